@@ -1,0 +1,1 @@
+"""What ABCD is, in torch: no nerfstudio, no user interface."""

@@ -1,0 +1,79 @@
+"""What every rasterizer takes and gives."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+
+
+@dataclass(frozen=True)
+class ZWindow:
+    """Per pixel, the half-open interval of camera z in which fragments count (fragment ownership).
+
+    A fragment is one Gaussian at one pixel; its z is the camera z of the Gaussian's mean. It is drawn
+    where near <= z < far. An empty interval (near >= far) draws nothing. Infinities are allowed.
+    """
+
+    near: Float[Tensor, "h w"]
+    far: Float[Tensor, "h w"]
+
+
+@dataclass(frozen=True)
+class Raster:
+    """One drawing: the pixels of a crop."""
+
+    color: Float[Tensor, "h w 3"]
+    """Premultiplied colour, no background."""
+    transmittance: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
+    info: dict[str, Any]
+    """gsplat 1.4.0's `info` for the Gaussians that take gradients: means2d [1, n, 2], radii [1, n],
+    depths, conics, opacities, width, height, n_cameras, gaussian_ids. Of the full image, not the crop."""
+
+    @property
+    def layer(self) -> Layer:
+        return Layer(self.color, self.transmittance)
+
+
+class Rasterizer(Protocol):
+    """Draws Gaussians as gsplat 1.4.0's `rasterization` does for one pinhole camera.
+
+    Constants (alpha >= 1/255, alpha <= 0.999, stop at T <= 1e-4, 3 sigma radius, 0.3 px blur) are gsplat's.
+    """
+
+    name: str
+    """Identifies backend and version; part of every layer's key."""
+    supports_z_window: bool
+
+    def __call__(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        *,
+        sh_degree: int,
+        crop: Crop | None = None,
+        frozen: Gaussians | None = None,
+        z_window: ZWindow | None = None,
+        antialiased: bool = False,
+        absgrad: bool = False,
+    ) -> Raster:
+        """Draw `gaussians` (and, sorted in with them by depth, `frozen`) as seen by `view`.
+
+        Args:
+            gaussians: take gradients where their tensors require them; `info` is about these alone.
+            sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
+            crop: draw only these pixels of the image; None means all. The result equals the crop of
+                the full drawing exactly.
+            frozen: Gaussians that occlude and are occluded, without gradients.
+            z_window: masks the fragments of `frozen` where it is given, else those of `gaussians`.
+            antialiased: scale opacities by gsplat's compensation factor.
+            absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward.
+
+        Raises:
+            ValueError: `z_window` given to a backend whose `supports_z_window` is False.
+        """
+        ...

@@ -1,0 +1,129 @@
+"""The values that the engine passes around: Gaussians, views, crops and layers."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float, Integer
+from torch import Tensor
+
+PARAM_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
+"""A Gaussian's parameters, under the names of nerfstudio's parameter groups, optimizers and checkpoints."""
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians as they are optimised: before activation, in world space."""
+
+    means: Float[Tensor, "n 3"]
+    """Centres, world units."""
+    scales: Float[Tensor, "n 3"]
+    """Natural logarithm of the standard deviations, world units."""
+    quats: Float[Tensor, "n 4"]
+    """Rotations as (w, x, y, z); need not be normalised."""
+    features_dc: Float[Tensor, "n 3"]
+    """Spherical harmonics of degree 0."""
+    features_rest: Float[Tensor, "n k 3"]
+    """Spherical harmonics of degrees 1 and up; k = (degree + 1)^2 - 1."""
+    opacities: Float[Tensor, "n 1"]
+    """Logit of the opacity."""
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        return self.means.device
+
+    @property
+    def sh_degree(self) -> int:
+        """The highest degree of spherical harmonics that is stored."""
+        return int((self.features_rest.shape[1] + 1) ** 0.5) - 1
+
+    def items(self) -> Iterator[tuple[str, Tensor]]:
+        """(name, tensor) pairs in the order of PARAM_NAMES."""
+        return ((name, getattr(self, name)) for name in PARAM_NAMES)
+
+    def __getitem__(self, rows: Integer[Tensor, "m"] | Tensor | slice) -> "Gaussians":
+        """The Gaussians at `rows` (indices, a boolean mask or a slice)."""
+        return Gaussians(**{name: value[rows] for name, value in self.items()})
+
+    def to(self, *args, **kwargs) -> "Gaussians":
+        """As Tensor.to, for every parameter."""
+        return Gaussians(**{name: value.to(*args, **kwargs) for name, value in self.items()})
+
+    def detach(self) -> "Gaussians":
+        """Cut from any autograd graph; shares memory."""
+        return Gaussians(**{name: value.detach() for name, value in self.items()})
+
+    @staticmethod
+    def cat(parts: Sequence["Gaussians"]) -> "Gaussians":
+        """All parts in one list, in order. `parts` must not be empty."""
+        return Gaussians(**{name: torch.cat([getattr(p, name) for p in parts]) for name in PARAM_NAMES})
+
+    @staticmethod
+    def empty(sh_degree: int = 3, device: torch.device | str = "cpu", dtype=torch.float32) -> "Gaussians":
+        """No Gaussians, with room for the given degree of spherical harmonics."""
+        k = (sh_degree + 1) ** 2 - 1
+        shapes = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "features_rest": (k, 3), "opacities": (1,)}
+        return Gaussians(**{n: torch.zeros((0, *s), device=device, dtype=dtype) for n, s in shapes.items()})
+
+
+assert tuple(f.name for f in fields(Gaussians)) == PARAM_NAMES
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A rectangle of pixels: columns x .. x + width - 1 and rows y .. y + height - 1 of a full image."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """(rows, columns), to index an [H, W, ...] image."""
+        return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
+
+    @property
+    def pixels(self) -> int:
+        return self.width * self.height
+
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera, in OpenCV convention (x right, y down, z forward); pixel centres at +0.5."""
+
+    viewmat: Float[Tensor, "4 4"]
+    """World to camera; float32 or float64."""
+    K: Float[Tensor, "3 3"]
+    """Intrinsics in pixels."""
+    width: int
+    height: int
+    index: int = 0
+    """Which camera of the training set this is; names its layers and its photo."""
+
+    @property
+    def full(self) -> Crop:
+        """The crop that is the whole image."""
+        return Crop(0, 0, self.width, self.height)
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """The camera's centre in world space: -R^T t."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def to(self, *args, **kwargs) -> "View":
+        """As Tensor.to, for both matrices."""
+        return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What some Gaussians look like alone from one camera: no background, premultiplied."""
+
+    color: Float[Tensor, "h w 3"]
+    """Premultiplied linear colour; may exceed 1."""
+    transmittance: Float[Tensor, "h w"]
+    """The share of light from behind that passes: 1 - alpha."""
