@@ -1,0 +1,110 @@
+"""All that belongs to one block: its Gaussians, their Adam moments, growth statistics and clocks."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
+"""Adam's running moments, under torch's names."""
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """How far a block has come; integers, so that schedules built on them are exact."""
+
+    steps: int = 0
+    """Optimisation steps spent on the block."""
+    adam_steps: int = 0
+    """Adam's own step count, which corrects its bias."""
+    visits: int = 0
+    """Visits that have ended."""
+
+
+@dataclass(frozen=True)
+class BlockState:
+    """One block at rest. Rows of every tensor belong to the same Gaussians."""
+
+    gaussians: Gaussians
+    exp_avg: Gaussians
+    """First moment of each parameter."""
+    exp_avg_sq: Gaussians
+    """Second moment of each parameter."""
+    growth: dict[str, Tensor] = field(default_factory=dict)
+    """Densification's running statistics, each [n]: gsplat's strategy state."""
+    clocks: Clocks = field(default_factory=Clocks)
+
+    def __post_init__(self) -> None:
+        rows = {len(self.gaussians), len(self.exp_avg), len(self.exp_avg_sq)}
+        rows |= {value.shape[0] for value in self.growth.values()}
+        if len(rows) != 1:
+            raise ValueError(f"a block's tensors must have equally many rows, not {sorted(rows)}")
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @staticmethod
+    def fresh(gaussians: Gaussians) -> "BlockState":
+        """A block that has not been trained: zero moments, clocks at zero."""
+        zeros = Gaussians(**{name: torch.zeros_like(value) for name, value in gaussians.items()})
+        return BlockState(gaussians, zeros, Gaussians(**{n: v.clone() for n, v in zeros.items()}))
+
+    def __getitem__(self, rows: Tensor) -> "BlockState":
+        """The Gaussians at `rows` with all that belongs to them; the clocks stay the block's."""
+        return BlockState(
+            self.gaussians[rows],
+            self.exp_avg[rows],
+            self.exp_avg_sq[rows],
+            {name: value[rows] for name, value in self.growth.items()},
+            self.clocks,
+        )
+
+    def joined_by(self, arrivals: "BlockState") -> "BlockState":
+        """This block with the Gaussians of `arrivals` added at the end, moments and statistics included.
+
+        The clocks stay this block's. A statistic which only one side has starts at zero for the other.
+        """
+        names = dict.fromkeys([*self.growth, *arrivals.growth])
+        growth = {name: torch.cat([_statistic(self, name), _statistic(arrivals, name)]) for name in names}
+        return BlockState(
+            Gaussians.cat([self.gaussians, arrivals.gaussians]),
+            Gaussians.cat([self.exp_avg, arrivals.exp_avg]),
+            Gaussians.cat([self.exp_avg_sq, arrivals.exp_avg_sq]),
+            growth,
+            self.clocks,
+        )
+
+    def to(self, device: torch.device | str) -> "BlockState":
+        """On another device."""
+        return BlockState(
+            self.gaussians.to(device),
+            self.exp_avg.to(device),
+            self.exp_avg_sq.to(device),
+            {name: value.to(device) for name, value in self.growth.items()},
+            self.clocks,
+        )
+
+    def to_tensors(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """As flat tensors by name (parameters under their own names) and JSON-able clocks, for the store."""
+        tensors = dict(self.gaussians.items())
+        for moment in MOMENTS:
+            tensors |= {f"{moment}.{name}": value for name, value in getattr(self, moment).items()}
+        tensors |= {f"growth.{name}": value for name, value in self.growth.items()}
+        return tensors, {"clocks": vars(self.clocks)}
+
+    @staticmethod
+    def from_tensors(tensors: dict[str, Tensor], meta: dict[str, Any]) -> "BlockState":
+        """The inverse of `to_tensors`."""
+        growth = {k.removeprefix("growth."): v for k, v in tensors.items() if k.startswith("growth.")}
+        moments = (Gaussians(**{n: tensors[f"{m}.{n}"] for n in PARAM_NAMES}) for m in MOMENTS)
+        gaussians = Gaussians(**{name: tensors[name] for name in PARAM_NAMES})
+        return BlockState(gaussians, *moments, growth, Clocks(**meta["clocks"]))
+
+
+def _statistic(state: BlockState, name: str) -> Tensor:
+    if name in state.growth:
+        return state.growth[name]
+    return torch.zeros(len(state), device=state.gaussians.device)

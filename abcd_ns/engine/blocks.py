@@ -1,0 +1,461 @@
+"""Blocks: a k-d tree whose leaves are axis-aligned cells that tile all of space."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import count
+
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+FORMAT = "abcd_ns.block_tree"
+VERSION = 1
+MAX_CELLS = 65_536
+"""The most cells that a grid may have: far more than any scene needs, few enough to fit in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """An axis-aligned box, world units. It holds its lower faces and not its upper ones; may be infinite."""
+
+    lower: Float64[Tensor, "3"]
+    upper: Float64[Tensor, "3"]
+
+    def __post_init__(self) -> None:
+        if not bool((self.lower <= self.upper).all()):
+            raise ValueError(
+                f"a box needs lower <= upper, got {self.lower.tolist()} and {self.upper.tolist()}"
+            )
+
+    def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether lower <= x < upper on all axes, compared in float64 as BlockTree.assign does."""
+        exact = _float64(points)
+        inside = (exact >= self.lower.to(exact.device)) & (exact < self.upper.to(exact.device))
+        return inside.all(dim=1).to(points.device)
+
+    def intersects(self, other: "Box") -> bool:
+        """Whether some point lies in both. Boxes that only touch share none."""
+        return bool((torch.maximum(self.lower, other.lower) < torch.minimum(self.upper, other.upper)).all())
+
+    def grown(self, margin: float) -> "Box":
+        """Moved outward by `margin` >= 0 (world units) on every face."""
+        if not margin >= 0:
+            raise ValueError(f"a box cannot grow by {margin}: the margin must be 0 or more")
+        return Box(self.lower - margin, self.upper + margin)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockTree:
+    """A k-d tree over all of R^3 with one block at each leaf; all tensors live on the CPU.
+
+    A point with x[axis] < threshold belongs to the left child, any other to the right one, compared in
+    float64 (which holds every float32 exactly). So the cells overlap nowhere and leave nothing out. Node 0
+    is the root, every node comes after its parent, and a tree of one block is a single leaf.
+
+    Raises:
+        ValueError: the arrays are no such tree, or a threshold lies outside its node's box.
+    """
+
+    axis: Int64[Tensor, "m"]
+    """The axis that an inner node splits, 0 to 2; -1 for a leaf."""
+    threshold: Float64[Tensor, "m"]
+    """Where it splits, world units; 0 for a leaf."""
+    left: Int64[Tensor, "m"]
+    """The child below the threshold; -1 for a leaf."""
+    right: Int64[Tensor, "m"]
+    """The child at and above the threshold; -1 for a leaf."""
+    block: Int64[Tensor, "m"]
+    """A leaf's block, 0 to num_blocks - 1; -1 for an inner node."""
+    parent: Int64[Tensor, "m"]
+    """-1 for the root."""
+
+    def __post_init__(self) -> None:
+        _check_structure(self)
+        lower, upper = self._bounds
+        nodes = (self.axis >= 0).nonzero()[:, 0]
+        along = self.axis[nodes]
+        cuts = (lower[nodes, along] < self.threshold[nodes]) & (self.threshold[nodes] < upper[nodes, along])
+        if not bool(cuts.all()):
+            raise ValueError(f"block tree: node {int(nodes[~cuts][0])} has a threshold outside its own box")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, BlockTree) and self.to_json() == other.to_json()
+
+    def __hash__(self) -> int:
+        return hash(self.to_json())
+
+    @property
+    def num_blocks(self) -> int:
+        return (self.axis.shape[0] + 1) // 2
+
+    @cached_property
+    def depth(self) -> int:
+        """Splits between the root and the deepest leaf; 0 for a tree of one block."""
+        depths = [0]
+        for parent in self.parent.tolist()[1:]:
+            depths.append(depths[parent] + 1)
+        return max(depths)
+
+    @cached_property
+    def _bounds(self) -> tuple[Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
+        """The lower and upper corners of all nodes' boxes."""
+        lower, upper = [[-math.inf] * 3], [[math.inf] * 3]
+        axis, threshold, left = self.axis.tolist(), self.threshold.tolist(), self.left.tolist()
+        for node, parent in enumerate(self.parent.tolist()[1:], start=1):
+            lower.append(list(lower[parent]))
+            upper.append(list(upper[parent]))
+            side = upper if left[parent] == node else lower
+            side[node][axis[parent]] = threshold[parent]
+        return torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64)
+
+    def assign(self, points: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
+        """The block that holds each point, on the points' device. A NaN goes to the right."""
+        exact = _float64(points)
+        device = exact.device
+        axis, threshold = self.axis.to(device), self.threshold.to(device)
+        left, right, block = self.left.to(device), self.right.to(device), self.block.to(device)
+        node = torch.zeros(len(points), dtype=torch.int64, device=device)
+        for _ in range(self.depth):
+            along = axis[node]
+            value = exact.gather(1, along.clamp(min=0)[:, None])[:, 0]
+            child = torch.where(value < threshold[node], left[node], right[node])
+            node = torch.where(along >= 0, child, node)
+        return block[node].to(points.device)
+
+    def node_of(self, block: int) -> int:
+        """The leaf of a block."""
+        if not 0 <= block < self.num_blocks:
+            raise ValueError(f"block {block} does not exist: the tree has blocks 0 to {self.num_blocks - 1}")
+        return int((self.block == block).nonzero()[0, 0])
+
+    def box(self, node: int) -> Box:
+        """The part of space under a node; all of it for the root."""
+        lower, upper = self._bounds
+        return Box(lower[node].clone(), upper[node].clone())
+
+    def cell(self, block: int) -> Box:
+        """The part of space that a block holds."""
+        return self.box(self.node_of(block))
+
+    def leaves(self, node: int = 0) -> tuple[int, ...]:
+        """The blocks under a node, from left to right."""
+        left, right, block = self.left.tolist(), self.right.tolist(), self.block.tolist()
+        found, stack = [], [node]
+        while stack:
+            node = stack.pop()
+            if left[node] < 0:
+                found.append(block[node])
+            else:
+                stack += [right[node], left[node]]
+        return tuple(found)
+
+    def siblings_to_root(self, block: int) -> tuple[int, ...]:
+        """The nodes that hang off the path from a block's leaf up to the root, lowest first.
+
+        Together with the leaf they tile space: every other block lies under exactly one of them.
+        """
+        node, siblings = self.node_of(block), []
+        while node:
+            parent = int(self.parent[node])
+            siblings.append(int(self.left[parent]) + int(self.right[parent]) - node)
+            node = parent
+        return tuple(siblings)
+
+    def split(self, block: int, axis: int, threshold: float) -> "BlockTree":
+        """A new tree in which the block's cell is cut in two and all else is as it was.
+
+        The part below `threshold` keeps the block's id, the other becomes block `num_blocks`.
+
+        Raises:
+            ValueError: no such block or axis, or the plane does not cut the block's cell.
+        """
+        node = self.node_of(block)
+        if axis not in (0, 1, 2):
+            raise ValueError(f"there is no axis {axis}: use 0, 1 or 2")
+        lower, upper = (float(bounds[node, axis]) for bounds in self._bounds)
+        if not lower < threshold < upper:
+            raise ValueError(
+                f"block {block} spans {lower} to {upper} on axis {axis}: {threshold} does not cut it"
+            )
+        rows = self._rows()
+        rows[node] = (axis, float(threshold), len(rows), len(rows) + 1, -1)
+        return _from_rows([*rows, (-1, 0.0, -1, -1, block), (-1, 0.0, -1, -1, self.num_blocks)])
+
+    def to_json(self) -> str:
+        """As text that from_json turns back into the same tree, bit for bit."""
+        # json writes a float as repr does: the shortest text that reads back as the same float64.
+        return json.dumps({"format": FORMAT, "version": VERSION, "nodes": self._rows()})
+
+    @staticmethod
+    def from_json(text: str) -> "BlockTree":
+        """The tree that to_json wrote.
+
+        Raises:
+            ValueError: the text is not JSON, not of this format and version, or describes no tree.
+        """
+        try:
+            data = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(f"block tree: not valid JSON ({error})") from error
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise ValueError(f'block tree: expected a JSON object with "format": "{FORMAT}"')
+        if data.get("version") != VERSION:
+            raise ValueError(f"block tree: version {data.get('version')} cannot be read, only {VERSION}")
+        rows = data.get("nodes")
+        if not isinstance(rows, list) or not all(_is_row(row) for row in rows):
+            raise ValueError(
+                'block tree: "nodes" must list [axis, threshold, left, right, block] of each node'
+            )
+        return _from_rows(rows)
+
+    def _rows(self) -> list[tuple]:
+        """(axis, threshold, left, right, block) of each node, as Python numbers."""
+        columns = (self.axis, self.threshold, self.left, self.right, self.block)
+        return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def best_split(
+    points: Float[Tensor, "n 3"], box: Box, share: float = 0.5, weights: Float[Tensor, "n"] | None = None
+) -> tuple[int, float]:
+    """Where to cut `box` so that `share` of the weight of its points falls to the left.
+
+    Takes the axis along which the points reach furthest, outliers aside, unless equal coordinates make
+    that cut miss its share by over a tenth of the weight and another axis does better. Points that all
+    coincide (or are missing) cannot be shared out: then an empty cell is cut off.
+
+    Args:
+        points: inside `box`, finite.
+        share: 0 to 1.
+        weights: >= 0; 1 each if left out.
+
+    Returns:
+        (axis, threshold), for BlockTree.split. The threshold lies strictly inside the box, and strictly
+        between two points' coordinates where float64 has room there.
+    """
+    points = _float64(points).cpu()
+    weights = torch.ones(len(points), dtype=torch.float64) if weights is None else _float64(weights).cpu()
+    total = float(weights.sum())
+    best: tuple[float, int, float] | None = None
+    for axis in _axes_by_extent(points):
+        cut = _cut_along(points[:, axis], weights, share * total)
+        if cut is not None and (best is None or cut[0] < best[0]):
+            best = (cut[0], axis, cut[1])
+        if best is not None and best[0] <= 0.1 * total:
+            break
+    if best is not None:
+        return best[1], best[2]
+    return _cut_off(box, points[0].tolist() if len(points) else [0.0] * 3)
+
+
+def build_kd(
+    points: Float[Tensor, "n 3"], num_blocks: int, weights: Float[Tensor, "n"] | None = None
+) -> BlockTree:
+    """A tree of `num_blocks` cells with equal numbers of points (or sums of weights); deterministic.
+
+    Counts differ by at most one where all coordinates are distinct. Points that coincide stay together,
+    so with few distinct points some blocks start empty, but there are always `num_blocks`.
+
+    Raises:
+        ValueError: `num_blocks` < 1, a point that is not finite, or weights that are not finite and >= 0.
+    """
+    if num_blocks < 1:
+        raise ValueError(f"cannot build {num_blocks} blocks: ask for 1 or more")
+    _check_finite(points)
+    weights = points.new_ones(len(points)) if weights is None else weights
+    if len(weights) != len(points) or not bool((weights.isfinite() & (weights >= 0)).all()):
+        raise ValueError("weights must be finite, 0 or more, and one per point")
+    points, weights = _float64(points).cpu(), _float64(weights).cpu()
+    everything = Box(torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double())
+    return _flatten(_kd_node(points, weights, everything, num_blocks, (0.0, float(weights.sum()))))
+
+
+def build_grid(
+    points: Float[Tensor, "n 3"], counts: tuple[int, int, int] | None = None, cell_size: float | None = None
+) -> BlockTree:
+    """A regular grid, as nested splits, over where the points are (outliers aside).
+
+    Give either `counts`, the cells on each axis, or `cell_size`, their edge in world units. The outermost
+    cells reach to infinity.
+
+    Raises:
+        ValueError: both or neither given, not positive, over MAX_CELLS cells, or a point that is not finite.
+    """
+    if (counts is None) == (cell_size is None):
+        raise ValueError("a grid needs either counts or cell_size, and not both")
+    if (counts is not None and min(counts) < 1) or (cell_size is not None and not 0 < cell_size < math.inf):
+        raise ValueError(f"a grid needs positive counts or a positive cell_size, got {counts or cell_size}")
+    _check_finite(points)
+    start, stop = _robust_range(_float64(points).cpu())
+    extents = (stop - start).tolist()
+    if counts is not None:
+        # Without any extent every cell size is as good as another; 1 keeps the planes apart.
+        sizes = [(extent or 1.0) / n for extent, n in zip(extents, counts, strict=True)]
+    else:
+        sizes = [float(cell_size)] * 3
+        counts = tuple(max(1, math.ceil(extent / cell_size)) for extent in extents)
+    if math.prod(counts) > MAX_CELLS:
+        raise ValueError(
+            f"the grid would have {counts} cells, over {MAX_CELLS} in all: make its cells larger"
+        )
+    grid = zip(start.tolist(), sizes, counts, strict=True)
+    return _flatten(_grid_node([[lo + size * i for i in range(1, n)] for lo, size, n in grid]))
+
+
+def _kd_node(points: Tensor, weights: Tensor, box: Box, k: int, ideal: tuple[float, float]) -> tuple | None:
+    """The subtree of `k` cells over these points, as nested (axis, threshold, left, right); None is a leaf.
+
+    `ideal` says where this node's share begins and ends among its weights, laid in a row. It differs from
+    (0, their sum) by the fractions of points that rounding moved; passing it down keeps them from adding up.
+    """
+    if k == 1:
+        return None
+    total = float(weights.sum())
+    target = ideal[0] + (ideal[1] - ideal[0]) * (k // 2) / k
+    share = min(max(target / total, 0.0), 1.0) if total > 0 else 0.5
+    axis, threshold = best_split(points, box, share, weights)
+    below = points[:, axis] < threshold
+    cut = float(weights[below].sum())
+    one = float(weights.max()) if len(weights) else 0.0
+    if abs(cut - target) > 0.5 * one * (1 + 1e-9):
+        target = cut  # More than rounding: points that coincide. What they took is not made up for elsewhere.
+    lower, upper = box.lower.clone(), box.upper.clone()
+    upper[axis] = lower[axis] = threshold
+    left = _kd_node(points[below], weights[below], Box(box.lower, upper), k // 2, (ideal[0], target))
+    rest = (target - cut, ideal[1] - cut if target != cut else total - cut)
+    right = _kd_node(points[~below], weights[~below], Box(lower, box.upper), k - k // 2, rest)
+    return axis, threshold, left, right
+
+
+def _grid_node(planes: list[list[float]]) -> tuple | None:
+    """The subtree over the cells between sorted `planes` of each axis, nested as in _kd_node."""
+    axis = max(range(3), key=lambda a: len(planes[a]))
+    if not planes[axis]:
+        return None
+    middle = len(planes[axis]) // 2
+    below = [p[:middle] if a == axis else p for a, p in enumerate(planes)]
+    above = [p[middle + 1 :] if a == axis else p for a, p in enumerate(planes)]
+    return axis, planes[axis][middle], _grid_node(below), _grid_node(above)
+
+
+def _robust_range(points: Float64[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+    """The 5th and 95th percentile on each axis; zeros without points."""
+    if not len(points):
+        return torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    tail = int(0.05 * (len(points) - 1))
+    return points.kthvalue(tail + 1, dim=0).values, points.kthvalue(len(points) - tail, dim=0).values
+
+
+def _axes_by_extent(points: Float64[Tensor, "n 3"]) -> list[int]:
+    """Axes from the widest to the narrowest; by the full range where the bulk of the points coincides."""
+    if not len(points):
+        return []
+    start, stop = _robust_range(points)
+    robust, full = (stop - start).tolist(), (points.amax(dim=0) - points.amin(dim=0)).tolist()
+    return sorted(range(3), key=lambda axis: (-robust[axis], -full[axis]))
+
+
+def _cut_along(
+    values: Float64[Tensor, "n"], weights: Float64[Tensor, "n"], target: float
+) -> tuple[float, float] | None:
+    """(miss, threshold) of the cut with about `target` weight below it; None if all values are equal."""
+    values, order = values.sort(stable=True)
+    gaps = (values[:-1] < values[1:]).nonzero()[:, 0]
+    if not len(gaps):
+        return None
+    misses = (weights[order].cumsum(dim=0)[gaps] - target).abs()
+    best = int(misses.argmin())
+    low, high = values[gaps[best] : gaps[best] + 2].tolist()
+    middle = low / 2 + high / 2  # Not (low + high) / 2, which may overflow.
+    return float(misses[best]), middle if low < middle < high else high
+
+
+def _cut_off(box: Box, point: list[float]) -> tuple[int, float]:
+    """(axis, threshold) of some plane through `box`, near `point` where the box gives no other hint."""
+    lower, upper = box.lower.tolist(), box.upper.tolist()
+    axis = max(range(3), key=lambda a: (math.isinf(lower[a]) + math.isinf(upper[a]), upper[a] - lower[a]))
+    lo, hi = lower[axis], upper[axis]
+    if math.isinf(lo) and math.isinf(hi):
+        return axis, point[axis]
+    if math.isinf(hi):
+        return axis, lo + max(1.0, abs(lo))
+    if math.isinf(lo):
+        return axis, hi - max(1.0, abs(hi))
+    return axis, lo / 2 + hi / 2
+
+
+def _flatten(nested: tuple | None) -> BlockTree:
+    """The tree of nested (axis, threshold, left, right), blocks numbered from left to right."""
+    rows: list[tuple] = []
+    blocks = count()
+
+    def add(part: tuple | None) -> int:
+        node = len(rows)
+        rows.append((-1, 0.0, -1, -1, next(blocks)) if part is None else ())
+        if part is not None:
+            rows[node] = (part[0], part[1], add(part[2]), add(part[3]), -1)
+        return node
+
+    add(nested)
+    return _from_rows(rows)
+
+
+def _from_rows(rows: Sequence[Sequence[float]]) -> BlockTree:
+    """A tree from (axis, threshold, left, right, block) of each node; parents follow from the children."""
+    parent = [-1] * len(rows)
+    for node, (_, _, *children, _) in enumerate(rows):
+        for child in children:
+            if 0 <= child < len(rows):
+                parent[child] = node
+    threshold = torch.tensor([row[1] for row in rows], dtype=torch.float64)
+    axis, left, right, block = (
+        torch.tensor([row[i] for row in rows], dtype=torch.int64) for i in (0, 2, 3, 4)
+    )
+    return BlockTree(axis, threshold, left, right, block, torch.tensor(parent, dtype=torch.int64))
+
+
+def _is_row(row: object) -> bool:
+    """Whether `row` may be a node in JSON: five numbers, of which only the threshold may be a float."""
+    if not isinstance(row, list) or len(row) != 5:
+        return False
+    return all(type(value) is int or (type(value) is float and i == 1) for i, value in enumerate(row))
+
+
+def _check_structure(tree: BlockTree) -> None:
+    """Raises ValueError unless the arrays form one binary tree with blocks 0..K-1 at its leaves."""
+    size = tree.axis.shape[0]
+    inner = tree.axis >= 0
+    nodes = inner.nonzero()[:, 0]
+    left, right = tree.left[nodes], tree.right[nodes]
+    children = torch.cat([left, right])
+    parents = torch.cat([nodes, nodes])
+    # Every node but the root is the child of exactly one earlier node: then there are no cycles or islands.
+    rooted = sorted(children.tolist()) == list(range(1, size)) and int(tree.parent[0]) == -1
+    if size == 0 or not rooted or not bool(((children > parents) & (tree.parent[children] == parents)).all()):
+        raise ValueError(
+            "block tree: the nodes do not form a tree with node 0 as root and parents before children"
+        )
+    if not bool(((tree.axis >= -1) & (tree.axis <= 2)).all()):
+        raise ValueError("block tree: an axis must be 0, 1 or 2, or -1 for a leaf")
+    if not bool(
+        (tree.left[~inner] == -1).all() & (tree.right[~inner] == -1).all() & (tree.block[inner] == -1).all()
+    ):
+        raise ValueError("block tree: leaves have children -1 and inner nodes have block -1")
+    if sorted(tree.block[~inner].tolist()) != list(range((size + 1) // 2)):
+        raise ValueError("block tree: the leaves must hold each block from 0 upward exactly once")
+
+
+def _check_finite(points: Tensor) -> None:
+    bad = int((~points.isfinite()).any(dim=1).sum())
+    if bad:
+        raise ValueError(
+            f"{bad} of {len(points)} points are NaN or infinite: drop them before building blocks"
+        )
+
+
+def _float64(values: Tensor) -> Tensor:
+    """In float64, without gradients; by way of the CPU for Apple's GPUs, which have no float64."""
+    values = values.detach()
+    return (values.cpu() if values.device.type == "mps" else values).double()

@@ -1,0 +1,410 @@
+"""Block coordinate descent: visits blocks one after the other and trains each within its surroundings.
+
+The optimisation loop belongs to the caller (nerfstudio's trainer, or `training_loop`): it asks for a
+sample, renders it, steps its optimizers, and reports back. The coordinator decides what is trained, keeps
+everything else at rest in the store, and tells its listeners what happens.
+"""
+
+import random
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.block_state import BlockState, Clocks
+from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.compositing import sandwich
+from abcd_ns.engine.density import DensityClock, DensityConfig, DensityControl
+from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.loss import photometric_loss, ssim_windows
+from abcd_ns.engine.painter import Painter, PaintSettings, Parts
+from abcd_ns.engine.param_swap import Optimizers, Params, attach, detach, live_gaussians
+from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
+from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
+from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.schedule import (
+    VisitPlan,
+    exponential_decay,
+    passes_of_sweep,
+    plan_sweep,
+    sh_degree_at,
+    view_order,
+)
+from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
+
+
+@dataclass
+class TrainingConfig:
+    """How a scene is trained, whatever calls the engine."""
+
+    layers: bool = True
+    """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
+    ownership: Literal["auto", "fragments", "means"] = "auto"
+    """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
+    paper). `auto` takes fragments where the rasterizer can mask by depth."""
+    window_percentile: float = 0.9
+    """Share of the active Gaussians' extents that the window of sorted-in fragments must hold."""
+    first_passes: int = 1
+    """Uses of each view in a visit of the first sweep."""
+    last_passes: int = 4
+    """Uses of each view in a visit of late sweeps."""
+    pass_gaussians: int = 0
+    """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
+    sh_degree: int = 3
+    """Highest degree of spherical harmonics."""
+    sh_ramp: float = 0.1
+    """Share of the run over which the degree rises from 0 to the highest."""
+    ssim_lambda: float = 0.2
+    """Weight of 1 - SSIM in the loss; the rest is L1."""
+    antialiased: bool = False
+    """Scale opacities by gsplat's compensation for its low-pass filter."""
+    background: Literal["random", "black", "white"] = "random"
+    """What lies behind the scene while training."""
+    means_lr: float = 1.6e-4
+    """Learning rate of the means at the start."""
+    means_lr_final: float = 1.6e-6
+    """Learning rate of the means at the end; exponential between the two over the run."""
+    seed: int = 0
+    """Of the order of blocks and views, backgrounds and splits."""
+    density: DensityConfig = field(default_factory=DensityConfig)
+    """Growing and pruning."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one step trains on."""
+
+    step: int
+    view: View
+    crop: Crop
+    layers: Parts | None
+    near: Gaussians | None
+    window: ZWindow | None
+    background: Float[Tensor, "3"]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """The active block within its surroundings."""
+
+    rgb: Float[Tensor, "h w 3"]
+    """Of the sample's crop, background included, 0..1."""
+    transmittance: Float[Tensor, "h w"]
+    """Of the active block and what was sorted in with it."""
+    info: dict[str, Any]
+
+
+class Coordinator:
+    """Runs ABCD over a scene at rest in `store`, through the caller's live parameters and optimizers.
+
+    Args:
+        views: the training views; `View.index` names them.
+        params, optimizers: as `param_swap` wants them. Their present content is dropped.
+        scene_key: fingerprint of the capture, part of every layer's key.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        budget: Budget,
+        scene: StoredScene,
+        views: list[View],
+        cache: LayerCache,
+        rasterizer: Rasterizer,
+        params: Params,
+        optimizers: Optimizers,
+        *,
+        scene_key: str = "",
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.config, self.budget, self.scene, self.cache = config, budget, scene, cache
+        self.params, self.optimizers = params, optimizers
+        self.views = {view.index: view.to(device) for view in views}
+        self.device = torch.device(device)
+        self.announce = Announcer()
+        self.stopwatch = Stopwatch()
+        self.density = DensityControl(config.density)
+        self.state = RunState()
+        self._scene_key = scene_key
+        self._rasterizer = rasterizer
+        self._ownership = resolve_ownership(config.ownership, rasterizer)
+        self._growth: dict[str, Tensor] = {}
+        self._clocks = Clocks()
+        self._layers: VisitLayers | None = None
+        self._order: tuple[int, ...] = ()
+
+    # -- the loop ------------------------------------------------------------------------------------
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0..1."""
+        return self.budget.progress(self.state.step, self.stopwatch.seconds)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is used up."""
+        return self.progress >= 1.0
+
+    def next_sample(self) -> Sample:
+        """Begin a visit if none is under way, set the learning rate, and say what to train on next.
+
+        Raises:
+            RuntimeError: no view sees any block.
+        """
+        self.stopwatch.start()
+        if self.state.active is None:
+            self._begin_visit()
+        active = self._active
+        rate = exponential_decay(self.progress, self.config.means_lr, self.config.means_lr_final)
+        self.optimizers["means"].param_groups[0]["lr"] = rate
+        view = self._order[active.done]
+        around = self._layers.around(view) if self._layers else None
+        return Sample(
+            step=self.state.step,
+            view=self.views[view],
+            crop=active.geometry.crops[view],
+            layers=around and around.layers,
+            near=around and around.near,
+            window=around and around.window,
+            background=self._background(),
+        )
+
+    def render(self, sample: Sample) -> Rendered:
+        """Draw the active block between its layers; differentiable in the live parameters."""
+        raster = self._rasterizer(
+            live_gaussians(self.params),
+            sample.view,
+            sh_degree=self._active.sh_degree,
+            crop=sample.crop,
+            frozen=sample.near,
+            z_window=sample.window if sample.near is not None else None,
+            antialiased=self.config.antialiased,
+            absgrad=self.density.absgrad,
+        )
+        self.density.before_backward(raster.info)
+        if sample.layers is None:
+            rgb = raster.color + raster.transmittance[..., None] * sample.background
+        else:
+            rgb = sandwich(sample.layers.front, raster.layer, sample.layers.back, sample.background)
+        return Rendered(rgb.clamp(0, 1), raster.transmittance, raster.info)
+
+    def loss(self, sample: Sample, rendered: Rendered, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+        """The loss of a step: photometric over the crop, plus what the density strategy asks for."""
+        view = sample.view
+        photometric = photometric_loss(
+            rendered.rgb,
+            photo,
+            full_pixels=view.width * view.height,
+            full_windows=ssim_windows(view.height, view.width),
+            ssim_lambda=self.config.ssim_lambda,
+        )
+        if self.config.density.strategy != "mcmc":
+            return photometric
+        return photometric + self.density.regularisation(self.params, self.count())
+
+    def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
+        """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done."""
+        active = self._active
+        self.state.step += 1
+        active.done += 1
+        self._clocks = replace(self._clocks, steps=self._clocks.steps + 1)
+        limit = self.config.density.limit
+        clock = DensityClock(
+            progress=self.progress,
+            steps=self._clocks.steps,
+            views=len(active.geometry.views),
+            room=None if limit is None else limit - self.count(),
+            seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
+        )
+        self._growth = self.density.after_step(
+            self.params, self.optimizers, self._growth, rendered.info, clock
+        )
+        self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
+        if active.done >= active.steps or self.finished:
+            self._end_visit()
+
+    # -- at rest -------------------------------------------------------------------------------------
+
+    def count(self) -> int:
+        """Gaussians in the whole scene, the live block included."""
+        return sum(self.scene.count(block) for block in range(self.scene.tree.num_blocks))
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree of spherical harmonics in use."""
+        return sh_degree_at(self.progress, self.config.sh_ramp, self.config.sh_degree)
+
+    def save(self, pin: str | None = None) -> None:
+        """Commit everything, the live block in the middle of its visit included.
+
+        Args:
+            pin: keep this state under a name until it is unpinned.
+        """
+        updates = {}
+        if self.state.active is not None:
+            updates[self.state.active.geometry.block] = self._detached().to_tensors()
+        self.state.seconds = self.stopwatch.seconds
+        self.scene.store.commit(updates, state=self.state.to_json())
+        if pin is not None:
+            self.scene.store.pin(pin)
+
+    def restore(self) -> None:
+        """Go on from what the store holds: exactly where `save` was called."""
+        self.state = RunState.from_json(self.scene.store.state)
+        self.stopwatch = Stopwatch(self.state.seconds)
+        if self.state.active is not None:
+            self._attach(self.state.active)
+
+    # -- visits --------------------------------------------------------------------------------------
+
+    @property
+    def _active(self) -> ActiveVisit:
+        if self.state.active is None:
+            raise RuntimeError("no visit is under way: call next_sample first")
+        return self.state.active
+
+    def _begin_visit(self) -> None:
+        began = self.stopwatch.seconds
+        plan, geometry = self._next_visit()
+        self.state.active = ActiveVisit(
+            number=self.state.visit,
+            geometry=geometry,
+            sh_degree=self.sh_degree,
+            steps=plan.steps,
+            began=began,
+        )
+        self.state.visit += 1
+        self._attach(self.state.active)
+
+    def _next_visit(self) -> tuple[VisitPlan, VisitGeometry]:
+        """The next block that some view sees; blocks that none sees any more are passed over."""
+        while True:
+            plan = self._next_plan()
+            geometry = self._survey(plan.block, window=self._uses_windows)
+            self.state.views[plan.block] = len(geometry.views)
+            if geometry.views:
+                return plan, geometry
+
+    def _attach(self, active: ActiveVisit) -> None:
+        block, views = active.geometry.block, active.geometry.views
+        rest = BlockState.from_tensors(*self.scene.store.load(block)).to(self.device)
+        attach(rest, self.params, self.optimizers)
+        self._growth, self._clocks = dict(rest.growth), rest.clocks
+        self.scene.lay_over(block, lambda: live_gaussians(self.params))
+        self._order = view_order(views, active.steps, active.number, self.config.seed)
+        self.announce(
+            VisitBegan(active.number, self.state.sweep, block, active.steps, len(views), len(rest))
+        )
+        before = self.stopwatch.seconds
+        self._layers = self._draw_layers(active)
+        active.layer_seconds += self.stopwatch.seconds - before
+
+    def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
+        if self.scene.tree.num_blocks == 1 or not self.config.layers:
+            return None
+        painter = Painter(
+            self.scene,
+            list(self.views.values()),
+            self._rasterizer,
+            ownership=self._ownership,
+            pass_gaussians=self.config.pass_gaussians or self._default_pass(),
+            device=self.device,
+        )
+        settings = PaintSettings(active.sh_degree, self.config.antialiased)
+        layers = VisitLayers(painter, self.cache, active.geometry, self.views, settings, self._scene_key)
+        wanted = dict.fromkeys(self._order[active.done :])
+        for done, _ in enumerate(layers.draw(wanted), start=1):
+            self.announce(LayersDrawn(active.number, done, len(wanted)))
+        return layers
+
+    def _end_visit(self) -> None:
+        active = self._active
+        block = active.geometry.block
+        self._clocks = replace(self._clocks, visits=self._clocks.visits + 1)
+        state = self._detached()
+        owner = self.scene.tree.assign(state.gaussians.means.cpu()).to(self.device)
+        updates = {block: state[owner == block]}
+        for target in owner.unique().tolist():
+            if target != block:
+                rest = BlockState.from_tensors(*self.scene.store.load(target)).to(self.device)
+                updates[target] = rest.joined_by(state[owner == target])
+        self.scene.lift()
+        self.state.active, self._layers = None, None
+        self.state.seconds = self.stopwatch.seconds
+        self.scene.store.commit({b: s.to_tensors() for b, s in updates.items()}, state=self.state.to_json())
+        self.announce(
+            VisitEnded(
+                active.number,
+                self.state.sweep,
+                block,
+                gaussians=len(updates[block]),
+                migrated=len(state) - len(updates[block]),
+                layer_seconds=active.layer_seconds,
+                seconds=self.stopwatch.seconds - active.began,
+            )
+        )
+        if not self.state.queue:
+            self.announce(SweepEnded(self.state.sweep, self.state.step))
+
+    def _next_plan(self) -> VisitPlan:
+        state, config = self.state, self.config
+        if not state.queue:
+            if not state.views:
+                blocks = range(self.scene.tree.num_blocks)
+                state.views = {b: len(self._survey(b, window=False).views) for b in blocks}
+            else:
+                state.sweep += 1
+            remaining = None if self.budget.steps is None else self.budget.steps - state.step
+            passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
+            state.queue = list(plan_sweep(state.sweep, state.views, passes, remaining, config.seed))
+            if not state.queue:
+                raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
+        return state.queue.pop(0)
+
+    @property
+    def _uses_windows(self) -> bool:
+        fragments = self._ownership == "fragments" and self.scene.tree.num_blocks > 1
+        return self.config.layers and fragments
+
+    def _survey(self, block: int, window: bool) -> VisitGeometry:
+        return survey(
+            self.scene.gaussians(block).to(self.device),
+            block,
+            self.views.values(),
+            cell=self.scene.tree.cell(block) if window else None,
+            percentile=self.config.window_percentile,
+        )
+
+    def _detached(self) -> BlockState:
+        return detach(self.params, self.optimizers, self._growth, self._clocks)
+
+    def _default_pass(self) -> int:
+        counts = [self.scene.count(block) for block in range(self.scene.tree.num_blocks)]
+        return max(2 * max(counts), 200_000)
+
+    def _background(self) -> Tensor:
+        if self.config.background == "random":
+            generator = torch.Generator().manual_seed(
+                random.Random(f"background {self.config.seed} {self.state.step}").getrandbits(62)
+            )
+            return torch.rand(3, generator=generator).to(self.device)
+        return torch.full((3,), float(self.config.background == "white"), device=self.device)
+
+
+def resolve_ownership(
+    wanted: Literal["auto", "fragments", "means"], rasterizer: Rasterizer
+) -> Literal["fragments", "means"]:
+    """What `auto` means for a rasterizer."""
+    if wanted == "auto":
+        return "fragments" if rasterizer.supports_z_window else "means"
+    return wanted
+
+
+def blocks_at_rest(tree: BlockTree, gaussians: Gaussians) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
+    """The first content of a store: `gaussians` parted by `tree`, nothing trained yet."""
+    owner = tree.assign(gaussians.means)
+    return {b: BlockState.fresh(gaussians[owner == b]).to_tensors() for b in range(tree.num_blocks)}

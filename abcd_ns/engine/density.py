@@ -1,0 +1,203 @@
+"""Growing and pruning the active block, by gsplat's own strategies on the block's own clock.
+
+gsplat's strategies keep a schedule in absolute steps of one global run. Here the schedule is in shares of
+the run and in the block's own steps, so it is kept in this file and the strategies are told, through the
+step number they are given, either to gather statistics or to refine now.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
+from gsplat.strategy import ops as gsplat_ops
+from torch import Tensor
+
+from abcd_ns.engine.param_swap import Optimizers, Params
+from abcd_ns.engine.relocation import binomials, compute_relocation, covariances
+
+# Step numbers as gsplat sees them. It refines on multiples of REFINE, resets opacities on multiples of
+# `reset_every` (never, with these numbers) and prunes by size where step > reset_every.
+GATHER, REFINE = 1, 6
+BEFORE_RESET, AFTER_RESET = 7, 4
+
+MCMC_MIN_OPACITY = 0.005
+MCMC_DEFAULT_CAP = 1_000_000
+
+
+@dataclass
+class DensityConfig:
+    """When and how the number of Gaussians changes. Thresholds are splatfacto's, times are relative."""
+
+    strategy: Literal["default", "mcmc", "off"] = "default"
+    """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""
+    refine_start: float = 1 / 60
+    """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
+    refine_stop: float = 0.5
+    """Share of the run after which the number of Gaussians no longer changes."""
+    refine_every: int = 100
+    """A block's own steps between refinements; never fewer than the views that see the block."""
+    warmup_passes: int = 4
+    """Times that each of a block's views is used before the block's first refinement."""
+    reset_every: int = 3000
+    """A block's own steps between opacity resets (`default` strategy); 0 means never."""
+    cull_alpha_thresh: float = 0.005
+    """Opacity under which a Gaussian is pruned (`default` strategy)."""
+    cull_scale_thresh: float = 0.5
+    """Standard deviation, in scene units, over which a Gaussian is pruned once opacities were reset."""
+    densify_grad_thresh: float = 0.0008
+    """Mean norm of the screen-space gradient over which a Gaussian is cloned or split."""
+    densify_size_thresh: float = 0.01
+    """Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
+    use_absgrad: bool = True
+    """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum."""
+    max_gaussians: int = 0
+    """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000)."""
+    noise_lr: float = 5e5
+    """Strength of the exploration noise of `mcmc`."""
+    opacity_reg: float = 0.01
+    """Weight of the mean opacity in the loss (`mcmc`)."""
+    scale_reg: float = 0.01
+    """Weight of the mean standard deviation in the loss (`mcmc`)."""
+
+    @property
+    def limit(self) -> int | None:
+        """Gaussians in the whole scene at most, or None."""
+        if self.max_gaussians > 0:
+            return self.max_gaussians
+        return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
+
+
+@dataclass(frozen=True)
+class DensityClock:
+    """Where the run and the active block stand; all that decides whether to refine."""
+
+    progress: float
+    """Share of the whole run that is done, 0..1."""
+    steps: int
+    """The block's own steps, this one included."""
+    views: int
+    """Views that see the block."""
+    room: int | None
+    """Gaussians that may still be added to the scene; None for no limit."""
+    seed: int
+    """Of the random numbers drawn in this step."""
+
+
+class DensityControl:
+    """Applies the configured strategy to the live block."""
+
+    def __init__(self, config: DensityConfig) -> None:
+        self.config = config
+
+    @property
+    def absgrad(self) -> bool:
+        """Whether the rasterizer must leave `absgrad` on `means2d`."""
+        return self.config.strategy == "default" and self.config.use_absgrad
+
+    def before_backward(self, info: dict[str, Any]) -> None:
+        """Keep the gradient of the projected means, by which the default strategy judges."""
+        if self.config.strategy == "default" and info["means2d"].requires_grad:
+            info["means2d"].retain_grad()
+
+    def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
+        """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
+        config = self.config
+        if config.strategy != "mcmc":
+            return params["means"].new_zeros(())
+        opacity = torch.sigmoid(params["opacities"]).sum()
+        scale = torch.exp(params["scales"]).sum() / 3
+        return (config.opacity_reg * opacity + config.scale_reg * scale) / max(scene_gaussians, 1)
+
+    def is_due(self, clock: DensityClock) -> bool:
+        """Whether this step refines."""
+        warm = clock.steps >= self.config.warmup_passes * clock.views
+        running = self.config.refine_start <= clock.progress < self.config.refine_stop
+        return warm and running and clock.steps % max(self.config.refine_every, clock.views, 1) == 0
+
+    def after_step(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        growth: dict[str, Tensor],
+        info: dict[str, Any],
+        clock: DensityClock,
+    ) -> dict[str, Tensor]:
+        """Gather statistics and, when it is time, refine. Call after Adam's step.
+
+        Args:
+            growth: the block's statistics so far, each [n].
+            info: of the step's drawing, after backward.
+
+        Returns:
+            The block's statistics from now on. The global random generator is left as it was.
+        """
+        if self.config.strategy == "off" or len(params["means"]) == 0:
+            return growth
+        device = params["means"].device
+        cuda = [device] if device.type == "cuda" else []
+        with torch.random.fork_rng(devices=cuda), _operators_for(device):
+            torch.manual_seed(clock.seed)
+            if self.config.strategy == "mcmc":
+                self._step_mcmc(params, optimizers, clock)
+                return {}
+            return self._step_default(params, optimizers, growth, info, clock)
+
+    def _step_default(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        growth: dict[str, Tensor],
+        info: dict[str, Any],
+        clock: DensityClock,
+    ) -> dict[str, Tensor]:
+        config = self.config
+        if clock.progress >= config.refine_stop or info["means2d"].grad is None:
+            return growth
+        full = clock.room is not None and clock.room <= 0
+        has_reset = 0 < config.reset_every < clock.steps
+        strategy = DefaultStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=float("inf") if full else config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            prune_scale3d=config.cull_scale_thresh,
+            refine_start_iter=0,
+            refine_every=REFINE,
+            reset_every=AFTER_RESET if has_reset else BEFORE_RESET,
+            absgrad=config.use_absgrad,
+        )
+        state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": 1.0, **growth}
+        step = REFINE if self.is_due(clock) else GATHER
+        strategy.step_post_backward(params, optimizers, state, step, info)
+        if config.reset_every > 0 and clock.steps % config.reset_every == 0:
+            gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
+        return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+
+    def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:
+        room = len(params["means"]) if clock.room is None else clock.room
+        strategy = MCMCStrategy(
+            cap_max=len(params["means"]) + max(room, 0),
+            noise_lr=self.config.noise_lr,
+            refine_start_iter=0,
+            refine_every=REFINE,
+            min_opacity=MCMC_MIN_OPACITY,
+        )
+        step = REFINE if self.is_due(clock) else GATHER
+        learning_rate = optimizers["means"].param_groups[0]["lr"]
+        strategy.step_post_backward(params, optimizers, {"binoms": binomials()}, step, {}, lr=learning_rate)
+
+
+@contextmanager
+def _operators_for(device: torch.device) -> Iterator[None]:
+    """gsplat 1.4.0's MCMC calls two CUDA operators by name; elsewhere, lend it torch ones for the call."""
+    if device.type == "cuda":
+        yield
+        return
+    originals = gsplat_ops.compute_relocation, gsplat_ops.quat_scale_to_covar_preci
+    gsplat_ops.compute_relocation, gsplat_ops.quat_scale_to_covar_preci = compute_relocation, covariances
+    try:
+        yield
+    finally:
+        gsplat_ops.compute_relocation, gsplat_ops.quat_scale_to_covar_preci = originals

@@ -1,0 +1,81 @@
+"""What the coordinator tells whoever listens: terminal, viewer, logs. It knows none of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class VisitBegan:
+    """A block was attached; its layers are about to be drawn."""
+
+    visit: int
+    sweep: int
+    block: int
+    steps: int
+    views: int
+    gaussians: int
+
+
+@dataclass(frozen=True)
+class LayersDrawn:
+    """F and B of one more view of the visit are ready."""
+
+    visit: int
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class StepTaken:
+    """One optimisation step."""
+
+    step: int
+    visit: int
+    visit_step: int
+    psnr: float
+    """Of the crop that was trained on, dB."""
+
+
+@dataclass(frozen=True)
+class VisitEnded:
+    """The block was committed to the store."""
+
+    visit: int
+    sweep: int
+    block: int
+    gaussians: int
+    """In the block, after migration."""
+    migrated: int
+    """Gaussians that left for other blocks."""
+    layer_seconds: float
+    """Training time that went into drawing F and B."""
+    seconds: float
+    """Training time of the whole visit."""
+
+
+@dataclass(frozen=True)
+class SweepEnded:
+    """Every observed block was visited once more."""
+
+    sweep: int
+    step: int
+
+
+Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded
+Listener = Callable[[Event], None]
+
+
+class Announcer:
+    """Passes each event to every listener, in the order in which they subscribed."""
+
+    def __init__(self) -> None:
+        self._listeners: list[Listener] = []
+
+    def subscribe(self, listener: Listener) -> None:
+        """Call `listener` with every event from now on."""
+        self._listeners.append(listener)
+
+    def __call__(self, event: Event) -> None:
+        """Tell everyone."""
+        for listener in self._listeners:
+            listener(event)

@@ -1,0 +1,77 @@
+"""The first Gaussians: one for each point of a structure-from-motion model, as in 3DGS."""
+
+import math
+import warnings
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from abcd_ns.engine.types import Gaussians
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+INITIAL_OPACITY = 0.1
+
+
+def gaussians_from_points(
+    points: Float[Tensor, "n 3"],
+    colors: UInt8[Tensor, "n 3"] | Float[Tensor, "n 3"],
+    *,
+    sh_degree: int = 3,
+    seed: int = 0,
+) -> Gaussians:
+    """Isotropic Gaussians at `points`, as wide as the mean distance to the three nearest others.
+
+    Args:
+        points: world space; rows that are not finite are dropped with a warning.
+        colors: 0..255.
+        seed: of the random rotations.
+    """
+    keep = torch.isfinite(points).all(dim=1)
+    if not bool(keep.all()):
+        warnings.warn(f"dropped {int((~keep).sum())} initial points that are not finite", stacklevel=2)
+        points, colors = points[keep], colors[keep]
+    count = points.shape[0]
+    generator = torch.Generator().manual_seed(seed)
+    spacing = torch.from_numpy(_neighbour_distance(points.double().numpy())).to(points.dtype)
+    return Gaussians(
+        means=points.clone(),
+        scales=spacing.log()[:, None].repeat(1, 3),
+        quats=_random_quats(count, generator).to(points.dtype),
+        features_dc=(colors.to(points.dtype) / 255 - 0.5) / SH_C0,
+        features_rest=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+        opacities=points.new_full((count, 1), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+    )
+
+
+def random_points(count: int, extent: float, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """`count` points uniform in a cube of side `extent` around the origin, and random colours 0..255."""
+    generator = torch.Generator().manual_seed(seed)
+    points = (torch.rand((count, 3), generator=generator) - 0.5) * extent
+    return points, torch.rand((count, 3), generator=generator) * 255
+
+
+def _neighbour_distance(points: np.ndarray, neighbours: int = 3) -> np.ndarray:
+    """[n] mean distance to the nearest others; equal points get the smallest positive distance there is."""
+    count = len(points)
+    if count < 2:
+        return np.ones(count)
+    k = min(neighbours, count - 1) + 1
+    distance = cKDTree(points).query(points, k=k)[0][:, 1:].mean(axis=1)
+    positive = distance[distance > 0]
+    if len(positive) == 0:
+        return np.ones(count)
+    return np.maximum(distance, positive.min())
+
+
+def _random_quats(count: int, generator: torch.Generator) -> Tensor:
+    """Uniform random rotations (Shoemake, "Uniform random rotations", Graphics Gems III)."""
+    u, v, w = torch.rand((3, count), generator=generator)
+    a, b = torch.sqrt(1 - u), torch.sqrt(u)
+    tau = 2 * math.pi
+    return torch.stack(
+        [a * torch.sin(tau * v), a * torch.cos(tau * v), b * torch.sin(tau * w), b * torch.cos(tau * w)], dim=1
+    )

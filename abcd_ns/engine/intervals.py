@@ -1,0 +1,99 @@
+"""Where each pixel's ray is inside a cell, measured in camera z.
+
+A ray through a pixel's centre, scaled to unit camera z, is c + z d with the camera's centre c and
+
+    d = R^T [(u - cx) / fx, (v - cy) / fy, 1]
+
+so its parameter is camera z itself. It crosses the plane x_k = s at z = (s - c_k) / d_k, if at all.
+
+Cells tile space, and their intervals must tile z just as exactly, or fragments would be drawn twice or
+never. Three rules see to that, with no tolerance anywhere:
+
+1. Which side of a plane the camera is on is decided as in ordering.py: in float64, right if c_k >= s.
+2. The side with the camera gets [start, crossing), the other one [crossing, end). A ray that runs along
+   the plane or away from it never crosses: then the crossing is +inf and the other side gets nothing.
+3. Both sides compute the crossing by the same two rounded operations. These are monotone in s, so a
+   plane that is redundant for a box stays redundant after rounding.
+
+Hence for any tree, ray and z (z <= 0 too: all of it goes to the camera's cell), exactly one cell's
+interval holds z, and along z the cells follow one another in front_to_back order.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.blocks import BlockTree, Box
+from abcd_ns.engine.rasterizer.base import ZWindow
+from abcd_ns.engine.types import Crop, View
+
+
+def ray_directions(view: View, crop: Crop) -> Float[Tensor, "3 h w"]:
+    """World-space directions of the rays through the crop's pixel centres, scaled to unit camera z.
+
+    In the view's dtype and on its device. Skew is ignored, as gsplat does. A pixel's direction does not
+    depend on the crop, bit for bit: only elementwise operations are used.
+    """
+    like = {"dtype": view.viewmat.dtype, "device": view.viewmat.device}
+    u = torch.arange(crop.x, crop.x + crop.width, **like) + 0.5
+    v = torch.arange(crop.y, crop.y + crop.height, **like) + 0.5
+    x = ((u - view.K[0, 2]) / view.K[0, 0])[None, :]
+    y = ((v - view.K[1, 2]) / view.K[1, 1])[:, None]
+    rotation = view.viewmat[:3, :3]
+    return torch.stack([rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] for k in range(3)])
+
+
+def ray_interval(box: Box, view: View, crop: Crop) -> ZWindow:
+    """The half-open interval of camera z in which each pixel's ray is inside `box`.
+
+    `near` is -inf where the camera itself is inside the box, so that nothing in front of it is lost.
+    Rays that miss the box get the empty interval near = far = +inf, so [-inf, near) is then all of z.
+    """
+    return _interval(box, view.center.tolist(), ray_directions(view, crop))
+
+
+def cell_windows(tree: BlockTree, view: View, crop: Crop, nodes: Sequence[int]) -> tuple[ZWindow, ...]:
+    """ray_interval of the boxes of some of the tree's nodes, in the order given.
+
+    The windows of nodes that tile space (all leaves; or a leaf and its siblings_to_root) tile z.
+    """
+    center, directions = view.center.tolist(), ray_directions(view, crop)
+    return tuple(_interval(tree.box(node), center, directions) for node in nodes)
+
+
+def front_and_behind(window: ZWindow) -> tuple[ZWindow, ZWindow]:
+    """What a window of ray_interval leaves over: (z in front of it, z behind it).
+
+    Where the window is empty because the ray misses its box, all of z counts as in front.
+    """
+    infinite = torch.full_like(window.near, math.inf)
+    return ZWindow(-infinite, window.near), ZWindow(window.far, infinite)
+
+
+def _interval(box: Box, center: list[float], directions: Float[Tensor, "3 h w"]) -> ZWindow:
+    near = torch.full_like(directions[0], -math.inf)
+    far = torch.full_like(directions[0], math.inf)
+    for direction, c, lower, upper in zip(
+        directions, center, box.lower.tolist(), box.upper.tolist(), strict=True
+    ):
+        for plane, box_is_right in ((lower, True), (upper, False)):
+            if math.isinf(plane):
+                continue
+            if (c >= plane) == box_is_right:
+                far = torch.minimum(far, _crossing(plane, c, direction))
+            else:
+                near = torch.maximum(near, _crossing(plane, c, direction))
+    # The planes of several axes can pass the ray by in any order: near > far, or a far before the camera.
+    empty = near >= far
+    return ZWindow(near.masked_fill(empty, math.inf), far.masked_fill(empty, math.inf))
+
+
+def _crossing(plane: float, center: float, direction: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Camera z at which rays leave the camera's side of x_k = plane; +inf where they never do."""
+    leaves = direction < 0 if center >= plane else direction > 0
+    # A 0-dimensional tensor, because torch turns float / tensor into a product with the reciprocal.
+    offset = torch.tensor(plane - center, dtype=direction.dtype, device=direction.device)
+    return torch.where(leaves, offset / direction, math.inf)

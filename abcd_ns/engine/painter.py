@@ -1,0 +1,222 @@
+"""Draws frozen blocks into layers, as many blocks in one pass as the device has room for.
+
+With ownership by *fragments* (design, section 2) a layer holds the fragments of one convex node of the
+block tree, drawn from all Gaussians that reach into it, so that folding layers gives the merged picture.
+With ownership by *means* a layer holds a node's own Gaussians whole, as the paper has it; that is what
+stock gsplat can draw.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.blocks import BlockTree, Box
+from abcd_ns.engine.compositing import empty_layer, fold
+from abcd_ns.engine.intervals import ray_interval
+from abcd_ns.engine.ordering import node_children_in_order, split_around
+from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
+from abcd_ns.engine.scene import BlockScene
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+from abcd_ns.engine.visibility import reaches
+
+Ownership = Literal["fragments", "means"]
+
+SUPPORT = math.sqrt(2 * math.log(255))
+"""Standard deviations at which an opaque Gaussian falls to 1/255, below which nothing is drawn."""
+BLUR_PIXELS = SUPPORT * math.sqrt(0.3) + 1
+"""Pixels that the rasterizer's low-pass filter and rounding add to a Gaussian's extent."""
+
+
+@dataclass(frozen=True)
+class PaintSettings:
+    """What every drawing of a run has in common."""
+
+    sh_degree: int
+    antialiased: bool = False
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A unit's layer, cut by the active block's window: what lies in front of it and what lies behind."""
+
+    front: Layer
+    back: Layer
+
+
+class Painter:
+    """Draws the frozen blocks of a scene.
+
+    Args:
+        scene: where Gaussians are read from.
+        views: all views that will be drawn; they bound how far Gaussians reach.
+        pass_gaussians: the most Gaussians that one drawing may take on the device. A node of the tree
+            that holds more is drawn in parts, down to single blocks.
+    """
+
+    def __init__(
+        self,
+        scene: BlockScene,
+        views: list[View],
+        rasterizer: Rasterizer,
+        *,
+        ownership: Ownership,
+        pass_gaussians: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if ownership == "fragments" and not rasterizer.supports_z_window:
+            raise ValueError(f"{rasterizer.name} cannot mask fragments by depth: use ownership='means'")
+        self.scene = scene
+        self.rasterizer = rasterizer
+        self.ownership = ownership
+        self.device = torch.device(device)
+        self._pass_gaussians = pass_gaussians
+        self._optics = _Optics(views)
+
+    @property
+    def tree(self) -> BlockTree:
+        return self.scene.tree
+
+    def units(self, exclude: int | None = None) -> tuple[int, ...]:
+        """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass."""
+        return tuple(self._descend(0, exclude))
+
+    def load(self, unit: int, exclude: int | None = None) -> Gaussians:
+        """On the device: the Gaussians of the unit's blocks and, by fragments, all others that reach in."""
+        inside = [b for b in self.tree.leaves(unit) if b != exclude]
+        parts = [self.scene.gaussians(block) for block in inside]
+        if self.ownership == "fragments" and unit != 0:
+            outside = [b for b in range(self.tree.num_blocks) if b not in inside and b != exclude]
+            parts += [self.reaching(block, self.tree.box(unit)) for block in outside]
+        return Gaussians.cat(parts).to(self.device)
+
+    def reaching(self, block: int, box: Box) -> Gaussians:
+        """The block's Gaussians that some view may see inside `box`."""
+        gaussians = self.scene.gaussians(block)
+        rows = reaches(gaussians, box, self._optics.blur(gaussians.means), sigma=SUPPORT * self._optics.secant)
+        return gaussians[rows]
+
+    def paint(
+        self,
+        unit: int,
+        gaussians: Gaussians,
+        view: View,
+        crop: Crop,
+        settings: PaintSettings,
+        *,
+        active: int | None = None,
+        window: ZWindow | None = None,
+    ) -> Parts:
+        """Draw a unit, loaded by `load`, cut by the window of the active block (by fragments) or put
+        whole before or behind the active block (by means). Without an active block all is in front."""
+        if self.ownership == "means":
+            layer = self._draw(gaussians, view, crop, settings, None)
+            nothing = empty_layer(crop.height, crop.width, self.device, layer.color.dtype)
+            front = active is None or self._is_in_front(unit, active, view)
+            return Parts(layer, nothing) if front else Parts(nothing, layer)
+        span = ray_interval(self.tree.box(unit), view, crop) if unit != 0 else _everywhere(crop, self.device)
+        if window is None:
+            return Parts(
+                self._draw(gaussians, view, crop, settings, span),
+                empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype),
+            )
+        before = ZWindow(span.near, torch.minimum(span.far, window.near))
+        behind = ZWindow(torch.maximum(span.near, window.far), span.far)
+        return Parts(
+            self._draw(gaussians, view, crop, settings, before),
+            self._draw(gaussians, view, crop, settings, behind),
+        )
+
+    def order(self, units: tuple[int, ...], view: View) -> tuple[int, ...]:
+        """The units front to back, as `view` sees them."""
+        center = view.center.double().cpu()
+        return tuple(node for node in self._walk(0, center) if node in set(units))
+
+    def fold(self, parts: dict[int, Parts], view: View, crop: Crop) -> Parts:
+        """All units' parts collapsed into one layer in front of the active block and one behind."""
+        ordered = [parts[unit] for unit in self.order(tuple(parts), view)]
+        nothing = empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
+        return Parts(
+            fold([nothing, *(part.front for part in ordered)]),
+            fold([nothing, *(part.back for part in ordered)]),
+        )
+
+    def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
+        """The whole scene through layers, unit by unit: the composited render."""
+        crop = crop or view.full
+        parts = {
+            unit: self.paint(unit, self.load(unit), view, crop, settings) for unit in self.units()
+        }
+        return self.fold(parts, view, crop).front
+
+    def _draw(
+        self, gaussians: Gaussians, view: View, crop: Crop, settings: PaintSettings, window: ZWindow | None
+    ) -> Layer:
+        if len(gaussians) == 0 or (window is not None and not bool((window.near < window.far).any())):
+            return empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
+        with torch.no_grad():
+            return self.rasterizer(
+                gaussians,
+                view,
+                crop=crop,
+                sh_degree=settings.sh_degree,
+                antialiased=settings.antialiased,
+                z_window=window,
+            ).layer
+
+    def _descend(self, node: int, exclude: int | None) -> Iterator[int]:
+        blocks = [block for block in self.tree.leaves(node) if block != exclude]
+        if not blocks:
+            return
+        # By means, a node around the active block would be neither in front of it nor behind it.
+        whole = self.ownership == "fragments" or len(blocks) == len(self.tree.leaves(node))
+        fits = sum(map(self.scene.count, blocks)) <= self._pass_gaussians
+        if whole and (fits or len(self.tree.leaves(node)) == 1):
+            yield node
+            return
+        yield from self._descend(int(self.tree.left[node]), exclude)
+        yield from self._descend(int(self.tree.right[node]), exclude)
+
+    def _walk(self, node: int, center: Float[Tensor, "3"]) -> Iterator[int]:
+        yield node
+        if int(self.tree.block[node]) < 0:
+            for child in node_children_in_order(self.tree, node, center):
+                yield from self._walk(child, center)
+
+    def _is_in_front(self, unit: int, active: int, view: View) -> bool:
+        front, _ = split_around(self.tree, view.center.double().cpu(), active)
+        return self.tree.leaves(unit)[0] in front
+
+
+class _Optics:
+    """Bounds over all views, for a test of reach that does not depend on the view."""
+
+    def __init__(self, views: list[View]) -> None:
+        centers = torch.stack([view.center.double().cpu() for view in views])
+        self._middle = centers.mean(dim=0)
+        self._spread = float((centers - self._middle).norm(dim=1).max())
+        self._focal = min(float(torch.minimum(view.K[0, 0], view.K[1, 1])) for view in views)
+        self.secant = max(_secant(view) for view in views)
+        """1 / cos of the widest angle to the optical axis: the affine projection stretches by as much."""
+
+    def blur(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """World size of the rasterizer's blur at each mean, as the farthest camera sees it."""
+        distance = (means.double() - self._middle.to(means.device)).norm(dim=1) + self._spread
+        return (BLUR_PIXELS / self._focal * distance).to(means.dtype)
+
+
+def _secant(view: View) -> float:
+    # The projection clamps x/z and y/z at 1.3 times the field of view, measured from the image's middle.
+    fx, fy, cx, cy = (float(view.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    x = max(cx, view.width - cx) / fx + 0.15 * view.width / fx
+    y = max(cy, view.height - cy) / fy + 0.15 * view.height / fy
+    return math.sqrt(1 + x * x + y * y)
+
+
+def _everywhere(crop: Crop, device: torch.device) -> ZWindow:
+    infinity = torch.full((crop.height, crop.width), math.inf, device=device)
+    return ZWindow(-infinity, infinity)

@@ -1,0 +1,74 @@
+"""Puts a block into live parameters and Adam optimizers, and takes it out again, moments included."""
+
+from collections.abc import Mapping, MutableMapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from abcd_ns.engine.block_state import MOMENTS, BlockState, Clocks
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+
+Params = MutableMapping[str, Parameter]
+"""The live parameters by name; a dict or a torch ParameterDict."""
+Optimizers = Mapping[str, torch.optim.Optimizer]
+"""One Adam per parameter, under the parameter's name; each with one parameter group."""
+
+
+def attach(state: BlockState, params: Params, optimizers: Optimizers) -> None:
+    """Make `state` the live block: new Parameters, with its moments as Adam's state.
+
+    The Parameters that were live before lose their memory at once, even where something (a logged loss,
+    say) still refers to them.
+    """
+    for name, value in state.gaussians.items():
+        parameter = Parameter(value.detach().clone())
+        group = optimizers[name].param_groups[0]
+        _release(group["params"][0], optimizers[name])
+        group["params"] = [parameter]
+        optimizers[name].state[parameter] = {
+            "step": torch.tensor(float(state.clocks.adam_steps)),
+            **{moment: getattr(getattr(state, moment), name).clone() for moment in MOMENTS},
+        }
+        params[name] = parameter
+
+
+def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clocks: Clocks) -> BlockState:
+    """The live block as a BlockState that shares no memory with later steps; it stays live.
+
+    Args:
+        growth: the strategy's statistics, each [n]; copied.
+        clocks: the block's clocks; `adam_steps` is read from the optimizers.
+    """
+    moments: dict[str, dict[str, Tensor]] = {moment: {} for moment in MOMENTS}
+    steps = clocks.adam_steps
+    for name in PARAM_NAMES:
+        adam = optimizers[name].state.get(params[name], {})
+        for moment in MOMENTS:
+            value = adam.get(moment)
+            moments[moment][name] = torch.zeros_like(params[name]) if value is None else value.detach().clone()
+        steps = max(steps, int(adam.get("step", 0)))
+    return BlockState(
+        Gaussians(**{name: params[name].detach().clone() for name in PARAM_NAMES}),
+        Gaussians(**{n: v.detach() for n, v in moments["exp_avg"].items()}),
+        Gaussians(**{n: v.detach() for n, v in moments["exp_avg_sq"].items()}),
+        {name: value.clone() for name, value in growth.items()},
+        replace(clocks, adam_steps=steps),
+    )
+
+
+def live_gaussians(params: Params) -> Gaussians:
+    """The live parameters as Gaussians, with their gradients' graph."""
+    return Gaussians(**{name: params[name] for name in PARAM_NAMES})
+
+
+def make_adam(params: Params, learning_rates: Mapping[str, float], eps: float = 1e-15) -> Optimizers:
+    """One Adam for each parameter, as 3DGS uses it."""
+    return {name: torch.optim.Adam([params[name]], lr=learning_rates[name], eps=eps) for name in PARAM_NAMES}
+
+
+def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:
+    optimizer.state.pop(parameter, None)
+    parameter.grad = None
+    parameter.data = parameter.data.new_empty(0)

@@ -1,0 +1,58 @@
+"""The relocation of 3DGS-MCMC in torch, for devices that gsplat's CUDA operator does not serve."""
+
+import math
+from functools import cache
+
+import torch
+from jaxtyping import Float, Integer
+from torch import Tensor
+
+
+def compute_relocation(
+    opacities: Float[Tensor, "n ..."],
+    scales: Float[Tensor, "n 3"],
+    ratios: Integer[Tensor, "n"],
+    binoms: Float[Tensor, "m m"],
+) -> tuple[Float[Tensor, "n ..."], Float[Tensor, "n 3"]]:
+    """Opacities and scales with which `ratios` coinciding copies look like the one Gaussian they replace.
+
+    Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", equation 9:
+    o' = 1 - (1 - o)^(1/r) and s' = s o / sum_{i=1..r} sum_{k<i} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1).
+
+    Args:
+        opacities: after the sigmoid; [n] or [n, 1].
+        scales: standard deviations.
+        ratios: number of copies, clamped to 1..m.
+        binoms: binoms[i, k] = C(i, k).
+    """
+    most = binoms.shape[0]
+    copies = ratios.clamp(1, most)
+    flat = opacities.reshape(-1)
+    new = 1 - (1 - flat) ** (1 / copies)
+    k = torch.arange(most, device=flat.device)
+    sign = 1 - 2 * (k % 2)
+    # binoms[:, k] summed over i - 1 = 0 .. r - 1, by a cumulative sum in float64: C(50, 25) is 1e14.
+    weights = binoms.double().cumsum(dim=0)[copies.long() - 1] * sign / torch.sqrt(k + 1.0)
+    denominator = (weights * new.double()[:, None] ** (k + 1)).sum(dim=1)
+    factor = (flat.double() / denominator).to(scales.dtype)
+    return new.reshape(opacities.shape), scales * factor[:, None]
+
+
+def covariances(
+    quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"], **_unused: bool
+) -> tuple[Float[Tensor, "n 3 3"], None]:
+    """R diag(s^2) R^T, in the form of gsplat's `quat_scale_to_covar_preci` with compute_preci=False."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(dim=1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotated = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1) * scales[:, None, :]
+    return rotated @ rotated.transpose(1, 2), None
+
+
+@cache
+def binomials(most: int = 51) -> Float[Tensor, "m m"]:
+    """C(i, k) for i, k < most; zero where k > i."""
+    return torch.tensor([[math.comb(i, k) for k in range(most)] for i in range(most)], dtype=torch.float32)

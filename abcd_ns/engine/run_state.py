@@ -1,0 +1,101 @@
+"""Where a run stands: integers and plans, in JSON, so that a run can stop anywhere and go on exactly."""
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from abcd_ns.engine.schedule import VisitPlan
+from abcd_ns.engine.visit import VisitGeometry
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long a run may be. With both limits the one that is reached first counts."""
+
+    steps: int | None = None
+    """Optimisation steps for the whole scene."""
+    seconds: float | None = None
+    """Seconds of training, drawing layers included, evaluation and saving not."""
+
+    def __post_init__(self) -> None:
+        if self.steps is None and self.seconds is None:
+            raise ValueError("a run needs a budget of steps or of seconds")
+
+    def progress(self, steps: int, seconds: float) -> float:
+        """The share of the run that is done, 0..1."""
+        by_steps = steps / self.steps if self.steps else 0.0
+        by_time = seconds / self.seconds if self.seconds else 0.0
+        return min(max(by_steps, by_time), 1.0)
+
+
+@dataclass
+class ActiveVisit:
+    """The visit that is under way."""
+
+    number: int
+    geometry: VisitGeometry
+    sh_degree: int
+    """In use from the visit's first step to its last, so that its layers stay right."""
+    steps: int
+    done: int = 0
+    layer_seconds: float = 0.0
+    """Training time that went into drawing F and B."""
+    began: float = 0.0
+    """Training time when the visit began."""
+
+
+@dataclass
+class RunState:
+    """All that the coordinator knows besides the blocks themselves."""
+
+    step: int = 0
+    """Optimisation steps taken in the whole scene."""
+    sweep: int = 0
+    visit: int = 0
+    """Visits begun so far."""
+    queue: list[VisitPlan] = field(default_factory=list)
+    """Visits of this sweep still to come."""
+    views: dict[int, int] = field(default_factory=dict)
+    """By block, how many views saw it when last looked at; 0 means that none does."""
+    active: ActiveVisit | None = None
+    seconds: float = 0.0
+    """Training time up to the last save."""
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON; `from_json` gives an equal state."""
+        active = self.active and {**vars(self.active), "geometry": self.active.geometry.to_json()}
+        queue = [[plan.block, plan.steps] for plan in self.queue]
+        views = {str(block): count for block, count in self.views.items()}
+        return {**vars(self), "queue": queue, "active": active, "views": views}
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> "RunState":
+        """The inverse of `to_json`."""
+        active = data["active"]
+        if active is not None:
+            active = ActiveVisit(**{**active, "geometry": VisitGeometry.from_json(active["geometry"])})
+        queue = [VisitPlan(*plan) for plan in data["queue"]]
+        views = {int(block): count for block, count in data["views"].items()}
+        return RunState(**{**data, "queue": queue, "active": active, "views": views})
+
+
+class Stopwatch:
+    """Seconds of training; can be paused for what does not count."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._before = seconds
+        self._since: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        return self._before + running
+
+    def start(self) -> None:
+        """Count from now on; harmless when it already does."""
+        if self._since is None:
+            self._since = time.perf_counter()
+
+    def pause(self) -> None:
+        """Stop counting until `start`."""
+        self._before, self._since = self.seconds, None

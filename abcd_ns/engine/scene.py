@@ -1,0 +1,91 @@
+"""Where the blocks of a scene are to be found: at rest in the store, one of them live in parameters."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Protocol
+
+from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.storage import ParameterStore
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+
+
+class BlockScene(Protocol):
+    """Gaussians by block."""
+
+    tree: BlockTree
+
+    def gaussians(self, block: int) -> Gaussians:
+        """The block's Gaussians, without a graph, wherever they are kept."""
+        ...
+
+    def version(self, block: int) -> int:
+        """Changes whenever the block's Gaussians do."""
+        ...
+
+    def count(self, block: int) -> int:
+        """How many Gaussians the block has."""
+        ...
+
+
+class MemoryScene:
+    """A scene that is one list of Gaussians in memory, parted by a tree."""
+
+    def __init__(self, tree: BlockTree, gaussians: Gaussians) -> None:
+        self.tree = tree
+        owner = tree.assign(gaussians.means)
+        self._blocks = [gaussians[owner == block] for block in range(tree.num_blocks)]
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._blocks[block]
+
+    def version(self, block: int) -> int:  # noqa: ARG002 - the scene never changes
+        return 0
+
+    def count(self, block: int) -> int:
+        return len(self._blocks[block])
+
+
+class StoredScene:
+    """A scene at rest in a ParameterStore, read block by block, with the live block laid over it.
+
+    Blocks that were read stay in RAM, least recently used first out, within `ram_bytes`.
+    """
+
+    def __init__(self, tree: BlockTree, store: ParameterStore, ram_bytes: int = 2 << 30) -> None:
+        self.tree = tree
+        self.store = store
+        self._ram_bytes = ram_bytes
+        self._ram: OrderedDict[tuple[int, int], Gaussians] = OrderedDict()
+        self._live: tuple[int, Callable[[], Gaussians]] | None = None
+
+    def lay_over(self, block: int, live: Callable[[], Gaussians]) -> None:
+        """From now on `block` is what `live` returns, not what the store holds."""
+        self._live = (block, live)
+
+    def lift(self) -> None:
+        """No block is live any more."""
+        self._live = None
+
+    def gaussians(self, block: int) -> Gaussians:
+        if self._live is not None and self._live[0] == block:
+            return self._live[1]().detach()
+        key = (block, self.version(block))
+        if key not in self._ram:
+            self._ram[key] = Gaussians(**self.store.load_names(block, PARAM_NAMES))
+        self._ram.move_to_end(key)
+        found = self._ram[key]
+        while len(self._ram) > 1 and sum(map(_nbytes, self._ram.values())) > self._ram_bytes:
+            self._ram.popitem(last=False)
+        return found
+
+    def version(self, block: int) -> int:
+        return self.store.version(block)
+
+    def count(self, block: int) -> int:
+        if self._live is not None and self._live[0] == block:
+            return len(self._live[1]())
+        return self.store.counts(block)
+
+
+def _nbytes(gaussians: Gaussians) -> int:
+    return sum(value.nbytes for _, value in gaussians.items())

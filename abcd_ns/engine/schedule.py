@@ -1,0 +1,85 @@
+"""Which block next, for how many steps, on which views: pure functions of integers.
+
+There is one step budget for the whole scene. A sweep visits every block that some view sees; a block's
+steps are proportional to the number of those views, as in joint training (design, section 2: blocks that
+few views see overfit otherwise). Visits are short at first, while the neighbours are still blobs, and
+grow longer, so that drawing the frozen layers is paid for by more steps.
+"""
+
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class VisitPlan:
+    """One visit to come."""
+
+    block: int
+    steps: int
+
+
+def passes_of_sweep(sweep: int, first: int, last: int) -> int:
+    """How often each view of a block is used in a visit of this sweep: from `first` up by one to `last`."""
+    return min(first + sweep, max(first, last))
+
+
+def plan_sweep(
+    sweep: int, views: Mapping[int, int], passes: int, remaining: int | None, seed: int
+) -> tuple[VisitPlan, ...]:
+    """The visits of one sweep, in a random order that depends on `seed` and `sweep` alone.
+
+    Args:
+        views: by block, the number of views that see it; blocks seen by none are left out.
+        passes: steps a visit = passes x views.
+        remaining: steps left in the budget, or None without one. Where they do not suffice for the sweep,
+            or would leave less than half a sweep behind, all visits are scaled to use up exactly these.
+    """
+    seen = {block: count for block, count in sorted(views.items()) if count > 0}
+    order = list(seen)
+    random.Random(f"sweep {seed} {sweep}").shuffle(order)
+    full = passes * sum(seen.values())
+    if remaining is None or remaining >= full + full // 2:
+        return tuple(VisitPlan(block, passes * seen[block]) for block in order)
+    if not seen:
+        return ()
+    shares = _apportion(remaining, [seen[block] for block in order])
+    return tuple(VisitPlan(block, share) for block, share in zip(order, shares, strict=True) if share > 0)
+
+
+def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tuple[int, ...]:
+    """The view of each step of a visit: shuffled passes over all views, so that use differs by at most one."""
+    shuffled: list[int] = []
+    rng = random.Random(f"views {seed} {visit}")
+    while len(shuffled) < steps:
+        one_pass = list(views)
+        rng.shuffle(one_pass)
+        shuffled += one_pass
+    return tuple(shuffled[:steps])
+
+
+def exponential_decay(progress: float, initial: float, final: float) -> float:
+    """initial (final / initial)^progress, for progress from 0 to 1; the learning rate of the means in 3DGS."""
+    return initial * (final / initial) ** min(max(progress, 0.0), 1.0)
+
+
+def sh_degree_at(progress: float, ramp: float, highest: int) -> int:
+    """The degree of spherical harmonics in use: one more at each third (for degree 3) of the ramp.
+
+    With ramp = 0.1 and 30,000 steps this is splatfacto's one degree every 1,000 steps.
+    """
+    if ramp <= 0:
+        return highest
+    # 1e-9 keeps degree n exactly at n / highest of the ramp, where the product may fall just below n.
+    return min(int(progress / ramp * highest + 1e-9), highest)
+
+
+def _apportion(total: int, weights: list[int]) -> list[int]:
+    """Integers in proportion to `weights` that add up to `total` exactly (cumulative rounding)."""
+    whole, given, cumulative, shares = sum(weights), 0, 0, []
+    for weight in weights:
+        cumulative += weight
+        upto = total * cumulative // whole
+        shares.append(upto - given)
+        given = upto
+    return shares

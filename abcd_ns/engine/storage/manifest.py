@@ -1,0 +1,158 @@
+"""The one small file that says which shards make up a generation of a store."""
+
+import hashlib
+import json
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+FORMAT = "abcd-parameter-store"
+FORMAT_VERSION = 1
+
+
+class StoreError(RuntimeError):
+    """The store cannot do what was asked; the message names the file and what to do."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """What the manifest says of one block."""
+
+    file: str
+    generation: int
+    """The generation that wrote it: the block's version."""
+    nbytes: int
+    checksum: str
+    """blake2b of the whole file, hexadecimal."""
+    rows: int
+    """Rows of the tensor "means"."""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """One generation of a store."""
+
+    generation: int
+    header: dict[str, Any]
+    state: dict[str, Any]
+    blocks: dict[int, Shard]
+
+    @property
+    def files(self) -> set[str]:
+        return {shard.file for shard in self.blocks.values()}
+
+    def to_bytes(self) -> bytes:
+        """Canonical JSON: equal manifests give equal bytes."""
+        body = asdict(self) | {"blocks": {str(b): asdict(shard) for b, shard in sorted(self.blocks.items())}}
+        envelope = {"format": FORMAT, "version": FORMAT_VERSION, "checksum": _checksum(body), "body": body}
+        return _canonical(envelope)
+
+    @staticmethod
+    def from_bytes(data: bytes, path: Path) -> "Manifest":
+        """The manifest in `data`, which was read from `path`.
+
+        Raises:
+            StoreError: another format or version, or a single altered byte.
+        """
+        try:
+            envelope = json.loads(data)
+        except ValueError as error:
+            raise StoreError(f"{path} is damaged: it is not JSON ({error}).") from error
+        if not isinstance(envelope, dict) or envelope.get("format") != FORMAT:
+            raise StoreError(f"{path} is not the manifest of a parameter store.")
+        version = envelope.get("version")
+        if version != FORMAT_VERSION:
+            raise StoreError(
+                f"{path} has format version {version}; this program reads version {FORMAT_VERSION}. "
+                "Open it with the program that wrote it."
+            )
+        body = envelope.get("body")
+        # Comparing the bytes as well finds alterations that JSON reads as the same value.
+        if envelope.get("checksum") != _checksum(body) or _canonical(envelope) != data:
+            raise StoreError(f"{path} is damaged: its checksum is wrong. Restore it from a pin or a copy.")
+        blocks = {int(block): Shard(**shard) for block, shard in body["blocks"].items()}
+        return Manifest(body["generation"], body["header"], body["state"], blocks)
+
+
+def manifest_path(folder: Path, name: str | None = None) -> Path:
+    """Where the present manifest lies, or the one pinned under `name`.
+
+    Raises:
+        ValueError: a name with other characters than letters, digits, '_', '-' and '.'.
+    """
+    if name is None:
+        return folder / "manifest.json"
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", name):
+        raise ValueError(f"A pin's name may hold letters, digits, '_', '-' and '.'; got {name!r}.")
+    return folder / f"manifest-{name}.json"
+
+
+def pin_names(folder: Path) -> list[str]:
+    """The names under which generations of the store in `folder` are pinned."""
+    return sorted(path.stem.removeprefix("manifest-") for path in folder.glob("manifest-*.json"))
+
+
+def read_manifest(path: Path) -> Manifest:
+    """The manifest in a file.
+
+    Raises:
+        StoreError: missing, unreadable, of another format or damaged.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        what = "is no parameter store" if path.stem == "manifest" else "has no such pin"
+        raise StoreError(
+            f"{path.parent} {what}: there is no {path.name}; check the folder and the name."
+        ) from error
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
+    return Manifest.from_bytes(data, path)
+
+
+def read_checked_manifest(path: Path) -> Manifest:
+    """As `read_manifest`, and every shard is there with its right size.
+
+    Raises:
+        StoreError: as `read_manifest`; or a shard is missing, or has another size.
+    """
+    while True:
+        manifest = read_manifest(path)
+        problem = _missing_or_resized(path.parent, manifest)
+        if problem is None:
+            return manifest
+        if read_manifest(path) == manifest:
+            raise StoreError(problem)
+        # A writer has committed meanwhile, and deleted shards of the generation read here.
+
+
+def json_copy(value: dict[str, Any]) -> dict[str, Any]:
+    """`value` as it will be after a reopen: tuples are lists, keys are strings.
+
+    Raises:
+        TypeError, ValueError: no dictionary, or something in it is not JSON.
+    """
+    if not isinstance(value, dict):
+        raise TypeError(f"A store keeps JSON dictionaries, not {type(value).__name__}.")
+    return json.loads(json.dumps(value))
+
+
+def _missing_or_resized(folder: Path, manifest: Manifest) -> str | None:
+    for shard in manifest.blocks.values():
+        path = folder / shard.file
+        try:
+            nbytes = path.stat().st_size
+        except OSError as error:
+            return f"{path} cannot be read: {error.strerror}."
+        if nbytes != shard.nbytes:
+            return f"{path} is damaged: it should have {shard.nbytes} bytes but has {nbytes}."
+    return None
+
+
+def _canonical(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, indent=1).encode()
+
+
+def _checksum(body: Any) -> str:
+    return hashlib.blake2b(_canonical(body), digest_size=16).hexdigest()

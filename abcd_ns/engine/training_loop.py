@@ -1,0 +1,39 @@
+"""The plainest caller of a coordinator: for tests, benchmarks, and anyone without nerfstudio."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.loss import psnr
+from abcd_ns.engine.types import Crop
+
+PhotoReader = Callable[[int, Crop], Float[Tensor, "h w 3"]]
+"""Gives the pixels of a crop of a view's photo, 0..1, by the view's index."""
+
+
+def train(coordinator: Coordinator, photo: PhotoReader, steps: int | None = None) -> None:
+    """Take `steps` optimisation steps, or go on until the coordinator's budget is used up."""
+    taken = 0
+    while not coordinator.finished and (steps is None or taken < steps):
+        train_step(coordinator, photo)
+        taken += 1
+
+
+def train_step(coordinator: Coordinator, photo: PhotoReader) -> None:
+    """Render a sample, take its loss' gradient, step every optimizer, report back."""
+    sample = coordinator.next_sample()
+    target = photo(sample.view.index, sample.crop).to(coordinator.device)
+    rendered = coordinator.render(sample)
+    loss = coordinator.loss(sample, rendered, target)
+    for optimizer in coordinator.optimizers.values():
+        optimizer.zero_grad(set_to_none=True)
+    if loss.requires_grad:
+        loss.backward()
+    for optimizer in coordinator.optimizers.values():
+        optimizer.step()
+    with torch.no_grad():
+        quality = float(psnr(rendered.rgb, target))
+    coordinator.after_step(rendered, quality)

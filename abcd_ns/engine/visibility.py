@@ -1,0 +1,149 @@
+"""What of a block can be seen where: footprints in the image, views to train on, and reach into cells."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int64, Integer, Real
+from torch import Tensor
+
+from abcd_ns.engine.blocks import Box
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+DRAWN_SIGMAS = 3.33
+"""How far out a Gaussian is drawn, in standard deviations on screen. Fragments under alpha = 1/255 are
+skipped, and opacity is at most 1, so exp(-d^2 / 2) >= 1/255: d <= sqrt(2 ln 255) = 3.3291."""
+
+BLUR_VARIANCE = 0.3
+"""The variance that is added to every projected Gaussian (gsplat's eps2d), px^2."""
+
+
+def footprint(
+    means2d: Float[Tensor, "n 2"], radii: Real[Tensor, "n"], view: View, margin: int = 0, align: int = 16
+) -> Crop | None:
+    """The smallest aligned crop that holds everything that these projected Gaussians can draw.
+
+    Args:
+        means2d: centres in the full image, px.
+        radii: half the sides of their squares, px; 0 where culled.
+        margin: grow by this many px (a loss that looks at neighbouring pixels needs it).
+        align: move the edges outward to multiples of this many px, or to the image's border. With the
+            rasterizer's tile size (gsplat's is 16) no pixel is missed: it draws a Gaussian on all of
+            each tile that its square touches, which may be beyond the square.
+
+    Returns:
+        The crop, or None if nothing is in the image.
+    """
+    if margin < 0 or align < 1:
+        raise ValueError(f"a footprint needs margin >= 0 and align >= 1, got {margin} and {align}")
+    size = means2d.new_tensor([view.width, view.height])
+    low, high = means2d - radii[:, None], means2d + radii[:, None]
+    visible = (radii > 0) & (high > 0).all(dim=1) & (low < size).all(dim=1)
+    if not bool(visible.any()):
+        return None
+    (x0, y0), (x1, y1) = low[visible].amin(dim=0).tolist(), high[visible].amax(dim=0).tolist()
+    x, width = _aligned_span(x0, x1, view.width, margin, align)
+    y, height = _aligned_span(y0, y1, view.height, margin, align)
+    return Crop(x, y, width, height)
+
+
+def select_views(visible_counts: Integer[Tensor, "v"], min_visible: int = 1) -> Int64[Tensor, "m"]:
+    """The views that train a block, ascending: those that see at least `min_visible` of its Gaussians."""
+    return (visible_counts >= min_visible).nonzero()[:, 0]
+
+
+def fragment_box_intersects(
+    depths: Float[Tensor, "n"],
+    means2d: Float[Tensor, "n 2"],
+    radii: Real[Tensor, "n"],
+    view: View,
+    box: Box,
+    crop: Crop | None = None,
+) -> Bool[Tensor, "n"]:
+    """Whether any fragment of each Gaussian may lie in `box`: False is certain, True may be cautious.
+
+    A Gaussian's fragments lie at its mean's camera z, within its square on the screen: in the world, a
+    parallelogram parallel to the image plane. It is tested by the bounds of its four corners.
+
+    Args:
+        depths: camera z of the means, world units.
+        means2d: centres in the full image, px.
+        radii: gsplat's 3 sigma radii, px; 0 where culled.
+        crop: only fragments at these pixels count; None means the whole image.
+    """
+    crop = crop or view.full
+    reach = radii.to(means2d.dtype)[:, None] * (DRAWN_SIGMAS / 3)
+    first = means2d.new_tensor([crop.x, crop.y])
+    last = means2d.new_tensor([crop.x + crop.width, crop.y + crop.height])
+    low, high = torch.maximum(means2d - reach, first), torch.minimum(means2d + reach, last)
+    drawn = (radii > 0) & (low <= high).all(dim=1)
+    u = torch.stack([low[:, 0], high[:, 0], low[:, 0], high[:, 0]])
+    v = torch.stack([low[:, 1], low[:, 1], high[:, 1], high[:, 1]])
+    corners = _unproject(torch.stack([u, v], dim=-1), depths.expand(4, -1), view)
+    lower, upper = box.lower.to(corners), box.upper.to(corners)
+    touches = (corners.amin(dim=0) <= upper) & (corners.amax(dim=0) >= lower)
+    return drawn & touches.all(dim=1)
+
+
+def reach_radius(scales: Float[Tensor, "n 3"], sigma: float = DRAWN_SIGMAS) -> Float[Tensor, "n"]:
+    """`sigma` standard deviations along each Gaussian's longest axis, world units; `scales` are logs."""
+    return sigma * scales.amax(dim=1).exp()
+
+
+def blur_reach(depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:
+    """How much further than its own size a Gaussian at camera z = `depths` is drawn, world units.
+
+    DRAWN_SIGMAS sqrt(BLUR_VARIANCE) px, which is that many z / f; at most, as sqrt(a^2 + b^2) <= a + b.
+    """
+    focal = torch.minimum(view.K[0, 0], view.K[1, 1])
+    return DRAWN_SIGMAS * math.sqrt(BLUR_VARIANCE) * depths / focal
+
+
+def widest_slant(view: View) -> float:
+    """How much longer a Gaussian may be drawn at its own camera z than it is: 1 / cos of the widest angle.
+
+    Splatting projects along the line of sight onto the plane of the mean's camera z: there an offset
+    (dx, dy, dz) lands at (dx - dz x/z, dy - dz y/z), longer by sqrt(1 + (x/z)^2 + (y/z)^2) at most. gsplat
+    clamps x/z at the image's border plus 0.15 of its width (0.3 tan of half the field of view); y/z alike.
+    """
+    limits = []
+    for size, focal, middle in (
+        (view.width, float(view.K[0, 0]), float(view.K[0, 2])),
+        (view.height, float(view.K[1, 1]), float(view.K[1, 2])),
+    ):
+        limits.append((max(middle, size - middle) + 0.15 * size) / focal)
+    return math.hypot(1.0, *limits)
+
+
+def reaches(
+    gaussians: Gaussians, box: Box, blur: Float[Tensor, "n"] | float = 0.0, slant: float = 2.0
+) -> Bool[Tensor, "n"]:
+    """Whether any fragment of each Gaussian may lie in `box`, from any view: False is certain.
+
+    True where the distance from the mean to the box is at most slant * reach_radius + blur.
+
+    Args:
+        blur: world-size addition for the screen's blur; blur_reach gives it for one view.
+        slant: the largest `widest_slant` of the views in question. 2 covers fields of view up to about
+            90 degrees horizontally by 60 vertically.
+    """
+    means = gaussians.means
+    outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
+    return outside.norm(dim=1) <= slant * reach_radius(gaussians.scales) + blur
+
+
+def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -> tuple[int, int]:
+    """(first pixel, number of pixels) of [low, high] grown, aligned outward and clipped to 0 .. size."""
+    start = (math.floor(max(low, 0.0)) - margin) // align * align
+    stop = -((-math.ceil(min(high, float(size))) - margin) // align) * align
+    start, stop = max(start, 0), min(stop, size)
+    return start, stop - start
+
+
+def _unproject(
+    means2d: Float[Tensor, "*batch 2"], depths: Float[Tensor, "*batch"], view: View
+) -> Float[Tensor, "*batch 3"]:
+    """World-space points at given pixels and camera z."""
+    x = (means2d[..., 0] - view.K[0, 2]) / view.K[0, 0] * depths
+    y = (means2d[..., 1] - view.K[1, 2]) / view.K[1, 1] * depths
+    camera = torch.stack([x, y, depths], dim=-1)
+    return (camera - view.viewmat[:3, 3]) @ view.viewmat[:3, :3]

@@ -1,0 +1,235 @@
+"""One visit: what a block looks like to its views, and the frozen layers around it."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.blocks import Box
+from abcd_ns.engine.compositing import empty_layer
+from abcd_ns.engine.intervals import ray_interval
+from abcd_ns.engine.loss import SSIM_WINDOW
+from abcd_ns.engine.painter import SUPPORT, Painter, PaintSettings, Parts
+from abcd_ns.engine.rasterizer import ZWindow
+from abcd_ns.engine.rasterizer.projection import project
+from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError
+from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.visibility import footprint, fragment_box_intersects
+
+CROP_MARGIN = SSIM_WINDOW - 1
+"""Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
+
+
+@dataclass(frozen=True)
+class VisitGeometry:
+    """What is decided once, when a visit begins, and must be the same after a resume."""
+
+    block: int
+    crops: dict[int, Crop]
+    """By view index, the pixels to train on; views that do not see the block are missing."""
+    window: Box | None
+    """The box in which frozen fragments are sorted in with the active ones; None by means."""
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """Indices of the views that see the block."""
+        return tuple(sorted(self.crops))
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON; numbers survive exactly."""
+        crops = {str(i): [c.x, c.y, c.width, c.height] for i, c in self.crops.items()}
+        window = self.window and [self.window.lower.tolist(), self.window.upper.tolist()]
+        return {"block": self.block, "crops": crops, "window": window}
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> "VisitGeometry":
+        """The inverse of `to_json`."""
+        crops = {int(i): Crop(*crop) for i, crop in data["crops"].items()}
+        window = data["window"] and Box(*(torch.tensor(side, dtype=torch.float64) for side in data["window"]))
+        return VisitGeometry(data["block"], crops, window)
+
+
+def survey(
+    gaussians: Gaussians,
+    block: int,
+    views: Iterable[View],
+    *,
+    cell: Box | None,
+    percentile: float = 0.9,
+    align: int = 16,
+) -> VisitGeometry:
+    """Which views see the block's Gaussians, and where in the image.
+
+    Args:
+        cell: the block's cell; the window is this, grown to hold the given share of the block's extents
+            at each face. None for no window.
+        align: crops begin and end on multiples of this, pixels (or at the image's edge).
+    """
+    crops = {}
+    with torch.no_grad():
+        for view in views:
+            seen = project(gaussians, view)
+            crop = footprint(seen.means2d, seen.radii, view, margin=CROP_MARGIN, align=align)
+            if crop is not None:
+                crops[view.index] = crop
+    return VisitGeometry(block, crops, cell and grow_to_extents(cell, gaussians, percentile))
+
+
+def grow_to_extents(cell: Box, gaussians: Gaussians, percentile: float) -> Box:
+    """The cell, grown at each face until the given share of the Gaussians' extents does not reach past it."""
+    if len(gaussians) == 0:
+        return cell
+    extent = SUPPORT * gaussians.scales.exp().amax(dim=1, keepdim=True).double()
+    means = gaussians.means.double()
+    lower = torch.quantile(means - extent, 1 - percentile, dim=0).cpu()
+    upper = torch.quantile(means + extent, percentile, dim=0).cpu()
+    return Box(torch.minimum(cell.lower, lower), torch.maximum(cell.upper, upper))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What one training view sees around the active block."""
+
+    layers: Parts
+    """F (front) and B (back), for the view's crop."""
+    near: Gaussians | None
+    """Frozen Gaussians to be sorted in with the active ones."""
+    window: ZWindow | None
+    """Where the fragments of `near` count."""
+
+
+class VisitLayers:
+    """F and B for the views of one visit, drawn once and kept in the layer cache.
+
+    Args:
+        geometry: crops and window.
+        views: all views, by index.
+        scene_key: fingerprint of all else that changes a pixel, for the cache's keys.
+    """
+
+    def __init__(
+        self,
+        painter: Painter,
+        cache: LayerCache,
+        geometry: VisitGeometry,
+        views: Mapping[int, View],
+        settings: PaintSettings,
+        scene_key: str,
+    ) -> None:
+        self._painter, self._cache = painter, cache
+        self._geometry, self._views, self._settings = geometry, views, settings
+        self._scene_key = scene_key
+        self._versions = self._frozen_versions()
+        self._units = painter.units(exclude=geometry.block)
+        self._loaded: dict[int, Gaussians] = {}
+        self._near = self._load_near()
+        self._near_rows: dict[int, Tensor] = {}
+
+    def draw(self, views: Iterable[int]) -> Iterable[int]:
+        """Draw what the cache lacks for these views; yields each view when it is ready.
+
+        Units are taken one after the other, each for all views, so that the device holds one at a time.
+        """
+        missing = [view for view in dict.fromkeys(views) if self._cached(view) is None]
+        parts: dict[int, dict[int, Parts]] = {view: {} for view in missing}
+        for unit in self._units:
+            gaussians = self._painter.load(unit, exclude=self._geometry.block)
+            for view in missing:
+                parts[view][unit] = self._paint(unit, gaussians, view)
+                if unit == self._units[-1]:
+                    self._keep(view, parts.pop(view))
+                    yield view
+
+    def around(self, view: int) -> Surroundings:
+        """What `view` sees around the active block.
+
+        Raises:
+            StaleLayerError: a frozen block has changed since the visit began.
+        """
+        if self._frozen_versions() != self._versions:
+            raise StaleLayerError(f"a frozen block changed during the visit of block {self._geometry.block}")
+        layers = self._cached(view)
+        if layers is None:  # never drawn, or the disposable cache has lost it
+            for _ in self.draw([view]):
+                pass
+            layers = self._cached(view)
+        crop = self._geometry.crops[view]
+        if layers is None:
+            raise StaleLayerError(f"the layer cache does not keep what was just drawn for view {view}")
+        return Surroundings(layers, self._near_of(view), self._window(view, crop))
+
+    def _frozen_versions(self) -> dict[int, int]:
+        scene = self._painter.scene
+        return {b: scene.version(b) for b in range(scene.tree.num_blocks) if b != self._geometry.block}
+
+    def _window(self, view: int, crop: Crop) -> ZWindow | None:
+        if self._geometry.window is None:
+            return None
+        return ray_interval(self._geometry.window, self._views[view], crop)
+
+    def _paint(self, unit: int, gaussians: Gaussians, view: int) -> Parts:
+        crop = self._geometry.crops[view]
+        return self._painter.paint(
+            unit,
+            gaussians,
+            self._views[view],
+            crop,
+            self._settings,
+            active=self._geometry.block,
+            window=self._window(view, crop),
+        )
+
+    def _keep(self, view: int, parts: dict[int, Parts]) -> None:
+        crop = self._geometry.crops[view]
+        folded = self._painter.fold(parts, self._views[view], crop)
+        for side in ("front", "back"):
+            self._cache.put(self._key(view, side), getattr(folded, side))
+
+    def _cached(self, view: int) -> Parts | None:
+        if not self._units:
+            crop, matrix = self._geometry.crops[view], self._views[view].viewmat
+            nothing = empty_layer(crop.height, crop.width, self._painter.device, matrix.dtype)
+            return Parts(nothing, nothing)
+        front, back = (self._cache.get(self._key(view, side)) for side in ("front", "back"))
+        if front is None or back is None:
+            return None
+        return Parts(front, back)
+
+    def _key(self, view: int, side: str) -> LayerKey:
+        return visit_layer_key(
+            scene=self._scene_key,
+            view=self._views[view],
+            side=side,
+            geometry=self._geometry,
+            versions=self._versions,
+            settings=self._settings,
+            rasterizer=self._painter.rasterizer.name,
+        )
+
+    def _load_near(self) -> Gaussians | None:
+        window, scene = self._geometry.window, self._painter.scene
+        if window is None or not self._versions:
+            return None
+        near = [self._painter.reaching(block, window) for block in self._versions if scene.count(block) > 0]
+        return Gaussians.cat(near).to(self._painter.device) if near else None
+
+    def _near_of(self, view: int) -> Gaussians | None:
+        """Of the frozen Gaussians that reach into the window, those that this view sees there."""
+        if self._near is None or self._geometry.window is None:
+            return None
+        if view not in self._near_rows:
+            camera = self._views[view]
+            with torch.no_grad():
+                seen = project(self._near, camera)
+                # The square of 3 sigma is what gsplat bins by; ellipses reach 3.33 sigma within its tiles.
+                radii = torch.ceil(seen.radii * (SUPPORT / 3)).to(seen.radii.dtype)
+                hit = fragment_box_intersects(
+                    seen.depths, seen.means2d, radii, camera, self._geometry.window
+                )
+            self._near_rows[view] = torch.where(hit & (seen.radii > 0))[0]
+        rows = self._near_rows[view]
+        return self._near[rows] if len(rows) else None

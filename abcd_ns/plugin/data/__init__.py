@@ -1,0 +1,1 @@
+"""Reading scenes: models, photos and the frame they are put in."""

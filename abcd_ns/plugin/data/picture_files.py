@@ -1,0 +1,105 @@
+"""Looks at picture files without decoding them: size, kind, and whether the end is there."""
+
+import stat
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, UnidentifiedImageError
+
+from abcd_ns.plugin.input_errors import InputError
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"})
+"""What counts as a photo when a folder is listed."""
+
+_MODES = frozenset({"RGB", "RGBA", "L", "LA", "P", "1"})
+_ENDS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND\xaeB`\x82"}
+_ORIENTATION_TAG = 0x0112
+_PNG_BIT_DEPTH_BYTE = 24
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a picture file says of itself."""
+
+    width: int
+    height: int
+    format: str
+    turned: bool
+    """Its EXIF orientation swaps width and height."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) as stored: EXIF orientation is not applied, as COLMAP does not."""
+        return self.width, self.height
+
+
+def check_regular(path: Path) -> None:
+    """Refuse what must not be opened: a missing file, a folder, a pipe (it would block), no bytes.
+
+    Raises:
+        InputError: names `path`.
+    """
+    try:
+        status = path.stat()
+    except OSError as error:
+        what = "is a link to nothing" if path.is_symlink() else f"cannot be read ({error.strerror})"
+        raise InputError(f"{path} {what}; copy the photo there.") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path} is not a regular file; copy the photo there.")
+    if status.st_size == 0:
+        raise InputError(f"{path} is empty; copy the photo again.")
+
+
+def read_header(path: Path) -> Header:
+    """The header of a photo; reads a few hundred bytes. Not thread-safe (it sets warning filters).
+
+    Raises:
+        InputError: missing, empty, a pipe, not a picture, over 89 Mpx, 16 bits deep or CMYK.
+    """
+    check_regular(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path) as picture:
+                _check_kind(path, picture)
+                turned = picture.getexif().get(_ORIENTATION_TAG, 1) in (5, 6, 7, 8)
+                return Header(picture.width, picture.height, picture.format or "", turned)
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+        raise InputError(f"{path} has more than 89 Mpx; reduce the photo and make the model again.") from None
+    except UnidentifiedImageError:
+        raise InputError(f"{path} is not a picture; copy the photo again or save it as JPEG or PNG.") from None
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None
+
+
+def _check_kind(path: Path, picture: Image.Image) -> None:
+    """Refuse pictures whose conversion to 8-bit sRGB would be a guess."""
+    deep = picture.mode.startswith(("I", "F"))
+    if picture.format == "PNG":
+        # Pillow cuts 16-bit RGB to 8 bits without a word, so look at the file.
+        with path.open("rb") as file:
+            deep = deep or file.read(_PNG_BIT_DEPTH_BYTE + 1)[_PNG_BIT_DEPTH_BYTE] == 16
+    if deep:
+        raise InputError(f"{path} has more than 8 bits a channel; convert it to 8 bits.")
+    if picture.mode not in _MODES:
+        raise InputError(f"{path} is a {picture.mode} picture; convert it to RGB.")
+
+
+def check_complete(path: Path, header: Header) -> None:
+    """Refuse a cut file, in one short read; only files with a doubtful end are decoded to make sure.
+
+    Raises:
+        InputError: names `path`.
+    """
+    end = _ENDS.get(header.format)
+    with path.open("rb") as file:
+        file.seek(-min(64, path.stat().st_size), 2)
+        tail = file.read()
+    if end is not None and end in tail:
+        return
+    try:
+        with Image.open(path) as picture:
+            picture.load()
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None

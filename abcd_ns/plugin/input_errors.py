@@ -1,0 +1,58 @@
+"""Errors in what the user gave: one line per file, naming the file and what to do about it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+def one_line(text: str) -> str:
+    """`text` fit for a terminal: control characters and undecodable bytes of file names are escaped."""
+    printable = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+    return printable.encode("utf-8", "backslashreplace").decode()
+
+
+class InputError(Exception):
+    """The input cannot be used; a command shows `str(error)` alone and exits with code 2.
+
+    Args:
+        lines: what is wrong, each a sentence that names the file or value and the fix.
+    """
+
+    def __init__(self, *lines: str):
+        self.lines = tuple(one_line(line) for line in lines)
+        super().__init__("\n".join(self.lines))
+
+
+class Problems:
+    """Collects errors so that all bad files are named at once, instead of one per run.
+
+    Args:
+        limit: how many lines are shown; the rest is counted.
+    """
+
+    def __init__(self, limit: int = 20):
+        self.limit = limit
+        self.lines: list[str] = []
+
+    def add(self, line: str) -> None:
+        """Note one problem and go on."""
+        self.lines.append(line)
+
+    @contextmanager
+    def collect(self) -> Iterator[None]:
+        """Note the InputError that the body raises, if any, and go on after it."""
+        try:
+            yield
+        except InputError as error:
+            self.lines.extend(error.lines)
+
+    def raise_if_any(self) -> None:
+        """Raise one InputError with all that was noted.
+
+        Raises:
+            InputError: something was noted.
+        """
+        if not self.lines:
+            return
+        rest = len(self.lines) - self.limit
+        more = [f"... and {rest} more like these ({len(self.lines)} in all)."] if rest > 0 else []
+        raise InputError(*self.lines[: self.limit], *more)

@@ -1,0 +1,26 @@
+"""Set-up that must happen before any test module is imported."""
+
+import sys
+from types import ModuleType
+
+import torch
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+# Shapes and dtypes in the engine's signatures are checked on every call. The hook only works on modules
+# that are not imported yet, hence here and not in a fixture.
+install_import_hook("abcd_ns.engine", "beartype.beartype")
+
+# The same sums in the same order on any machine, and room for other processes.
+torch.set_num_threads(2)
+
+# derandomize: a failure shows up on every run or on none. No deadline: shared machines stall.
+settings.register_profile("abcd", derandomize=True, deadline=None, max_examples=40, database=None)
+settings.load_profile("abcd")
+
+if not torch.cuda.is_available():
+    # The first CUDA op of gsplat would start a build of many CPU-minutes where nvcc is on the PATH, and
+    # could not run afterwards. With this it fails at once, as it does where there is no nvcc.
+    backend = ModuleType("gsplat.cuda._backend")
+    backend._C = None
+    sys.modules["gsplat.cuda._backend"] = backend
