@@ -16,6 +16,7 @@ help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(STAMP)  ## make .venv with every package at its tested version
+	@:
 
 # The script's own changes matter too: they may install something else.
 $(STAMP): pyproject.toml constraints.txt scripts/setup.sh
@@ -28,7 +29,7 @@ test: lint  ## lint, then all tests but those that need a GPU (ARGS: pytest's)
 lint: setup  ## check style, formatting and who may import whom
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@PYTHONPATH=. $(BIN)/lint-imports
+	@PYTHONPATH=. $(BIN)/lint-imports --no-logo
 
 format: setup  ## reformat the code and mend what can be mended
 	@$(BIN)/ruff format .

@@ -30,7 +30,8 @@ find_python() {
   if [[ -n $without_venv ]]; then
     die "$without_venv has no venv module; on Debian or Ubuntu: sudo apt-get install $(basename "$without_venv")-venv"
   fi
-  die "${PYTHON:+PYTHON=$PYTHON is not usable: }no Python 3.10, 3.11 or 3.12 found; install one, or name it: make setup PYTHON=/path/to/python3.11"
+  [[ -z ${PYTHON:-} ]] || die "PYTHON=$PYTHON is no Python 3.10, 3.11 or 3.12"
+  die "no Python 3.10, 3.11 or 3.12 found; install one, or name it: make setup PYTHON=/path/to/python3.11"
 }
 
 venv_works() {
@@ -80,7 +81,7 @@ install_packages() {
   # shellcheck disable=SC2064  # the name is wanted now: the variable is local
   trap "rm -f '$packages'" EXIT
   list_packages >"$packages"
-  say "installing $(grep -c '==' "$packages") pinned packages: about 3 GB to download the first time, 7 GB on disk"
+  say "installing the pinned packages: about 3 GB to download the first time, 7 GB on disk"
   touch "$UNFINISHED"
   # --no-deps: the list is complete, so nothing unpinned can slip in.
   install_with_uv "$packages" || {

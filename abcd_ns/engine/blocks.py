@@ -11,8 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-FORMAT = "abcd_ns.block_tree"
-VERSION = 1
+FORMAT = "abcd_ns.block_tree/1"
 MAX_CELLS = 65_536
 """The most cells that a grid may have: far more than any scene needs, few enough to fit in memory."""
 
@@ -26,9 +25,7 @@ class Box:
 
     def __post_init__(self) -> None:
         if not bool((self.lower <= self.upper).all()):
-            raise ValueError(
-                f"a box needs lower <= upper, got {self.lower.tolist()} and {self.upper.tolist()}"
-            )
+            raise ValueError(f"a box needs lower <= upper, not {self.lower.tolist()}, {self.upper.tolist()}")
 
     def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether lower <= x < upper on all axes, compared in float64 as BlockTree.assign does."""
@@ -73,13 +70,16 @@ class BlockTree:
     """-1 for the root."""
 
     def __post_init__(self) -> None:
-        _check_structure(self)
+        if not _is_tree(self):
+            raise ValueError(
+                "block tree: not a binary tree, parents first, with blocks 0 to K - 1 at its leaves"
+            )
         lower, upper = self._bounds
-        nodes = (self.axis >= 0).nonzero()[:, 0]
-        along = self.axis[nodes]
-        cuts = (lower[nodes, along] < self.threshold[nodes]) & (self.threshold[nodes] < upper[nodes, along])
+        node = (self.axis >= 0).nonzero()[:, 0]
+        axis, threshold = self.axis[node], self.threshold[node]
+        cuts = (lower[node, axis] < threshold) & (threshold < upper[node, axis])
         if not bool(cuts.all()):
-            raise ValueError(f"block tree: node {int(nodes[~cuts][0])} has a threshold outside its own box")
+            raise ValueError(f"block tree: node {int(node[~cuts][0])} has a threshold outside its own box")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, BlockTree) and self.to_json() == other.to_json()
@@ -90,14 +90,6 @@ class BlockTree:
     @property
     def num_blocks(self) -> int:
         return (self.axis.shape[0] + 1) // 2
-
-    @cached_property
-    def depth(self) -> int:
-        """Splits between the root and the deepest leaf; 0 for a tree of one block."""
-        depths = [0]
-        for parent in self.parent.tolist()[1:]:
-            depths.append(depths[parent] + 1)
-        return max(depths)
 
     @cached_property
     def _bounds(self) -> tuple[Float64[Tensor, "m 3"], Float64[Tensor, "m 3"]]:
@@ -118,7 +110,7 @@ class BlockTree:
         axis, threshold = self.axis.to(device), self.threshold.to(device)
         left, right, block = self.left.to(device), self.right.to(device), self.block.to(device)
         node = torch.zeros(len(points), dtype=torch.int64, device=device)
-        for _ in range(self.depth):
+        while bool((axis[node] >= 0).any()):
             along = axis[node]
             value = exact.gather(1, along.clamp(min=0)[:, None])[:, 0]
             child = torch.where(value < threshold[node], left[node], right[node])
@@ -178,7 +170,7 @@ class BlockTree:
         lower, upper = (float(bounds[node, axis]) for bounds in self._bounds)
         if not lower < threshold < upper:
             raise ValueError(
-                f"block {block} spans {lower} to {upper} on axis {axis}: {threshold} does not cut it"
+                f"block {block} spans {lower} to {upper} on axis {axis}: {threshold} cuts nothing"
             )
         rows = self._rows()
         rows[node] = (axis, float(threshold), len(rows), len(rows) + 1, -1)
@@ -187,14 +179,14 @@ class BlockTree:
     def to_json(self) -> str:
         """As text that from_json turns back into the same tree, bit for bit."""
         # json writes a float as repr does: the shortest text that reads back as the same float64.
-        return json.dumps({"format": FORMAT, "version": VERSION, "nodes": self._rows()})
+        return json.dumps({"format": FORMAT, "nodes": self._rows()})
 
     @staticmethod
     def from_json(text: str) -> "BlockTree":
         """The tree that to_json wrote.
 
         Raises:
-            ValueError: the text is not JSON, not of this format and version, or describes no tree.
+            ValueError: the text is not JSON, not of this format, or describes no tree.
         """
         try:
             data = json.loads(text)
@@ -202,13 +194,9 @@ class BlockTree:
             raise ValueError(f"block tree: not valid JSON ({error})") from error
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ValueError(f'block tree: expected a JSON object with "format": "{FORMAT}"')
-        if data.get("version") != VERSION:
-            raise ValueError(f"block tree: version {data.get('version')} cannot be read, only {VERSION}")
         rows = data.get("nodes")
         if not isinstance(rows, list) or not all(_is_row(row) for row in rows):
-            raise ValueError(
-                'block tree: "nodes" must list [axis, threshold, left, right, block] of each node'
-            )
+            raise ValueError('block tree: "nodes" must list [axis, threshold, left, right, block] of each')
         return _from_rows(rows)
 
     def _rows(self) -> list[tuple]:
@@ -265,11 +253,11 @@ def build_kd(
         raise ValueError(f"cannot build {num_blocks} blocks: ask for 1 or more")
     _check_finite(points)
     weights = points.new_ones(len(points)) if weights is None else weights
-    if len(weights) != len(points) or not bool((weights.isfinite() & (weights >= 0)).all()):
-        raise ValueError("weights must be finite, 0 or more, and one per point")
+    if not bool((weights.isfinite() & (weights >= 0)).all()):
+        raise ValueError("weights must be finite and 0 or more")
     points, weights = _float64(points).cpu(), _float64(weights).cpu()
     everything = Box(torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double())
-    return _flatten(_kd_node(points, weights, everything, num_blocks, (0.0, float(weights.sum()))))
+    return _flatten(_kd_node(points, weights, everything, num_blocks))
 
 
 def build_grid(
@@ -295,37 +283,28 @@ def build_grid(
         sizes = [(extent or 1.0) / n for extent, n in zip(extents, counts, strict=True)]
     else:
         sizes = [float(cell_size)] * 3
-        counts = tuple(max(1, math.ceil(extent / cell_size)) for extent in extents)
+        # Capped so that the product below stays small enough for an integer.
+        counts = tuple(math.ceil(min(max(extent / cell_size, 1.0), 2.0 * MAX_CELLS)) for extent in extents)
     if math.prod(counts) > MAX_CELLS:
-        raise ValueError(
-            f"the grid would have {counts} cells, over {MAX_CELLS} in all: make its cells larger"
-        )
+        raise ValueError(f"the grid would have over {MAX_CELLS} cells: make them fewer or larger")
     grid = zip(start.tolist(), sizes, counts, strict=True)
     return _flatten(_grid_node([[lo + size * i for i in range(1, n)] for lo, size, n in grid]))
 
 
-def _kd_node(points: Tensor, weights: Tensor, box: Box, k: int, ideal: tuple[float, float]) -> tuple | None:
+def _kd_node(points: Tensor, weights: Tensor, box: Box, k: int) -> tuple | None:
     """The subtree of `k` cells over these points, as nested (axis, threshold, left, right); None is a leaf.
 
-    `ideal` says where this node's share begins and ends among its weights, laid in a row. It differs from
-    (0, their sum) by the fractions of points that rounding moved; passing it down keeps them from adding up.
+    Rounding does not add up on the way down: of q k + r points with r < k, the left half of the cells gets
+    q (k // 2) and r's share, rounded. So q stays the same in all subtrees, and leaves get q or q + 1.
     """
     if k == 1:
         return None
-    total = float(weights.sum())
-    target = ideal[0] + (ideal[1] - ideal[0]) * (k // 2) / k
-    share = min(max(target / total, 0.0), 1.0) if total > 0 else 0.5
-    axis, threshold = best_split(points, box, share, weights)
+    axis, threshold = best_split(points, box, (k // 2) / k, weights)
     below = points[:, axis] < threshold
-    cut = float(weights[below].sum())
-    one = float(weights.max()) if len(weights) else 0.0
-    if abs(cut - target) > 0.5 * one * (1 + 1e-9):
-        target = cut  # More than rounding: points that coincide. What they took is not made up for elsewhere.
     lower, upper = box.lower.clone(), box.upper.clone()
     upper[axis] = lower[axis] = threshold
-    left = _kd_node(points[below], weights[below], Box(box.lower, upper), k // 2, (ideal[0], target))
-    rest = (target - cut, ideal[1] - cut if target != cut else total - cut)
-    right = _kd_node(points[~below], weights[~below], Box(lower, box.upper), k - k // 2, rest)
+    left = _kd_node(points[below], weights[below], Box(box.lower, upper), k // 2)
+    right = _kd_node(points[~below], weights[~below], Box(lower, box.upper), k - k // 2)
     return axis, threshold, left, right
 
 
@@ -342,18 +321,16 @@ def _grid_node(planes: list[list[float]]) -> tuple | None:
 
 def _robust_range(points: Float64[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
     """The 5th and 95th percentile on each axis; zeros without points."""
-    if not len(points):
-        return torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    points = points if len(points) else points.new_zeros((1, 3))
     tail = int(0.05 * (len(points) - 1))
     return points.kthvalue(tail + 1, dim=0).values, points.kthvalue(len(points) - tail, dim=0).values
 
 
 def _axes_by_extent(points: Float64[Tensor, "n 3"]) -> list[int]:
     """Axes from the widest to the narrowest; by the full range where the bulk of the points coincides."""
-    if not len(points):
-        return []
     start, stop = _robust_range(points)
-    robust, full = (stop - start).tolist(), (points.amax(dim=0) - points.amin(dim=0)).tolist()
+    robust = (stop - start).tolist()
+    full = (points.amax(dim=0) - points.amin(dim=0)).tolist() if len(points) else robust
     return sorted(range(3), key=lambda axis: (-robust[axis], -full[axis]))
 
 
@@ -377,13 +354,9 @@ def _cut_off(box: Box, point: list[float]) -> tuple[int, float]:
     lower, upper = box.lower.tolist(), box.upper.tolist()
     axis = max(range(3), key=lambda a: (math.isinf(lower[a]) + math.isinf(upper[a]), upper[a] - lower[a]))
     lo, hi = lower[axis], upper[axis]
-    if math.isinf(lo) and math.isinf(hi):
-        return axis, point[axis]
-    if math.isinf(hi):
-        return axis, lo + max(1.0, abs(lo))
     if math.isinf(lo):
-        return axis, hi - max(1.0, abs(hi))
-    return axis, lo / 2 + hi / 2
+        return axis, point[axis] if math.isinf(hi) else hi - max(1.0, abs(hi))
+    return axis, lo + max(1.0, abs(lo)) if math.isinf(hi) else lo / 2 + hi / 2
 
 
 def _flatten(nested: tuple | None) -> BlockTree:
@@ -402,57 +375,49 @@ def _flatten(nested: tuple | None) -> BlockTree:
     return _from_rows(rows)
 
 
-def _from_rows(rows: Sequence[Sequence[float]]) -> BlockTree:
+def _from_rows(rows: Sequence[Sequence[int | float]]) -> BlockTree:
     """A tree from (axis, threshold, left, right, block) of each node; parents follow from the children."""
     parent = [-1] * len(rows)
     for node, (_, _, *children, _) in enumerate(rows):
         for child in children:
             if 0 <= child < len(rows):
                 parent[child] = node
-    threshold = torch.tensor([row[1] for row in rows], dtype=torch.float64)
-    axis, left, right, block = (
-        torch.tensor([row[i] for row in rows], dtype=torch.int64) for i in (0, 2, 3, 4)
-    )
-    return BlockTree(axis, threshold, left, right, block, torch.tensor(parent, dtype=torch.int64))
+    axis, threshold, left, right, block = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5).unbind(dim=1)
+    whole = (column.long() for column in (left, right, block, torch.tensor(parent)))
+    return BlockTree(axis.long(), threshold.clone(), *whole)
 
 
 def _is_row(row: object) -> bool:
-    """Whether `row` may be a node in JSON: five numbers, of which only the threshold may be a float."""
-    if not isinstance(row, list) or len(row) != 5:
+    """Whether `row` may be a node in JSON. The bound keeps out integers that no tensor could hold."""
+    if not isinstance(row, list) or [type(value) for value in row] != [int, float, int, int, int]:
         return False
-    return all(type(value) is int or (type(value) is float and i == 1) for i, value in enumerate(row))
+    return all(abs(value) < 2**31 for value in row if isinstance(value, int))
 
 
-def _check_structure(tree: BlockTree) -> None:
-    """Raises ValueError unless the arrays form one binary tree with blocks 0..K-1 at its leaves."""
+def _is_tree(tree: BlockTree) -> bool:
+    """Whether the arrays form one binary tree, parents first, with each block at one leaf."""
     size = tree.axis.shape[0]
     inner = tree.axis >= 0
-    nodes = inner.nonzero()[:, 0]
-    left, right = tree.left[nodes], tree.right[nodes]
-    children = torch.cat([left, right])
-    parents = torch.cat([nodes, nodes])
+    children = torch.cat([tree.left[inner], tree.right[inner]])
     # Every node but the root is the child of exactly one earlier node: then there are no cycles or islands.
-    rooted = sorted(children.tolist()) == list(range(1, size)) and int(tree.parent[0]) == -1
-    if size == 0 or not rooted or not bool(((children > parents) & (tree.parent[children] == parents)).all()):
-        raise ValueError(
-            "block tree: the nodes do not form a tree with node 0 as root and parents before children"
-        )
-    if not bool(((tree.axis >= -1) & (tree.axis <= 2)).all()):
-        raise ValueError("block tree: an axis must be 0, 1 or 2, or -1 for a leaf")
-    if not bool(
-        (tree.left[~inner] == -1).all() & (tree.right[~inner] == -1).all() & (tree.block[inner] == -1).all()
-    ):
-        raise ValueError("block tree: leaves have children -1 and inner nodes have block -1")
-    if sorted(tree.block[~inner].tolist()) != list(range((size + 1) // 2)):
-        raise ValueError("block tree: the leaves must hold each block from 0 upward exactly once")
+    if size == 0 or sorted(children.tolist()) != list(range(1, size)) or int(tree.parent[0]) != -1:
+        return False
+    parents = inner.nonzero()[:, 0].repeat(2)
+    leaves = torch.stack([tree.axis + 1, tree.left + 1, tree.right + 1, tree.threshold != 0])[:, ~inner]
+    return bool(
+        (children > parents).all()
+        and (tree.parent[children] == parents).all()
+        and (tree.axis <= 2).all()
+        and (tree.block[inner] == -1).all()
+        and not leaves.any()
+        and sorted(tree.block[~inner].tolist()) == list(range((size + 1) // 2))
+    )
 
 
 def _check_finite(points: Tensor) -> None:
     bad = int((~points.isfinite()).any(dim=1).sum())
     if bad:
-        raise ValueError(
-            f"{bad} of {len(points)} points are NaN or infinite: drop them before building blocks"
-        )
+        raise ValueError(f"{bad} of {len(points)} points are NaN or infinite: drop them first")
 
 
 def _float64(values: Tensor) -> Tensor:

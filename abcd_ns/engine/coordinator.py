@@ -32,7 +32,7 @@ from abcd_ns.engine.schedule import (
     sh_degree_at,
     view_order,
 )
-from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
 
@@ -192,11 +192,13 @@ class Coordinator:
             rgb = sandwich(sample.layers.front, raster.layer, sample.layers.back, sample.background)
         return Rendered(rgb.clamp(0, 1), raster.transmittance, raster.info)
 
-    def loss(self, sample: Sample, rendered: Rendered, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    def loss(
+        self, sample: Sample, rgb: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]
+    ) -> Float[Tensor, ""]:
         """The loss of a step: photometric over the crop, plus what the density strategy asks for."""
         view = sample.view
         photometric = photometric_loss(
-            rendered.rgb,
+            rgb,
             photo,
             full_pixels=view.width * view.height,
             full_windows=ssim_windows(view.height, view.width),
@@ -296,9 +298,7 @@ class Coordinator:
         self._growth, self._clocks = dict(rest.growth), rest.clocks
         self.scene.lay_over(block, lambda: live_gaussians(self.params))
         self._order = view_order(views, active.steps, active.number, self.config.seed)
-        self.announce(
-            VisitBegan(active.number, self.state.sweep, block, active.steps, len(views), len(rest))
-        )
+        self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, len(views), len(rest)))
         before = self.stopwatch.seconds
         self._layers = self._draw_layers(active)
         active.layer_seconds += self.stopwatch.seconds - before
@@ -404,7 +404,9 @@ def resolve_ownership(
     return wanted
 
 
-def blocks_at_rest(tree: BlockTree, gaussians: Gaussians) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
+def blocks_at_rest(
+    tree: BlockTree, gaussians: Gaussians
+) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
     """The first content of a store: `gaussians` parted by `tree`, nothing trained yet."""
     owner = tree.assign(gaussians.means)
     return {b: BlockState.fresh(gaussians[owner == b]).to_tensors() for b in range(tree.num_blocks)}

@@ -73,5 +73,6 @@ def _random_quats(count: int, generator: torch.Generator) -> Tensor:
     a, b = torch.sqrt(1 - u), torch.sqrt(u)
     tau = 2 * math.pi
     return torch.stack(
-        [a * torch.sin(tau * v), a * torch.cos(tau * v), b * torch.sin(tau * w), b * torch.cos(tau * w)], dim=1
+        [a * torch.sin(tau * v), a * torch.cos(tau * v), b * torch.sin(tau * w), b * torch.cos(tau * w)],
+        dim=1,
     )

@@ -22,14 +22,9 @@ from abcd_ns.engine.ordering import node_children_in_order, split_around
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
 from abcd_ns.engine.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
-from abcd_ns.engine.visibility import reaches
+from abcd_ns.engine.visibility import blur_reach, reaches, widest_slant
 
 Ownership = Literal["fragments", "means"]
-
-SUPPORT = math.sqrt(2 * math.log(255))
-"""Standard deviations at which an opaque Gaussian falls to 1/255, below which nothing is drawn."""
-BLUR_PIXELS = SUPPORT * math.sqrt(0.3) + 1
-"""Pixels that the rasterizer's low-pass filter and rounding add to a Gaussian's extent."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +92,8 @@ class Painter:
     def reaching(self, block: int, box: Box) -> Gaussians:
         """The block's Gaussians that some view may see inside `box`."""
         gaussians = self.scene.gaussians(block)
-        rows = reaches(gaussians, box, self._optics.blur(gaussians.means), sigma=SUPPORT * self._optics.secant)
-        return gaussians[rows]
+        blur = self._optics.blur(gaussians.means)
+        return gaussians[reaches(gaussians, box, blur, self._optics.slant)]
 
     def paint(
         self,
@@ -148,9 +143,7 @@ class Painter:
     def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
         """The whole scene through layers, unit by unit: the composited render."""
         crop = crop or view.full
-        parts = {
-            unit: self.paint(unit, self.load(unit), view, crop, settings) for unit in self.units()
-        }
+        parts = {unit: self.paint(unit, self.load(unit), view, crop, settings) for unit in self.units()}
         return self.fold(parts, view, crop).front
 
     def _draw(
@@ -199,22 +192,13 @@ class _Optics:
         centers = torch.stack([view.center.double().cpu() for view in views])
         self._middle = centers.mean(dim=0)
         self._spread = float((centers - self._middle).norm(dim=1).max())
-        self._focal = min(float(torch.minimum(view.K[0, 0], view.K[1, 1])) for view in views)
-        self.secant = max(_secant(view) for view in views)
-        """1 / cos of the widest angle to the optical axis: the affine projection stretches by as much."""
+        self._widest = min(views, key=lambda view: float(view.K.diagonal()[:2].min()))
+        self.slant = max(widest_slant(view) for view in views)
 
     def blur(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """World size of the rasterizer's blur at each mean, as the farthest camera sees it."""
-        distance = (means.double() - self._middle.to(means.device)).norm(dim=1) + self._spread
-        return (BLUR_PIXELS / self._focal * distance).to(means.dtype)
-
-
-def _secant(view: View) -> float:
-    # The projection clamps x/z and y/z at 1.3 times the field of view, measured from the image's middle.
-    fx, fy, cx, cy = (float(view.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    x = max(cx, view.width - cx) / fx + 0.15 * view.width / fx
-    y = max(cy, view.height - cy) / fy + 0.15 * view.height / fy
-    return math.sqrt(1 + x * x + y * y)
+        """World size of the rasterizer's blur at each mean, as the farthest camera would see it."""
+        distance = (means - self._middle.to(means)).norm(dim=1) + self._spread
+        return blur_reach(distance, self._widest)
 
 
 def _everywhere(crop: Crop, device: torch.device) -> ZWindow:

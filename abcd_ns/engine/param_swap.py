@@ -47,7 +47,9 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
         adam = optimizers[name].state.get(params[name], {})
         for moment in MOMENTS:
             value = adam.get(moment)
-            moments[moment][name] = torch.zeros_like(params[name]) if value is None else value.detach().clone()
+            moments[moment][name] = (
+                torch.zeros_like(params[name]) if value is None else value.detach().clone()
+            )
         steps = max(steps, int(adam.get("step", 0)))
     return BlockState(
         Gaussians(**{name: params[name].detach().clone() for name in PARAM_NAMES}),

@@ -2,13 +2,14 @@
 
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
 
+@runtime_checkable
 class BlockScene(Protocol):
     """Gaussians by block."""
 

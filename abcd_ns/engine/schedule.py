@@ -48,7 +48,7 @@ def plan_sweep(
 
 
 def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tuple[int, ...]:
-    """The view of each step of a visit: shuffled passes over all views, so that use differs by at most one."""
+    """The view of each step of a visit: shuffled passes over all views; use differs by at most one."""
     shuffled: list[int] = []
     rng = random.Random(f"views {seed} {visit}")
     while len(shuffled) < steps:
@@ -59,7 +59,7 @@ def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tup
 
 
 def exponential_decay(progress: float, initial: float, final: float) -> float:
-    """initial (final / initial)^progress, for progress from 0 to 1; the learning rate of the means in 3DGS."""
+    """initial (final / initial)^progress for progress 0..1, as 3DGS decays the rate of the means."""
     return initial * (final / initial) ** min(max(progress, 0.0), 1.0)
 
 

@@ -27,7 +27,7 @@ def train_step(coordinator: Coordinator, photo: PhotoReader) -> None:
     sample = coordinator.next_sample()
     target = photo(sample.view.index, sample.crop).to(coordinator.device)
     rendered = coordinator.render(sample)
-    loss = coordinator.loss(sample, rendered, target)
+    loss = coordinator.loss(sample, rendered.rgb, target)
     for optimizer in coordinator.optimizers.values():
         optimizer.zero_grad(set_to_none=True)
     if loss.requires_grad:

@@ -65,7 +65,14 @@ class Gaussians:
     def empty(sh_degree: int = 3, device: torch.device | str = "cpu", dtype=torch.float32) -> "Gaussians":
         """No Gaussians, with room for the given degree of spherical harmonics."""
         k = (sh_degree + 1) ** 2 - 1
-        shapes = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "features_rest": (k, 3), "opacities": (1,)}
+        shapes = {
+            "means": (3,),
+            "scales": (3,),
+            "quats": (4,),
+            "features_dc": (3,),
+            "features_rest": (k, 3),
+            "opacities": (1,),
+        }
         return Gaussians(**{n: torch.zeros((0, *s), device=device, dtype=dtype) for n, s in shapes.items()})
 
 

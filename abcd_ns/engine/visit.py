@@ -1,25 +1,27 @@
 """One visit: what a block looks like to its views, and the frozen layers around it."""
 
-import math
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.compositing import empty_layer
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.loss import SSIM_WINDOW
-from abcd_ns.engine.painter import SUPPORT, Painter, PaintSettings, Parts
+from abcd_ns.engine.painter import Painter, PaintSettings, Parts
 from abcd_ns.engine.rasterizer import ZWindow
 from abcd_ns.engine.rasterizer.projection import project
-from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError
-from abcd_ns.engine.types import Crop, Gaussians, View
-from abcd_ns.engine.visibility import footprint, fragment_box_intersects
+from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+from abcd_ns.engine.visibility import footprint, fragment_box_intersects, reach_radius
 
+Side = Literal["front", "back"]
+SIDES: tuple[Side, ...] = ("front", "back")
+"""The two layers of a view, under the names of their fields in Parts."""
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
 
@@ -83,7 +85,7 @@ def grow_to_extents(cell: Box, gaussians: Gaussians, percentile: float) -> Box:
     """The cell, grown at each face until the given share of the Gaussians' extents does not reach past it."""
     if len(gaussians) == 0:
         return cell
-    extent = SUPPORT * gaussians.scales.exp().amax(dim=1, keepdim=True).double()
+    extent = reach_radius(gaussians.scales)[:, None].double()
     means = gaussians.means.double()
     lower = torch.quantile(means - extent, 1 - percentile, dim=0).cpu()
     upper = torch.quantile(means + extent, percentile, dim=0).cpu()
@@ -125,24 +127,28 @@ class VisitLayers:
         self._scene_key = scene_key
         self._versions = self._frozen_versions()
         self._units = painter.units(exclude=geometry.block)
-        self._loaded: dict[int, Gaussians] = {}
         self._near = self._load_near()
         self._near_rows: dict[int, Tensor] = {}
 
-    def draw(self, views: Iterable[int]) -> Iterable[int]:
-        """Draw what the cache lacks for these views; yields each view when it is ready.
+    def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Parts]]:
+        """Draw what the cache lacks for these views; yields each view with its layers when they are ready.
 
         Units are taken one after the other, each for all views, so that the device holds one at a time.
         """
-        missing = [view for view in dict.fromkeys(views) if self._cached(view) is None]
+        missing = []
+        for view in dict.fromkeys(views):
+            layers = self._cached(view)
+            if layers is None:
+                missing.append(view)
+            else:
+                yield view, layers
         parts: dict[int, dict[int, Parts]] = {view: {} for view in missing}
         for unit in self._units:
             gaussians = self._painter.load(unit, exclude=self._geometry.block)
             for view in missing:
                 parts[view][unit] = self._paint(unit, gaussians, view)
                 if unit == self._units[-1]:
-                    self._keep(view, parts.pop(view))
-                    yield view
+                    yield view, self._keep(view, parts.pop(view))
 
     def around(self, view: int) -> Surroundings:
         """What `view` sees around the active block.
@@ -154,12 +160,7 @@ class VisitLayers:
             raise StaleLayerError(f"a frozen block changed during the visit of block {self._geometry.block}")
         layers = self._cached(view)
         if layers is None:  # never drawn, or the disposable cache has lost it
-            for _ in self.draw([view]):
-                pass
-            layers = self._cached(view)
-        crop = self._geometry.crops[view]
-        if layers is None:
-            raise StaleLayerError(f"the layer cache does not keep what was just drawn for view {view}")
+            ((_, layers),) = self.draw([view])
         return Surroundings(layers, self._near_of(view), self._window(view, crop))
 
     def _frozen_versions(self) -> dict[int, int]:
@@ -183,31 +184,39 @@ class VisitLayers:
             window=self._window(view, crop),
         )
 
-    def _keep(self, view: int, parts: dict[int, Parts]) -> None:
-        crop = self._geometry.crops[view]
-        folded = self._painter.fold(parts, self._views[view], crop)
-        for side in ("front", "back"):
-            self._cache.put(self._key(view, side), getattr(folded, side))
+    def _keep(self, view: int, parts: dict[int, Parts]) -> Parts:
+        """Fold and cache; what comes back went through the codec, whether or not the cache had room."""
+        folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
+        self._cache.put_many((self._key(view, side), getattr(folded, side)) for side in SIDES)
+        return Parts(*(self._on_device(through_codec(getattr(folded, s), self._cache.bits)) for s in SIDES))
 
     def _cached(self, view: int) -> Parts | None:
         if not self._units:
             crop, matrix = self._geometry.crops[view], self._views[view].viewmat
             nothing = empty_layer(crop.height, crop.width, self._painter.device, matrix.dtype)
             return Parts(nothing, nothing)
-        front, back = (self._cache.get(self._key(view, side)) for side in ("front", "back"))
-        if front is None or back is None:
+        found = [self._cache.get(self._key(view, side)) for side in SIDES]
+        if any(layer is None for layer in found):
             return None
-        return Parts(front, back)
+        return Parts(*(self._on_device(layer) for layer in found))
 
-    def _key(self, view: int, side: str) -> LayerKey:
-        return visit_layer_key(
+    def _on_device(self, layer: Layer) -> Layer:
+        dtype, device = next(iter(self._views.values())).viewmat.dtype, self._painter.device
+        return Layer(layer.color.to(device, dtype), layer.transmittance.to(device, dtype))
+
+    def _key(self, view: int, side: Side) -> LayerKey:
+        geometry = self._geometry
+        cut = json.dumps([side, geometry.block, geometry.to_json()["window"], self._painter.ownership])
+        return LayerKey(
             scene=self._scene_key,
-            view=self._views[view],
-            side=side,
-            geometry=self._geometry,
-            versions=self._versions,
-            settings=self._settings,
+            view=view_fingerprint(self._views[view]),
+            crop=geometry.crops[view],
+            content=(cut, *self._versions.items()),
+            sh_degree=self._settings.sh_degree,
+            raster_mode="antialiased" if self._settings.antialiased else "classic",
             rasterizer=self._painter.rasterizer.name,
+            bits=self._cache.bits,
+            prefix=f"block-{geometry.block}",
         )
 
     def _load_near(self) -> Gaussians | None:
@@ -225,11 +234,10 @@ class VisitLayers:
             camera = self._views[view]
             with torch.no_grad():
                 seen = project(self._near, camera)
-                # The square of 3 sigma is what gsplat bins by; ellipses reach 3.33 sigma within its tiles.
-                radii = torch.ceil(seen.radii * (SUPPORT / 3)).to(seen.radii.dtype)
+                crop = self._geometry.crops[view]
                 hit = fragment_box_intersects(
-                    seen.depths, seen.means2d, radii, camera, self._geometry.window
+                    seen.depths, seen.means2d, seen.radii, camera, self._geometry.window, crop
                 )
-            self._near_rows[view] = torch.where(hit & (seen.radii > 0))[0]
+            self._near_rows[view] = torch.where(hit)[0]
         rows = self._near_rows[view]
         return self._near[rows] if len(rows) else None

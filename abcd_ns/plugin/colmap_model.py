@@ -4,6 +4,7 @@ The format is https://colmap.github.io/format.html. Files are walked here rather
 which loads a cut cameras.bin silently and hangs on an empty points3D.bin.
 """
 
+import mmap
 import stat
 import struct
 from collections.abc import Iterator
@@ -35,6 +36,9 @@ _MODELS = {
 
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _PART = 1 << 16
+"""Points gathered at a time."""
+_MAX_NAME = 1 << 16
+"""Bytes within which a name must end."""
 
 
 def find_model(data: Path) -> Path | None:
@@ -69,7 +73,9 @@ def read_colmap(data: Path, model: Path) -> Scene:
     for name, quat, translation, camera in images:
         label = f"{model}/images{suffix}: {name}"
         if camera not in lenses:
-            problems.add(f"{label} uses camera {camera}, which cameras{suffix} does not have; make the model again.")
+            problems.add(
+                f"{label} uses camera {camera}, which cameras{suffix} does not have; make the model again."
+            )
             continue
         with problems.collect():
             inside(data / "images", name, model / f"images{suffix}")
@@ -91,7 +97,9 @@ def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> n
     """Invert COLMAP's world to camera (w, x, y, z), t and turn it to OpenGL axes and a z-up world."""
     norm = np.linalg.norm(quat)
     if not (np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6):
-        raise InputError(f"{label} has a pose with NaN, infinity or a zero quaternion; remove the photo from the model.")
+        raise InputError(
+            f"{label} has a pose with NaN, infinity or a zero quaternion; remove the photo from the model."
+        )
     w, x, y, z = quat / norm
     rotation = np.array(
         [
@@ -129,7 +137,8 @@ class _Cursor:
     def __init__(self, path: Path):
         self.path = path
         _check_file(path)
-        self.data = memoryview(path.read_bytes())
+        with path.open("rb") as file:
+            self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.at = 0
 
     def take(self, layout: str) -> tuple:
@@ -141,7 +150,9 @@ class _Cursor:
     def skip(self, size: int) -> None:
         """Go on by `size` bytes, which must be there."""
         if size > len(self.data) - self.at:
-            raise InputError(f"{self.path} is cut: it ends at byte {len(self.data)} inside an entry; copy or make it again.")
+            raise InputError(
+                f"{self.path} is cut: it ends at byte {len(self.data)} inside an entry; make it again."
+            )
         self.at += size
 
     def count(self, smallest: int) -> int:
@@ -149,28 +160,27 @@ class _Cursor:
         (n,) = self.take("Q")
         left = len(self.data) - self.at
         if n * smallest > left:
-            raise InputError(f"{self.path} claims {n} entries but only {left} bytes follow; copy or make it again.")
+            raise InputError(
+                f"{self.path} claims {n} entries but only {left} bytes follow; copy or make it again."
+            )
         return n
 
     def name(self) -> str:
         """Characters up to a zero byte."""
-        end = self.path_end()
-        text = bytes(self.data[self.at : end]).decode("utf-8", "surrogateescape")
+        end = self.data.find(b"\0", self.at, self.at + _MAX_NAME)
+        if end < 0:
+            raise InputError(f"{self.path} is damaged: a photo's name has no end; copy or make it again.")
+        text = self.data[self.at : end].decode("utf-8", "surrogateescape")
         self.at = end + 1
         return text
-
-    def path_end(self) -> int:
-        """Where the zero byte that ends a name lies; names are far shorter than 64 KiB."""
-        length = bytes(self.data[self.at : self.at + _PART]).find(b"\0")
-        if length < 0:
-            raise InputError(f"{self.path} is damaged: a photo's name has no end; copy or make it again.")
-        return self.at + length
 
     def finish(self) -> None:
         """Refuse bytes after the last entry: the count was wrong."""
         if self.at != len(self.data):
             extra = len(self.data) - self.at
-            raise InputError(f"{self.path} has {extra} bytes more than its entries need; copy or make it again.")
+            raise InputError(
+                f"{self.path} has {extra} bytes more than its entries need; copy or make it again."
+            )
 
 
 def _cameras_bin(path: Path) -> dict[int, Lens]:
@@ -201,11 +211,14 @@ def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
     cursor = _Cursor(path)
     n = cursor.count(_POINT.itemsize)
     starts = np.empty(n, dtype=np.int64)
+    at, end, track = cursor.at, len(cursor.data), struct.Struct("<Q")
     for i in range(n):
-        starts[i] = cursor.at
-        cursor.skip(_POINT.itemsize)
-        (track,) = struct.unpack_from("<Q", cursor.data, cursor.at - 8)
-        cursor.skip(track * 8)
+        starts[i] = at
+        at += _POINT.itemsize
+        if at > end:
+            break
+        at += 8 * track.unpack_from(cursor.data, at - 8)[0]
+    cursor.skip(at - cursor.at)
     cursor.finish()
     raw = np.frombuffer(cursor.data, dtype=np.uint8)
     xyz, rgb = np.empty((n, 3)), np.empty((n, 3), dtype=np.uint8)
@@ -289,7 +302,9 @@ def _check_file(path: Path) -> None:
     try:
         status = path.stat()
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); a model is cameras, images and points3D.") from None
+        raise InputError(
+            f"{path} cannot be read ({error.strerror}); a model is cameras, images and points3D."
+        ) from None
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is not a regular file; put COLMAP's file there.")
     if status.st_size == 0:

@@ -3,14 +3,18 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from abcd_ns.errors import UserError
+
 
 def one_line(text: str) -> str:
     """`text` fit for a terminal: control characters and undecodable bytes of file names are escaped."""
-    printable = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+    printable = "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+    )
     return printable.encode("utf-8", "backslashreplace").decode()
 
 
-class InputError(Exception):
+class InputError(UserError):
     """The input cannot be used; a command shows `str(error)` alone and exits with code 2.
 
     Args:

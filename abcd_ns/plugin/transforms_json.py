@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,9 @@ def read_transforms(path: Path) -> Scene:
     model = str(meta.get("camera_model", "OPENCV"))
     if model not in _PINHOLES + _FISHEYES:
         fix = "undistort the photos first"
-        raise InputError(f"{path}: camera_model {model} is not one of {', '.join(_PINHOLES + _FISHEYES)}; {fix}.")
+        raise InputError(
+            f"{path}: camera_model {model} is not one of {', '.join(_PINHOLES + _FISHEYES)}; {fix}."
+        )
     fisheye = model in _FISHEYES or bool(meta.get("is_fisheye", False))
     frames = []
     for number, entry in enumerate(meta["frames"]):
@@ -47,9 +50,13 @@ def read_transforms(path: Path) -> Scene:
             xyz, rgb = read_points(inside(root, str(meta["ply_file_path"]), path))
     masks = sum(frame.mask_path is not None for frame in frames)
     if 0 < masks < len(frames):
-        problems.add(f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to every frame or to none.")
+        problems.add(
+            f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to every frame or to none."
+        )
     with problems.collect():
-        transform = rigid(_matrix(meta.get("applied_transform", np.eye(4).tolist()), path), f"{path}: applied_transform")
+        transform = rigid(
+            _matrix(meta.get("applied_transform", np.eye(4).tolist()), path), f"{path}: applied_transform"
+        )
     with problems.collect():
         scale = _number({"applied_scale": meta.get("applied_scale", 1.0)}, "applied_scale", str(path))
         if scale <= 0:
@@ -101,7 +108,7 @@ def _frame(path: Path, root: Path, meta: dict, entry: dict, number: int, fisheye
     check_lens(lens, label)
     mask = inside(root, str(entry["mask_path"]), path) if "mask_path" in entry else None
     # As nerfstudio has it, names are relative to the folder that transforms.json lies in.
-    return Frame(str(photo.relative_to(root.absolute())), pose, lens, mask)
+    return Frame(os.path.relpath(photo, root), pose, lens, mask)
 
 
 def _lens(values: dict[str, Any], label: str, photo: Path, fisheye: bool) -> Lens:
@@ -120,14 +127,19 @@ def _lens(values: dict[str, Any], label: str, photo: Path, fisheye: bool) -> Len
         fy = _focal(_number(values, "camera_angle_y", label), height, label)
     else:
         fy = _number(values, "fl_y", label, default=fx)
-    center = (_number(values, "cx", label, default=width / 2), _number(values, "cy", label, default=height / 2))
+    center = (
+        _number(values, "cx", label, default=width / 2),
+        _number(values, "cy", label, default=height / 2),
+    )
     return Lens(width, height, fx, fy, *center, _distortion(values, label, fisheye), fisheye)
 
 
 def _focal(angle: float, size: int, label: str) -> float:
     """Pixels: size / (2 tan(angle / 2)), for the full angle of view in radians."""
     if not 0 < angle < math.pi:
-        raise InputError(f"{label}: an angle of view of {angle:g} radians is no camera's; it lies between 0 and pi.")
+        raise InputError(
+            f"{label}: an angle of view of {angle:g} radians is no camera's; it lies between 0 and pi."
+        )
     return size / (2 * math.tan(angle / 2))
 
 
@@ -143,7 +155,9 @@ def _distortion(values: dict[str, Any], label: str, fisheye: bool) -> tuple[floa
     if fisheye:
         return (k1, k2, k3, k4)
     if k4 != 0:
-        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort the photos first.")
+        raise InputError(
+            f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort the photos first."
+        )
     return (k1, k2, p1, p2, k3)
 
 

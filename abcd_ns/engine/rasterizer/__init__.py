@@ -1,5 +1,40 @@
 """Rasterizers: one interface, a torch implementation for any device and gsplat's CUDA kernels."""
 
-from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, ZWindow
+from typing import Literal
 
-__all__ = ["Raster", "Rasterizer", "ZWindow"]
+import torch
+
+from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, ZWindow
+from abcd_ns.engine.rasterizer.chunk_kernels import CompilePolicy
+from abcd_ns.engine.rasterizer.self_check import self_check
+from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+
+__all__ = ["Raster", "Rasterizer", "TorchRasterizer", "ZWindow", "make_rasterizer", "self_check"]
+
+
+def make_rasterizer(
+    name: Literal["auto", "torch", "gsplat"], device: torch.device | str, *, compile: CompilePolicy = "auto"
+) -> Rasterizer:
+    """The rasterizer called `name`; "auto" takes gsplat on CUDA devices and torch elsewhere.
+
+    gsplat's kernels are checked against the torch backend on a tiny scene first (see self_check).
+
+    Args:
+        compile: passed to TorchRasterizer.
+
+    Raises:
+        ValueError: gsplat was asked for on a device other than CUDA, or `name` is unknown.
+        RuntimeError: gsplat's kernels do not agree with the torch backend.
+    """
+    device = torch.device(device)
+    if name not in ("auto", "torch", "gsplat"):
+        raise ValueError(f'rasterizer is "{name}"; choose one of "auto", "torch", "gsplat".')
+    if name == "torch" or (name == "auto" and device.type != "cuda"):
+        return TorchRasterizer(compile)
+    if device.type != "cuda":
+        raise ValueError(f'The gsplat rasterizer needs a CUDA device, not "{device}"; set the rasterizer to "torch".')
+    from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer  # imports gsplat
+
+    rasterizer = GsplatRasterizer()
+    self_check(rasterizer, device)
+    return rasterizer

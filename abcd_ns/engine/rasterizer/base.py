@@ -1,7 +1,7 @@
 """What every rasterizer takes and gives."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -39,6 +39,7 @@ class Raster:
         return Layer(self.color, self.transmittance)
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """Draws Gaussians as gsplat 1.4.0's `rasterization` does for one pinhole camera.
 

@@ -7,5 +7,6 @@ from abcd_ns.engine.storage.layer_cache import StaleLayerError as StaleLayerErro
 from abcd_ns.engine.storage.layer_cache import require_fresh as require_fresh
 from abcd_ns.engine.storage.layer_cache import view_fingerprint as view_fingerprint
 from abcd_ns.engine.storage.layer_codec import LayerDecodeError as LayerDecodeError
+from abcd_ns.engine.storage.layer_codec import through_codec as through_codec
 from abcd_ns.engine.storage.parameter_store import ParameterStore as ParameterStore
 from abcd_ns.engine.storage.parameter_store import StoreError as StoreError

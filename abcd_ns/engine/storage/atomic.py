@@ -53,9 +53,10 @@ def write_file(path: Path, data: bytes) -> None:
 
 def remove_temporaries(folder: Path) -> None:
     """Delete what `replacing` left in `folder` when its process was killed. Only for the one writer."""
-    for leftover in folder.glob(f".*{TEMPORARY_SUFFIX}"):
-        with suppress(OSError):
-            leftover.unlink()
+    for pattern in (f".*{TEMPORARY_SUFFIX}", ".tmp*"):  # the second are safetensors' own
+        for leftover in folder.glob(pattern):
+            with suppress(OSError):
+                leftover.unlink()
 
 
 class FolderLockedError(RuntimeError):
@@ -85,9 +86,7 @@ class FolderLock:
         except BaseException:
             os.close(descriptor)
             raise
-        with suppress(
-            OSError
-        ):  # the number only serves the message above; a full disk must not refuse a lock
+        with suppress(OSError):  # the number only serves the message above; a full disk may lack room for it
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         self._close = weakref.finalize(self, os.close, descriptor)

@@ -103,9 +103,7 @@ def read_manifest(path: Path) -> Manifest:
         data = path.read_bytes()
     except FileNotFoundError as error:
         what = "is no parameter store" if path.stem == "manifest" else "has no such pin"
-        raise StoreError(
-            f"{path.parent} {what}: there is no {path.name}; check the folder and the name."
-        ) from error
+        raise StoreError(f"{path.parent} {what}: it has no {path.name}; check the name.") from error
     except OSError as error:
         raise StoreError(f"{path} cannot be read: {error.strerror}.") from error
     return Manifest.from_bytes(data, path)

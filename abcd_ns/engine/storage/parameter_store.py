@@ -1,4 +1,4 @@
-"""Blocks on disk: one immutable shard per block and generation, and one manifest that names the current ones."""
+"""Blocks on disk: one immutable shard per block and generation, and one manifest that names those in use."""
 
 import copy
 import json
@@ -44,7 +44,7 @@ class ParameterStore:
         self._verified: set[str] = set()
 
     @classmethod
-    def create(cls, folder: Path, header: dict[str, Any]) -> "ParameterStore":
+    def create(cls, folder: Path | str, header: dict[str, Any]) -> "ParameterStore":
         """A new store without blocks, at generation 0, open for writing. Makes the folder if need be.
 
         Raises:
@@ -52,26 +52,19 @@ class ParameterStore:
             FolderLockedError: another writer has it.
         """
         folder = Path(folder)
+        manifest = Manifest(0, json_copy(header), {}, {})
+        lock = _claim(folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock = FolderLock(folder)
-        except OSError as error:
-            raise StoreError(f"No store can be made in {folder}: {error.strerror}.") from error
-        try:
-            if manifest_path(folder).exists():
-                raise StoreError(f"{folder} already holds a store; open it, or choose another folder.")
-            manifest = Manifest(0, json_copy(header), {}, {})
             write_file(manifest_path(folder), manifest.to_bytes())
-            return cls(folder, manifest, lock)
         except OSError as error:
             lock.release()
             raise StoreError(f"No store can be made in {folder}: {error.strerror}.") from error
-        except BaseException:
-            lock.release()
-            raise
+        return cls(folder, manifest, lock)
 
     @classmethod
-    def open(cls, folder: Path, name: str | None = None, *, read_only: bool = False) -> "ParameterStore":
+    def open(
+        cls, folder: Path | str, name: str | None = None, *, read_only: bool = False
+    ) -> "ParameterStore":
         """The store in `folder`: its present generation for writing, or for reading alone if `read_only`.
 
         With `name`, the generation pinned under that name, for reading alone.
@@ -91,9 +84,7 @@ class ParameterStore:
         try:
             lock = FolderLock(folder)
         except OSError as error:
-            raise StoreError(
-                f"{folder} cannot be written to: {error.strerror}; open it read-only."
-            ) from error
+            raise StoreError(f"{folder} is not writable: {error.strerror}; open it read-only.") from error
         try:
             store = cls(folder, read_checked_manifest(path), lock)
             store._collect()
@@ -185,10 +176,14 @@ class ParameterStore:
 
         Raises:
             StoreError: read-only store, too little space (found before anything is written), or a write
-                that failed: the previous generation is intact and the new files are gone.
+                that failed: the previous generation is intact and the new files are gone, unless the disk
+                refuses even to put the old manifest back; `generation` tells.
             TypeError, ValueError: something is not JSON, or a block's number is negative.
         """
         self._require_writable()
+        for block in updates:
+            if block < 0:
+                raise ValueError(f"A block's number must not be negative; got {block}.")
         old = self._manifest
         generation = old.generation + 1
         metas = {block: json.dumps(json_copy(meta)) for block, (_, meta) in updates.items()}
@@ -198,8 +193,8 @@ class ParameterStore:
             header=old.header if header is None else json_copy(header),
             state=old.state if state is None else json_copy(state),
         )
-        self._require_space({block: tensors for block, (tensors, _) in updates.items()})
         try:
+            self._require_space(sum(data_nbytes(tensors) for tensors, _ in updates.values()))
             shards = {
                 block: write_shard(self.folder, block, generation, tensors, metas[block])
                 for block, (tensors, _) in updates.items()
@@ -210,9 +205,7 @@ class ParameterStore:
         except BaseException as error:
             outcome = self._roll_back(old)
             if isinstance(error, (OSError, SafetensorError)):
-                raise StoreError(
-                    f"Generation {generation} could not be written: {error}. {outcome}"
-                ) from error
+                raise StoreError(f"Writing generation {generation} failed: {error}. {outcome}") from error
             raise
         self._verified.update(shard.file for shard in shards.values())
         self._collect()
@@ -270,7 +263,7 @@ class ParameterStore:
         self._collect()
         return self.generation
 
-    def clone_to(self, folder: Path, name: str | None = None) -> None:
+    def clone_to(self, folder: Path | str, name: str | None = None) -> None:
         """Make `folder` a store that holds this generation, or the one pinned under `name`.
 
         Shards are shared by hard links where the file system can, which costs no space, and copied
@@ -281,23 +274,24 @@ class ParameterStore:
             FolderLockedError: another writer has it.
         """
         folder = Path(folder)
-        manifest = self._manifest if name is None else read_checked_manifest(manifest_path(self.folder, name))
-        target = ParameterStore.create(folder, manifest.header)
+        manifest = self._manifest
+        if name is not None:
+            manifest = read_checked_manifest(manifest_path(self.folder, name))
+        lock = _claim(folder)
         try:
-            for shard in manifest.blocks.values():
-                link_or_copy(self.folder / shard.file, folder / shard.file)
+            for file in manifest.files:
+                link_or_copy(self.folder / file, folder / file)
             fsync_folder(folder)
-            target._publish(manifest)
+            write_file(manifest_path(folder), manifest.to_bytes())
         except BaseException as error:
-            # Without its manifest the folder is no store, and can be given again.
-            manifest_path(folder).unlink(missing_ok=True)
-            for shard in manifest.blocks.values():
-                (folder / shard.file).unlink(missing_ok=True)
+            with suppress(OSError):
+                for path in (manifest_path(folder), *(folder / file for file in manifest.files)):
+                    path.unlink(missing_ok=True)
             if isinstance(error, OSError):
                 raise StoreError(f"{self.folder} could not be cloned to {folder}: {error}.") from error
             raise
         finally:
-            target.close()
+            lock.release()
 
     def _shard(self, block: int) -> Shard:
         try:
@@ -327,20 +321,14 @@ class ParameterStore:
 
     def _require_writable(self) -> None:
         if self._lock is None:
-            raise StoreError(
-                f"{self.folder} was opened for reading; open it without read_only and name to change it."
-            )
+            raise StoreError(f"{self.folder} is open for reading; open it without `read_only` and `name`.")
 
-    def _require_space(self, updates: Mapping[int, Mapping[str, Tensor]]) -> None:
-        for block in updates:
-            if block < 0:
-                raise ValueError(f"A block's number must not be negative; got {block}.")
-        needed = sum(data_nbytes(tensors) for tensors in updates.values())
+    def _require_space(self, needed: int) -> None:
         free = shutil.disk_usage(self.folder).free
         if needed > free:
             raise StoreError(
-                f"{self.folder} needs {needed / 2**20:.1f} MiB for the next generation but has {free / 2**20:.1f} "
-                f"MiB free; generation {self.generation} is intact. Free space and go on."
+                f"{self.folder} has {free / 2**20:.1f} MiB free but the next generation needs "
+                f"{needed / 2**20:.1f} MiB. Free space and go on; generation {self.generation} is intact."
             )
 
     def _publish(self, manifest: Manifest) -> None:
@@ -362,7 +350,7 @@ class ParameterStore:
         except StoreError as error:
             return f"Nor can the manifest be read any more: {error}"
         self._collect()
-        return f"{self.folder} holds generation {self.generation}, intact; free space or mend the disk, and go on."
+        return f"{self.folder} holds generation {self.generation}, intact: free space or mend the disk."
 
     def _collect(self) -> None:
         """Delete the shards that no manifest names, and temporary files of writers that were killed."""
@@ -380,3 +368,21 @@ class ParameterStore:
                 with suppress(OSError):  # the commit stands; the next collection tries again
                     path.unlink()
         self._verified &= kept
+
+
+def _claim(folder: Path) -> FolderLock:
+    """Make `folder` if need be, and take its lock, for a new store in it.
+
+    Raises:
+        StoreError: it holds a store already, or cannot be written to.
+        FolderLockedError: another writer has it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(folder)
+    except OSError as error:
+        raise StoreError(f"No store can be made in {folder}: {error.strerror}.") from error
+    if manifest_path(folder).exists():
+        lock.release()
+        raise StoreError(f"{folder} already holds a store; open it, or choose another folder.")
+    return lock

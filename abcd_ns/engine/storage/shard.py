@@ -5,7 +5,7 @@ import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import torch
 from safetensors import safe_open
@@ -44,9 +44,7 @@ def verify_shard(path: Path, shard: Shard) -> None:
     """
     with open(path, "rb") as file:
         if os.fstat(file.fileno()).st_size != shard.nbytes or _checksum(file) != shard.checksum:
-            raise StoreError(
-                f"{path} is damaged: its checksum is wrong. Restore a pinned generation or a copy."
-            )
+            raise StoreError(f"{path} is damaged: its checksum is wrong. Go back to a pinned generation.")
 
 
 def read_shard(path: Path, names: Iterable[str] | None) -> tuple[dict[str, Tensor], str]:
@@ -62,7 +60,7 @@ def read_shard(path: Path, names: Iterable[str] | None) -> tuple[dict[str, Tenso
         for name in wanted:
             if name not in present:
                 raise KeyError(f"{path} has no tensor {name!r}; it has {sorted(present)}.")
-        # The copy owns its memory: a view of the mapped file would crash the process if the disk failed later.
+        # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
         return {name: file.get_tensor(name).clone() for name in wanted}, file.metadata()[_META]
 
 

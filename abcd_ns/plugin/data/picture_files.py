@@ -25,8 +25,6 @@ class Header:
     width: int
     height: int
     format: str
-    turned: bool
-    """Its EXIF orientation swaps width and height."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,14 +61,21 @@ def read_header(path: Path) -> Header:
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(path) as picture:
                 _check_kind(path, picture)
-                turned = picture.getexif().get(_ORIENTATION_TAG, 1) in (5, 6, 7, 8)
-                return Header(picture.width, picture.height, picture.format or "", turned)
+                return Header(picture.width, picture.height, picture.format or "")
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
         raise InputError(f"{path} has more than 89 Mpx; reduce the photo and make the model again.") from None
     except UnidentifiedImageError:
-        raise InputError(f"{path} is not a picture; copy the photo again or save it as JPEG or PNG.") from None
+        raise InputError(
+            f"{path} is not a picture; copy the photo again or save it as JPEG or PNG."
+        ) from None
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the EXIF orientation of a readable picture swaps width and height."""
+    with Image.open(path) as picture:
+        return picture.getexif().get(_ORIENTATION_TAG, 1) in (5, 6, 7, 8)
 
 
 def _check_kind(path: Path, picture: Image.Image) -> None:

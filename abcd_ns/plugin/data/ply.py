@@ -33,7 +33,9 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         InputError: missing, not a .ply with x, y and z in its first element, or not as long as it claims.
     """
     if not path.is_file():
-        raise InputError(f"{path} does not exist; correct ply_file_path, or remove it to start from random points.")
+        raise InputError(
+            f"{path} does not exist; correct ply_file_path, or remove it to start from random points."
+        )
     content = path.read_bytes()
     end = content.find(b"end_header", 0, _MAX_HEADER)
     start = content.find(b"\n", end) + 1
@@ -46,7 +48,9 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bad(path: Path, what: str) -> InputError:
-    return InputError(f"{path} {what}; write the points again, or remove ply_file_path to start from random points.")
+    return InputError(
+        f"{path} {what}; write the points again, or remove ply_file_path to start from random points."
+    )
 
 
 def _parse_header(path: Path, header: str) -> tuple[str, int, np.dtype, bool]:
@@ -75,7 +79,9 @@ def _read_rows(path: Path, body: bytes, order: str, count: int, row: np.dtype, a
         if len(lines) < count:
             raise _bad(path, f"claims {count} points but has {len(lines)} lines")
         try:
-            table = np.loadtxt(io.BytesIO(b"\n".join(lines)), dtype=row, ndmin=1) if count else np.empty(0, row)
+            table = (
+                np.loadtxt(io.BytesIO(b"\n".join(lines)), dtype=row, ndmin=1) if count else np.empty(0, row)
+            )
         except ValueError:
             raise _bad(path, "has lines that cannot be read") from None
         if len(table) != count:

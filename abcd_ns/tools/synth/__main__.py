@@ -2,12 +2,7 @@
 
 import sys
 
-import tyro
-
-from abcd_ns.tools.synth.command import SynthError, synth
+from abcd_ns.tools.cli import main
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(synth, prog="python -m abcd_ns.tools.synth")
-    except SynthError as error:
-        sys.exit(f"error: {error}")
+    sys.exit(main(["synth", *sys.argv[1:]]))

@@ -83,10 +83,8 @@ class Site:
         """The openings of a court's wall, in that wall's own direction; equal from both of its sides."""
         lower, upper = sorted((self.cells[court], self._beyond(court, side)))
         rng = self.rng("edge", lower, upper)
-        if self.shares_wall(court, side):
-            found = _shared_openings(rng)
-        else:
-            found = _outer_openings(rng)
+        draw = _shared_openings if self.shares_wall(court, side) else _outer_openings
+        found = draw(rng)
         # North and west walls run along +x and +y after their turn, south and east walls against them.
         return found if side < 2 else [o.mirrored() for o in found]
 
@@ -140,7 +138,7 @@ def _floor(shop: Workshop) -> Soup:
     ground = shop.material("paving", flag, (0.16, 0.15, 0.10), pale, (side, 0.8 * side))
     h = CELL / 2
     quad = np.array([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]])
-    return patch(quad, np.array([0, 0, 1.0]), ground, 0.4)
+    return patch(quad, np.array([0, 0, 1.0]), ground, 0.6)
 
 
 def _wall_extras(site: Site, court: int, side: int, shop: Workshop, height: float) -> list[Soup]:
@@ -151,9 +149,7 @@ def _wall_extras(site: Site, court: int, side: int, shop: Workshop, height: floa
         free = [s for s in hung if all(abs(s - o.center) > 1.0 for o in site.openings(court, side))]
         return [banner(shop, height - 0.25).placed((s, INNER - 0.07, 0)) for s in free]
     lean_to = shelter(shop, 2.8).placed((0.0, INNER, 0))
-    stores = [
-        FURNITURE[k](shop).placed((s, INNER - 0.55, 0)) for s, k in ((-0.75, 0), (0.1, 0), (0.95, 1))
-    ]
+    stores = [FURNITURE[k](shop).placed((s, INNER - 0.55, 0)) for s, k in ((-0.75, 0), (0.1, 0), (0.95, 1))]
     return [lean_to, *stores]
 
 

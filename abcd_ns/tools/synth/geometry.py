@@ -3,11 +3,11 @@
 All solids stand in local coordinates in metres, z up, and are then placed by `Soup.placed`.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 ALL_FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
@@ -50,25 +50,23 @@ class Soup:
         return Soup(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
-def _grid_triangles(
-    points: NDArray, normals: NDArray, uv: NDArray, material: int, min_area: float = 1e-9
-) -> Soup:
-    """Two triangles per cell of a grid of [a, b, ...] samples; those without an area are left out."""
+def _grid_triangles(points: NDArray, normals: NDArray, uv: NDArray, material: int) -> Soup:
+    """Two triangles per cell of a grid of [a, b, ...] samples."""
 
-    def split(values: NDArray) -> NDArray:
+    def split(values: NDArray) -> NDArray[np.float32]:
         p, q, r, s = values[:-1, :-1], values[1:, :-1], values[1:, 1:], values[:-1, 1:]
-        pairs = np.stack([np.stack([p, q, r], axis=2), np.stack([p, r, s], axis=2)], axis=2)
-        return pairs.reshape(-1, 3, values.shape[-1])
+        pairs = np.stack([p, q, r, p, r, s], axis=2)
+        return pairs.reshape(-1, 3, values.shape[-1]).astype(np.float32)
 
     corners = split(points)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    keep = area > min_area
-    return Soup(
-        corners[keep].astype(np.float32),
-        split(normals)[keep].astype(np.float32),
-        split(uv)[keep].astype(np.float32),
-        np.full(int(keep.sum()), material, np.int32),
-    )
+    return Soup(corners, split(normals), split(uv), np.full(len(corners), material, np.int32))
+
+
+def _without_slivers(soup: Soup) -> Soup:
+    """Drop the triangles that have no area, as those at the poles of a solid of revolution."""
+    edges = soup.corners[:, 1:] - soup.corners[:, :1]
+    keep = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > 1e-7
+    return Soup(soup.corners[keep], soup.normals[keep], soup.uv[keep], soup.material[keep])
 
 
 def _planar_uv(points: NDArray, normal: NDArray) -> NDArray:
@@ -83,8 +81,8 @@ def patch(corners: NDArray, outward: NDArray, material: int, max_edge: float) ->
     The cuts carry the baked ambient light, which is interpolated between vertices.
     """
     p, q, r, s = np.asarray(corners, np.float64)
-    n_u = max(1, int(np.ceil(max(np.linalg.norm(q - p), np.linalg.norm(r - s)) / max_edge - 1e-9)))
-    n_v = max(1, int(np.ceil(max(np.linalg.norm(s - p), np.linalg.norm(r - q)) / max_edge - 1e-9)))
+    n_u = max(1, math.ceil(max(math.dist(p, q), math.dist(s, r)) / max_edge - 1e-9))
+    n_v = max(1, math.ceil(max(math.dist(p, s), math.dist(q, r)) / max_edge - 1e-9))
     a = np.linspace(0, 1, n_u + 1)[:, None, None]
     b = np.linspace(0, 1, n_v + 1)[None, :, None]
     points = (1 - a) * (1 - b) * p + a * (1 - b) * q + a * b * r + (1 - a) * b * s
@@ -92,7 +90,9 @@ def patch(corners: NDArray, outward: NDArray, material: int, max_edge: float) ->
     normal /= np.linalg.norm(normal)
     if normal @ outward < 0:
         normal = -normal
-    return _grid_triangles(points, np.broadcast_to(normal, points.shape), _planar_uv(points, normal), material)
+    return _grid_triangles(
+        points, np.broadcast_to(normal, points.shape), _planar_uv(points, normal), material
+    )
 
 
 def hexahedron(
@@ -123,7 +123,7 @@ def box(
     """An axis-aligned box between two corners."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     base = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]], np.float64)
-    return hexahedron(base, base + [0, 0, z1 - z0], material, max_edge, faces)
+    return hexahedron(base, base + np.array([0, 0, z1 - z0]), material, max_edge, faces)
 
 
 def lathe(
@@ -152,7 +152,7 @@ def lathe(
         u = np.broadcast_to(angle[:, None] * rz[:, 0].max(), points.shape[:2])
         uv = np.stack([u, np.broadcast_to(arc[k : k + 2], points.shape[:2])], axis=-1)
         parts.append(_grid_triangles(points, _swept(around, normal), uv, material))
-    return Soup.cat(parts)
+    return _without_slivers(Soup.cat(parts))
 
 
 def _swept(around: NDArray, rz: NDArray) -> NDArray:
@@ -161,26 +161,35 @@ def _swept(around: NDArray, rz: NDArray) -> NDArray:
     return np.concatenate([flat, np.broadcast_to(rz[None, :, 1:], (*flat.shape[:2], 1))], axis=-1)
 
 
-def ball(radius: float, material: int, rings: int = 8, segments: int = 16) -> Soup:
+def ball(radius: float, material: int, rings: int = 7, segments: int = 14) -> Soup:
     """A sphere about the origin."""
     tilt = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     profile = [(max(0.0, radius * np.cos(a)), radius * np.sin(a)) for a in tilt]
     return lathe(profile, material, segments, smooth=True)
 
 
-def blob(radius: float, roughness: float, material: int, rng: np.random.Generator) -> Soup:
-    """A lumpy ball (foliage, rock); `roughness` is the relative size of its lumps."""
-    sphere = trimesh.creation.icosphere(subdivisions=2)
-    direction = np.asarray(sphere.vertices)
-    waves, phase = rng.normal(size=(6, 3)) * 2.5, rng.uniform(0, 2 * np.pi, 6)
-    lump = np.sin(np.einsum("vi,wi->vw", direction, waves) + phase).mean(axis=1)
-    vertices = direction * (radius * (1 + 2 * roughness * lump))[:, None]
-    shape = trimesh.Trimesh(vertices, sphere.faces, process=False)
-    faces = np.asarray(shape.faces)
-    uv = direction[:, :2] * radius
-    return Soup(
-        vertices[faces].astype(np.float32),
-        np.asarray(shape.vertex_normals)[faces].astype(np.float32),
-        uv[faces].astype(np.float32),
-        np.full(len(faces), material, np.int32),
+def blob(
+    radius: float,
+    roughness: float,
+    material: int,
+    rng: np.random.Generator,
+    rings: int = 8,
+    segments: int = 16,
+) -> Soup:
+    """A lumpy ball (foliage, rock): r(d) = radius (1 + 2 roughness lump(d)) in direction d.
+
+    The normal of such a surface is along r d - grad r, with the part of the gradient across d.
+    """
+    tilt = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)[None, :, None]
+    turn = np.linspace(0, 2 * np.pi, segments + 1)[:, None, None]
+    d = np.concatenate(
+        [np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt) + 0 * turn], axis=-1
     )
+    waves, phase = rng.normal(size=(6, 3)) * 2.5, rng.uniform(0, 2 * np.pi, 6)
+    argument = np.einsum("abi,wi->abw", d, waves) + phase
+    r = radius * (1 + 2 * roughness * np.sin(argument).mean(axis=-1, keepdims=True))
+    slope = radius * 2 * roughness * np.einsum("abw,wi->abi", np.cos(argument), waves) / len(waves)
+    slope -= (slope * d).sum(axis=-1, keepdims=True) * d
+    normal = r * d - slope
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return _without_slivers(_grid_triangles(r * d, normal, d[..., :2] * radius, material))

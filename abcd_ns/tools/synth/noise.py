@@ -77,7 +77,7 @@ def fbm2(x: Array, y: Array, frequency: float, octaves: int, footprint: Array) -
     for k in range(octaves):
         f = frequency * 2**k
         weight = amplitude * fade(f, footprint)
-        if weight.max() > 0:
+        if weight.any():
             total += weight * noise2(x * f + 17.3 * k, y * f + 5.7 * k)
         amplitude *= 0.55
     return total
@@ -89,7 +89,7 @@ def fbm3(p: Array, frequency: float, octaves: int, footprint: Array) -> Array:
     for k in range(octaves):
         f = frequency * 2**k
         weight = amplitude * fade(f, footprint)
-        if weight.max() > 0:
+        if weight.any():
             total += weight * noise3(p * np.float32(f) + np.float32(3.1 * k))
         amplitude *= 0.55
     return total

@@ -42,7 +42,9 @@ class Workshop:
 
     def leaves(self) -> int:
         warm = float(self.rng.uniform(0.0, 0.10))
-        return self.material("foliage", (0.08 + warm, 0.20, 0.04), (0.02, 0.05, 0.015), (0.22 + warm, 0.34, 0.07))
+        return self.material(
+            "foliage", (0.08 + warm, 0.20, 0.04), (0.02, 0.05, 0.015), (0.22 + warm, 0.34, 0.07)
+        )
 
     def paint(self) -> int:
         return self.material("plain", self.accent, self.accent, self.accent)
@@ -51,28 +53,30 @@ class Workshop:
 def barrel(shop: Workshop) -> Soup:
     """A cask with iron hoops."""
     r, h = shop.rng.uniform(0.32, 0.4), shop.rng.uniform(0.85, 1.0)
-    t = np.linspace(0, 1, 7)
+    t = np.linspace(0, 1, 5)
     bulge = r * (0.82 + 0.18 * np.sin(np.pi * t))
     staves = [*zip(bulge, h * t, strict=True), (r * 0.76, h), (r * 0.76, h - 0.05), (0.0, h - 0.05)]
-    parts = [lathe(staves, shop.oak(0.14), segments=18)]
+    parts = [lathe(staves, shop.oak(0.14), segments=16)]
     hoop = shop.iron()
     for z in (0.14, 0.36, 0.64, 0.86):
         ring = r * (0.82 + 0.18 * np.sin(np.pi * z))
-        band = [(ring, h * z - 0.03), (ring + 0.02, h * z - 0.03), (ring + 0.02, h * z + 0.03), (ring, h * z + 0.03)]
-        parts.append(lathe(band, hoop, segments=18))
+        band = [(ring + 0.012, h * z - 0.03), (ring + 0.012, h * z + 0.03)]
+        parts.append(lathe(band, hoop, segments=16))
     return Soup.cat(parts)
 
 
 def crates(shop: Workshop) -> Soup:
     """Two boxes, the smaller on top and turned."""
     low, high = shop.rng.uniform(0.7, 0.9), shop.rng.uniform(0.45, 0.6)
-    return Soup.cat([_crate(shop, low), _crate(shop, high).placed((0.05, -0.04, low), shop.rng.uniform(0.2, 0.7))])
+    return Soup.cat(
+        [_crate(shop, low), _crate(shop, high).placed((0.05, -0.04, low), shop.rng.uniform(0.2, 0.7))]
+    )
 
 
 def _crate(shop: Workshop, side: float) -> Soup:
     h, bar = side / 2, 0.08
     frame = shop.material("wood", (0.20, 0.12, 0.06), _DARK, _OAK, (0.4, 1.0))
-    parts = [box((-h, -h, 0), (h, h, side), shop.oak(0.15), 0.5, STANDING)]
+    parts = [box((-h, -h, 0), (h, h, side), shop.oak(0.15), 0.9, STANDING)]
     e = h + 0.025
     for x in (-1, 1):
         for y in (-1, 1):
@@ -89,14 +93,23 @@ def stone_ball(shop: Workshop) -> Soup:
     """A ball on a plinth."""
     marble, r = shop.marble(), shop.rng.uniform(0.34, 0.45)
     painted = shop.paint() if shop.rng.random() < 0.5 else shop.marble()
-    base = box((-0.4, -0.4, 0), (0.4, 0.4, 0.5), marble, 0.4, STANDING)
+    base = box((-0.4, -0.4, 0), (0.4, 0.4, 0.5), marble, 0.7, STANDING)
     lip = box((-0.46, -0.46, 0.5), (0.46, 0.46, 0.6), marble, 0.5)
     return Soup.cat([base, lip, ball(r, painted).placed((0, 0, 0.58 + r))])
 
 
 def urn(shop: Workshop) -> Soup:
     """A clay pot with a bush."""
-    profile = [(0.22, 0), (0.36, 0.22), (0.40, 0.42), (0.30, 0.62), (0.38, 0.72), (0.32, 0.72), (0.28, 0.6), (0, 0.6)]
+    profile = [
+        (0.22, 0),
+        (0.36, 0.22),
+        (0.40, 0.42),
+        (0.30, 0.62),
+        (0.38, 0.72),
+        (0.32, 0.72),
+        (0.28, 0.6),
+        (0, 0.6),
+    ]
     clay = shop.material("stone", (0.45, 0.20, 0.11), (0.30, 0.12, 0.07), (0.52, 0.27, 0.16))
     bush = blob(0.42, 0.25, shop.leaves(), shop.rng).placed((0, 0, 0.95))
     return Soup.cat([lathe(profile, clay, segments=18), bush])
@@ -126,9 +139,9 @@ def column(shop: Workshop) -> Soup:
     shaft = [(0.24, 0.2), (0.26, 0.3), (0.22, h - 0.25), (0.3, h - 0.1)]
     return Soup.cat(
         [
-            box((-0.34, -0.34, 0), (0.34, 0.34, 0.2), marble, 0.4, STANDING),
+            box((-0.34, -0.34, 0), (0.34, 0.34, 0.2), marble, 0.7, STANDING),
             lathe(shaft, marble, segments=18),
-            box((-0.36, -0.36, h - 0.1), (0.36, 0.36, h + 0.06), marble, 0.4),
+            box((-0.36, -0.36, h - 0.1), (0.36, 0.36, h + 0.06), marble, 0.8),
         ]
     )
 
@@ -137,13 +150,22 @@ def fountain(shop: Workshop) -> Soup:
     """Two bowls with water about a stem, a ball on top."""
     marble = shop.marble()
     pool = shop.material("water", (0.05, 0.17, 0.20), (0, 0, 0), (0.13, 0.33, 0.36))
-    rim = [(1.55, 0), (1.55, 0.1), (1.42, 0.16), (1.42, 0.5), (1.55, 0.56), (1.55, 0.66), (1.3, 0.66), (1.3, 0.2)]
+    rim = [
+        (1.55, 0),
+        (1.55, 0.1),
+        (1.42, 0.16),
+        (1.42, 0.5),
+        (1.55, 0.56),
+        (1.55, 0.66),
+        (1.3, 0.66),
+        (1.3, 0.2),
+    ]
     stem = [(0.32, 0.3), (0.2, 0.6), (0.2, 1.0), (0.75, 1.3), (0.8, 1.4), (0.68, 1.4), (0.6, 1.3)]
     spout = [(0.12, 1.3), (0.1, 1.8), (0.2, 1.85), (0.0, 1.86)]
     return Soup.cat(
         [
-            lathe(rim, marble, segments=28),
-            lathe([(1.32, 0.48), (0.0, 0.481)], pool, segments=28),
+            lathe(rim, marble, segments=20),
+            lathe([(1.32, 0.48), (0.0, 0.481)], pool, segments=20),
             lathe(stem, marble, segments=22),
             lathe([(0.66, 1.34), (0.0, 1.341)], pool, segments=22),
             lathe(spout, marble, segments=14),
@@ -158,8 +180,8 @@ def tree(shop: Workshop) -> Soup:
     ring = [(1.05, 0), (1.05, 0.4), (0.85, 0.4), (0.85, 0.25)]
     earth = shop.material("meadow", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     parts = [
-        lathe(ring, shop.marble(), segments=24),
-        lathe([(0.86, 0.3), (0.0, 0.36)], earth, segments=24),
+        lathe(ring, shop.marble(), segments=20),
+        lathe([(0.86, 0.3), (0.0, 0.36)], earth, segments=20),
         lathe([(0.3, 0.3), (0.2, 0.8), (0.17, 1.6), (0.24, 2.2)], bark, segments=12),
     ]
     leaves = shop.leaves()
@@ -175,12 +197,14 @@ def obelisk(shop: Workshop) -> Soup:
     """A tapering shaft on steps, a painted ball on its tip."""
     marble = shop.marble()
     parts = [
-        box((-s, -s, 0.22 * k), (s, s, 0.22 * k + 0.22), marble, 0.5, STANDING)
+        box((-s, -s, 0.22 * k), (s, s, 0.22 * k + 0.22), marble, 0.7, STANDING)
         for k, s in enumerate((1.3, 1.0, 0.7))
     ]
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float64)
     shaft = shop.material("stone", (0.50, 0.34, 0.28), _DARK, (0.60, 0.45, 0.38))
-    parts.append(hexahedron(corners * 0.42 + [0, 0, 0.66], corners * 0.22 + [0, 0, 3.1], shaft, 0.5, STANDING))
+    parts.append(
+        hexahedron(corners * 0.42 + [0, 0, 0.66], corners * 0.22 + [0, 0, 3.1], shaft, 0.5, STANDING)
+    )
     parts.append(ball(0.3, shop.paint()).placed((0, 0, 3.38)))
     return Soup.cat(parts)
 
@@ -192,8 +216,8 @@ def well(shop: Workshop) -> Soup:
     dark = shop.material("water", (0.02, 0.05, 0.06), (0, 0, 0), (0.05, 0.10, 0.11))
     oak = shop.oak()
     parts = [
-        lathe([(0.95, 0), (0.95, 0.85), (0.7, 0.85), (0.7, 0.3)], brick, segments=24),
-        lathe([(0.72, 0.5), (0.0, 0.501)], dark, segments=24),
+        lathe([(0.95, 0), (0.95, 0.85), (0.7, 0.85), (0.7, 0.3)], brick, segments=20),
+        lathe([(0.72, 0.5), (0.0, 0.501)], dark, segments=20),
         lathe([(1.35, 2.15), (0.0, 3.05)], roof, segments=20),
         lathe([(0.0, 2.14), (1.35, 2.15)], oak, segments=20),
         lathe([(0.09, -0.8), (0.09, 0.8)], oak, segments=10),
@@ -213,14 +237,18 @@ def tower(shop: Workshop, wall: int, trim: int, height: float, roofed: bool) -> 
     """A round turret of the walls' stone, with a tiled cone or a flat battlement."""
     r = 0.85
     parts = [
-        lathe([(r + 0.1, 0), (r + 0.1, 0.35), (r, 0.4)], trim, segments=24),
-        lathe([(r, z) for z in np.linspace(0.4, height, 7)], wall, segments=24),
-        lathe([(r, height), (r + 0.14, height + 0.12), (r + 0.14, height + 0.3), (0, height + 0.3)], trim, segments=24),
+        lathe([(r + 0.1, 0), (r + 0.1, 0.35), (r, 0.4)], trim, segments=18),
+        lathe([(r, z) for z in np.linspace(0.4, height, 5)], wall, segments=18),
+        lathe(
+            [(r, height), (r + 0.14, height + 0.12), (r + 0.14, height + 0.3), (0, height + 0.3)],
+            trim,
+            segments=18,
+        ),
     ]
     if roofed:
         tile = shop.material("tiles", (0.36, 0.12, 0.08), _DARK, (0.48, 0.20, 0.12), (0.3, 0.26))
-        cone = [(r + 0.22, height + 0.3), (r * 0.5, height + 1.3), (0.0, height + 2.1)]
-        parts += [lathe(cone, tile, segments=24), ball(0.12, shop.paint()).placed((0, 0, height + 2.15))]
+        cone = [(r + 0.19, height + 0.3), (r * 0.5, height + 1.3), (0.0, height + 2.1)]
+        parts += [lathe(cone, tile, segments=18), ball(0.12, shop.paint()).placed((0, 0, height + 2.15))]
     else:
         for k in range(8):
             block = box((r - 0.18, -0.2, 0), (r + 0.12, 0.2, 0.45), wall, 0.6, STANDING)
@@ -243,9 +271,9 @@ def shelter(shop: Workshop, width: float) -> Soup:
     tile = shop.material("tiles", (0.38, 0.16, 0.09), _DARK, (0.50, 0.25, 0.14), (0.28, 0.24))
     oak, h = shop.oak(), width / 2
     base = np.array([[-h, -1.15, 1.95], [h, -1.15, 1.95], [h, 0, 2.45], [-h, 0, 2.45]], np.float64)
-    roof = hexahedron(base, base + [0, 0, 0.1], tile, 0.6)
+    roof = hexahedron(base, base + np.array([0, 0, 0.1]), tile, 0.6)
     posts = [
-        box((x - 0.07, -1.05, 0), (x + 0.07, -0.91, 2.0), oak, 0.6, STANDING) for x in (0.1 - h, 0.0, h - 0.1)
+        box((x - 0.07, -1.05, 0), (x + 0.07, -0.91, 2.0), oak, 1.0, STANDING) for x in (0.1 - h, 0.0, h - 0.1)
     ]
     beam = box((-h, -1.06, 1.86), (h, -0.9, 1.98), oak, 0.8)
     return Soup.cat([roof, beam, *posts])

@@ -121,10 +121,10 @@ def wood(p: Points) -> Array:
 def stone(p: Points) -> Array:
     """Solid stone or marble: clouds of base and third, veins of the second."""
     at = p.position + p.salt[:, None]
-    cloud = fbm3(at, 1.6, 4, p.footprint)
+    cloud = fbm3(at, 1.6, 5, p.footprint)
     vein = 1 - smoothstep(0.0, 0.09, np.abs(fbm3(at + np.float32(9.5), 1.3, 2, p.footprint)))
-    color = mix(p.base, p.third, smoothstep(-0.6, 0.6, cloud)) * (1 + 0.2 * cloud)[:, None]
-    return mix(color, p.second, 0.45 * vein)
+    color = mix(p.base, p.third, smoothstep(-0.6, 0.6, cloud)) * (1 + 0.32 * cloud)[:, None]
+    return mix(color, p.second, 0.5 * vein)
 
 
 def tiles(p: Points) -> Array:
@@ -141,9 +141,9 @@ def foliage(p: Points) -> Array:
     """Leaves: clumps of base and third, dark gaps of the second."""
     at = p.position + p.salt[:, None]
     clumps = fbm3(at, 2.6, 3, p.footprint)
-    leaves = fbm3(at + np.float32(4.7), 9.0, 2, p.footprint)
-    color = mix(p.base, p.third, smoothstep(-0.5, 0.5, clumps)) * (1 + 0.5 * leaves)[:, None]
-    return mix(color, p.second, 0.7 * smoothstep(0.1, 0.6, -clumps - 0.5 * leaves))
+    leaves = fbm3(at + np.float32(4.7), 8.0, 3, p.footprint)
+    color = mix(p.base, p.third, smoothstep(-0.5, 0.5, clumps)) * (1 + 0.8 * leaves)[:, None]
+    return mix(color, p.second, 0.75 * smoothstep(0.0, 0.5, -clumps - 0.8 * leaves))
 
 
 def cloth(p: Points) -> Array:

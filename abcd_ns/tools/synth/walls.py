@@ -5,6 +5,7 @@ courts each build their own half of a shared wall; both take the openings from t
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,8 +17,10 @@ THICKNESS = 0.3
 """Of a court's half of a wall, metres."""
 INNER = CELL / 2 - THICKNESS
 """From a court's centre to the inner face of its walls, metres."""
-_ARCH_STEPS = 10
-_EDGE = 0.55
+_ARCH_STEPS = 8
+_EDGE = 0.8
+_SEEN = ("-x", "+x", "-y", "+z")
+"""The faces of a pier, but for the outer one, which is never near a camera and stays uncut."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def wall(openings: list[Opening], height: float, finish: WallFinish) -> Soup:
         parts += _opening(opening, height, finish)
         at = opening.right
     parts += _pier(at, end, height, finish)
-    parts.append(box((start, INNER - 0.07, height - 0.16), (end, INNER, height), finish.trim, 1.0))
+    parts.append(box((start, INNER - 0.07, height - 0.16), (end, INNER, height), finish.trim, 1.2))
     parts += _merlons(start, end, height, finish)
     return Soup.cat(parts)
 
@@ -83,8 +86,9 @@ def wall(openings: list[Opening], height: float, finish: WallFinish) -> Soup:
 def _pier(s0: float, s1: float, height: float, finish: WallFinish) -> list[Soup]:
     """A full-height stretch of wall with a plinth."""
     return [
-        box((s0, INNER, 0), (s1, CELL / 2, height), finish.wall, _EDGE, STANDING),
-        box((s0, INNER - 0.08, 0), (s1, INNER, 0.32), finish.trim, 0.8, STANDING),
+        box((s0, INNER, 0), (s1, CELL / 2, height), finish.wall, _EDGE, _SEEN),
+        box((s0, INNER, 0), (s1, CELL / 2, height), finish.wall, CELL, ("+y",)),
+        box((s0, INNER - 0.08, 0), (s1, INNER, 0.32), finish.trim, 1.2, ("-x", "+x", "-y", "+z")),
     ]
 
 
@@ -93,7 +97,7 @@ def _opening(o: Opening, height: float, finish: WallFinish) -> list[Soup]:
     y0, y1 = INNER, CELL / 2
     inner, outer = o.arch(), o.arch(grow=0.2)
     parts = []
-    for (s0, z0), (s1, z1) in zip(inner[:-1], inner[1:], strict=True):
+    for (s0, z0), (s1, z1) in pairwise(inner):
         base = np.array([[s0, y0, z0], [s1, y0, z1], [s1, y1, z1], [s0, y1, z0]])
         top = base * [1, 1, 0] + [0, 0, height]
         parts.append(hexahedron(base, top, finish.wall, _EDGE, ("-y", "+y", "-z", "+z")))
@@ -103,13 +107,13 @@ def _opening(o: Opening, height: float, finish: WallFinish) -> list[Soup]:
         (c, zc), (d, zd) = outer[k], outer[k + 1]
         base = np.array([[a, front, za], [b, front, zb], [b, y0, zb], [a, y0, za]])
         top = np.array([[c, front, zc], [d, front, zd], [d, y0, zd], [c, y0, zc]])
-        parts.append(hexahedron(base, top, finish.trim, 0.8, ("-y", "-z", "+z")))
+        parts.append(hexahedron(base, top, finish.trim, 1.5, ("-y", "-z", "+z")))
     for s0, s1 in ((o.left - 0.2, o.left), (o.right, o.right + 0.2)):
-        parts.append(box((s0, front, o.sill), (s1, y0, o.spring), finish.trim, 0.8, ("-x", "+x", "-y")))
+        parts.append(box((s0, front, o.sill), (s1, y0, o.spring), finish.trim, 1.2, ("-x", "+x", "-y")))
     if o.sill > 0:
         parts.append(box((o.left, y0, 0), (o.right, y1, o.sill), finish.wall, _EDGE, ("-y", "+y", "+z")))
         parts.append(
-            box((o.left - 0.3, y0 - 0.14, o.sill - 0.14), (o.right + 0.3, y0, o.sill), finish.trim, 0.8)
+            box((o.left - 0.3, y0 - 0.14, o.sill - 0.14), (o.right + 0.3, y0, o.sill), finish.trim, 1.2)
         )
     return parts
 
@@ -120,6 +124,6 @@ def _merlons(start: float, end: float, height: float, finish: WallFinish) -> lis
     pitch = (end - start) / count
     left = start + pitch * (np.arange(count) + 0.2)
     return [
-        box((s, INNER, height), (s + 0.58 * pitch, CELL / 2, height + 0.55), finish.wall, 0.8, STANDING)
+        box((s, INNER, height), (s + 0.58 * pitch, CELL / 2, height + 0.55), finish.wall, 1.2, STANDING)
         for s in left
     ]

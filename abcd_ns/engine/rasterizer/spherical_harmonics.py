@@ -1,0 +1,74 @@
+"""View-dependent colour: real spherical harmonics up to degree 3, in the order and signs of 3DGS."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+MAX_SH_DEGREE = 3
+
+SH_C0 = 0.5 / math.sqrt(math.pi)
+_C1 = math.sqrt(3 / (4 * math.pi))
+_C2 = math.sqrt(15 / math.pi) / 2
+_C2_ZZ = math.sqrt(5 / math.pi) / 4
+_C3_A = math.sqrt(35 / (2 * math.pi)) / 4
+_C3_B = math.sqrt(105 / math.pi) / 2
+_C3_C = math.sqrt(21 / (2 * math.pi)) / 4
+_C3_ZZZ = math.sqrt(7 / math.pi) / 4
+
+
+def sh_bases(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
+    """Real spherical harmonics of degrees 1 to `degree` at unit vectors; k = (degree + 1)^2 - 1.
+
+    The polynomials of Sloan, "Efficient Spherical Harmonic Evaluation" (JCGT 2013), with the
+    Condon-Shortley sign. Degree 0 is the constant SH_C0 and left out.
+    """
+    x, y, z = directions.unbind(-1)
+    bases = []
+    if degree >= 1:
+        bases += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        bases += [_C2 * x * y, -_C2 * y * z, _C2_ZZ * (3 * zz - 1), -_C2 * x * z, 0.5 * _C2 * (xx - yy)]
+    if degree >= 3:
+        ring = _C3_C * (5 * zz - 1)
+        bases += [
+            -_C3_A * y * (3 * xx - yy),
+            _C3_B * x * y * z,
+            -ring * y,
+            _C3_ZZZ * z * (5 * zz - 3),
+            -ring * x,
+            0.5 * _C3_B * z * (xx - yy),
+            -_C3_A * x * (xx - 3 * yy),
+        ]
+    return torch.stack(bases, dim=-1) if bases else directions.new_zeros((directions.shape[0], 0))
+
+
+def sh_colors(
+    features_dc: Float[Tensor, "n 3"],
+    features_rest: Float[Tensor, "n k 3"],
+    means: Float[Tensor, "n 3"],
+    camera_center: Float[Tensor, "3"],
+    degree: int,
+) -> Float[Tensor, "n 3"]:
+    """Colours as seen from a camera: max(0, SH(direction) + 0.5), linear, not clamped from above.
+
+    Args:
+        degree: the degree in use; coefficients of higher degrees are ignored.
+
+    Raises:
+        ValueError: `degree` is above 3, or above what `features_rest` holds.
+    """
+    used = (degree + 1) ** 2 - 1
+    if not 0 <= degree <= MAX_SH_DEGREE or used > features_rest.shape[1]:
+        raise ValueError(
+            f"sh_degree is {degree}, but the Gaussians hold {features_rest.shape[1]} coefficients above degree 0 "
+            f"and at most degree {MAX_SH_DEGREE} is supported; lower sh_degree."
+        )
+    colors = SH_C0 * features_dc + 0.5
+    if degree > 0:
+        bases = sh_bases(F.normalize(means - camera_center, dim=-1), degree)
+        colors = colors + torch.bmm(bases[:, None], features_rest[:, :used])[:, 0]
+    return colors.clamp_min(0.0)

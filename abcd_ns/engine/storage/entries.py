@@ -1,0 +1,242 @@
+"""Bytes by key under a limit, in memory or in LMDB; never raises for what a disk does. Not thread-safe."""
+
+import mmap
+import secrets
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+import lmdb
+
+from abcd_ns.engine.storage.atomic import FolderLock
+
+T = TypeVar("T")
+
+_FILES = ("data.mdb", "lock.mdb")
+_LEAST_PAGES = 16  # LMDB needs a few beside the values
+
+
+class MemoryEntries:
+    """A dictionary that empties itself when its values would exceed the limit."""
+
+    def __init__(self, limit: int):
+        self.evictions = self.rejected = self.recreated = 0
+        self._limit = limit
+        self._values: dict[bytes, bytes] = {}
+        self._nbytes = 0
+
+    def get(self, key: bytes) -> bytes | None:
+        return self._values.get(key)
+
+    def put_many(self, items: Sequence[tuple[bytes, bytes]]) -> None:
+        for key, value in items:
+            self.delete(key)
+            if len(value) > self._limit:
+                self.rejected += 1
+                continue
+            if self._nbytes + len(value) > self._limit:
+                self.clear()
+                self.evictions += 1
+            self._values[key] = value
+            self._nbytes += len(value)
+
+    def delete(self, key: bytes) -> None:
+        self._nbytes -= len(self._values.pop(key, b""))
+
+    def drop(self, start: bytes) -> None:
+        """Delete all keys that begin with `start`."""
+        for key in [key for key in self._values if key.startswith(start)]:
+            self.delete(key)
+
+    def clear(self) -> None:
+        self._values.clear()
+        self._nbytes = 0
+
+    def close(self) -> None:
+        self.clear()
+
+    @property
+    def nbytes(self) -> int:
+        return self._nbytes
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+class LmdbEntries:
+    """An LMDB environment that is deleted and made anew whenever it is full, damaged or refused by the disk.
+
+    LMDB trusts its files: a damaged page can crash the process that maps it. So a file is discarded, before
+    any page is read, if it is shorter than its header says, or if it was open when the machine went down,
+    for pages are written without syncing. A killed process does no such harm: the kernel has its pages.
+    """
+
+    def __init__(self, folder: Path, limit: int):
+        self.evictions = self.rejected = self.recreated = 0
+        self._folder = folder
+        self._limit = max(limit // mmap.PAGESIZE, _LEAST_PAGES) * mmap.PAGESIZE
+        self._unsynced = folder / "unsynced"  # there while open; says in which boot that was
+        self._environment: lmdb.Environment | None = None
+        folder.mkdir(parents=True, exist_ok=True)
+        self._lock = FolderLock(folder)
+        self._closed = False
+        try:
+            boot = _boot_id()
+            if self._unsynced.exists() and self._unsynced.read_bytes() != boot:
+                self.recreated += 1
+                self._delete_files()
+            self._unsynced.write_bytes(boot)
+            self._environment = self._open()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def get(self, key: bytes) -> bytes | None:
+        def read(environment: lmdb.Environment) -> bytes | None:
+            with environment.begin() as transaction:
+                return transaction.get(key)
+
+        return self._attempt(read)
+
+    def put_many(self, items: Sequence[tuple[bytes, bytes]]) -> None:
+        """Put all in one transaction; if they do not fit, empty the environment and put what does."""
+        fitting = [item for item in items if len(item[1]) <= self._limit - _LEAST_PAGES * mmap.PAGESIZE // 2]
+        self.rejected += len(items) - len(fitting)
+        if not fitting or self._put(fitting):
+            return
+        for item in fitting:  # together they may exceed the limit where each does not
+            if not self._put([item]) and not self._put([item]):
+                self.rejected += 1
+
+    def delete(self, key: bytes) -> None:
+        def remove(environment: lmdb.Environment) -> None:
+            with environment.begin(write=True) as transaction:
+                transaction.delete(key)
+
+        self._attempt(remove)
+
+    def drop(self, start: bytes) -> None:
+        """Delete all keys that begin with `start`, which is not empty."""
+
+        def remove(environment: lmdb.Environment) -> None:
+            with environment.begin(write=True) as transaction, transaction.cursor() as cursor:
+                cursor.set_range(start)
+                while cursor.key().startswith(start):
+                    cursor.delete()  # and stand on the next
+
+        self._attempt(remove)
+
+    def clear(self) -> None:
+        self._require_open()
+        self._recreate()
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        if self._environment is not None:
+            with suppress(lmdb.Error, OSError):
+                self._environment.sync(True)
+                self._unsynced.unlink()
+            self._environment.close()
+        self._environment = None
+        self._lock.release()
+
+    @property
+    def nbytes(self) -> int:
+        stat = self._attempt(lambda environment: environment.stat())
+        if stat is None:
+            return 0
+        return stat["psize"] * (stat["branch_pages"] + stat["leaf_pages"] + stat["overflow_pages"])
+
+    def __len__(self) -> int:
+        stat = self._attempt(lambda environment: environment.stat())
+        return stat["entries"] if stat else 0
+
+    def _put(self, items: Sequence[tuple[bytes, bytes]]) -> bool:
+        """Put all and say True, or lose everything and say False."""
+
+        def write(environment: lmdb.Environment) -> bool:
+            with environment.begin(write=True) as transaction:
+                for key, value in items:
+                    transaction.put(key, value)
+            return True
+
+        return self._attempt(write) is True
+
+    def _attempt(self, work: Callable[[lmdb.Environment], T]) -> T | None:
+        """The result of `work`; or None, and an empty environment, if LMDB fails."""
+        self._require_open()
+        if self._environment is None:  # could not be made anew the last time
+            self._recreate()
+        if self._environment is None:
+            return None
+        try:
+            return work(self._environment)
+        except lmdb.MapFullError:
+            self.evictions += 1
+        except lmdb.Error:  # on a full disk too: what the cache gives back, the store can use
+            self.recreated += 1
+        self._recreate()
+        return None
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise RuntimeError(f"The layer cache in {self._folder} is closed.")
+
+    def _recreate(self) -> None:
+        if self._environment is not None:
+            self._environment.close()
+            self._environment = None
+        with suppress(OSError):
+            self._delete_files()
+            self._environment = self._open()
+
+    def _delete_files(self) -> None:
+        for name in _FILES:
+            (self._folder / name).unlink(missing_ok=True)
+
+    def _open(self) -> lmdb.Environment:
+        """The environment; an empty one in place of files that are damaged or too large.
+
+        Raises:
+            OSError: not even an empty one can be made.
+        """
+        for _ in range(2):
+            try:
+                environment = lmdb.open(
+                    str(self._folder),
+                    map_size=self._limit,
+                    sync=False,
+                    metasync=False,
+                    lock=False,  # the folder's lock and the cache's mutex leave nothing for LMDB's to do
+                )
+            except lmdb.Error as error:
+                problem = str(error)
+            else:
+                if self._is_sound(environment):
+                    return environment
+                environment.close()
+                problem = "its size is wrong"
+            self.recreated += 1
+            self._delete_files()
+        raise OSError(f"No layer cache can be made in {self._folder}: {problem}.")
+
+    def _is_sound(self, environment: lmdb.Environment) -> bool:
+        """Whether the file holds all pages that its header counts, within the limit."""
+        size = (self._folder / "data.mdb").stat().st_size
+        pages = environment.info()["last_pgno"] + 1
+        return pages * environment.stat()["psize"] <= size <= self._limit
+
+
+Entries = MemoryEntries | LmdbEntries
+"""What a layer cache needs of its memory or disk: the methods that the two share."""
+
+
+def _boot_id() -> bytes:
+    """Names the time since the machine started; where the system does not tell, nothing equals it."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_bytes()
+    except OSError:
+        return secrets.token_bytes(16)

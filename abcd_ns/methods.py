@@ -1,0 +1,57 @@
+"""The methods that `ns-train` offers. Imports nothing that can fail on a machine with nerfstudio."""
+
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from abcd_ns.engine.coordinator import TrainingConfig
+from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig
+
+LEARNING_RATES = {
+    "means": 1.6e-4,
+    "features_dc": 0.0025,
+    "features_rest": 0.0025 / 20,
+    "opacities": 0.05,
+    "scales": 0.005,
+    "quats": 0.001,
+}
+"""Splatfacto's. The means' decays with the progress of the run, see TrainingConfig."""
+
+
+def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
+    return AbcdTrainerConfig(
+        method_name=method_name,
+        steps_per_eval_image=500,
+        steps_per_eval_batch=0,
+        steps_per_eval_all_images=2000,
+        steps_per_save=500,
+        max_num_iterations=30_000,
+        mixed_precision=False,
+        pipeline=AbcdPipelineConfig(**pipeline),
+        optimizers={
+            name: {"optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15), "scheduler": None}
+            for name, rate in LEARNING_RATES.items()
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
+        vis="viewer",
+    )
+
+
+def _quiet(config: AbcdTrainerConfig) -> AbcdTrainerConfig:
+    # ABCD reports its own progress, by visit; nerfstudio's table would run through it.
+    config.logging.local_writer.enable = False
+    return config
+
+
+abcd = MethodSpecification(
+    config=_quiet(_trainer("abcd")),
+    description="ABCD: Gaussian Splatting block by block, each within alpha-composited frozen layers.",
+)
+abcd_ablated = MethodSpecification(
+    config=_quiet(_trainer("abcd-ablated", training=TrainingConfig(layers=False))),
+    description="ABCD without its layers: each block alone against the photos (the paper's ablation).",
+)
+abcd_monolithic = MethodSpecification(
+    config=_quiet(_trainer("abcd-monolithic", blocks=1)),
+    description="3D Gaussian Splatting in ABCD's engine: one block, no layers. Runs without a GPU.",
+)

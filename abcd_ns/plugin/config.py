@@ -1,0 +1,125 @@
+"""What a user sets: the trainer's, pipeline's, datamanager's and model's options."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from abcd_ns.engine.coordinator import TrainingConfig
+from abcd_ns.errors import UserError
+from abcd_ns.plugin.datamanager import AbcdDataManager
+from abcd_ns.plugin.dataparser import AbcdDataParserConfig
+from abcd_ns.plugin.model import AbcdModel
+from abcd_ns.plugin.pipeline import AbcdPipeline
+from abcd_ns.plugin.trainer import AbcdTrainer
+
+HONOURED = {"random_init", "num_random", "random_scale", "loss_coefficients", "prompt", "enable_collider"}
+"""Splatfacto's model options that ABCD obeys as they are."""
+MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
+"""Those which `AbcdModelConfig.mirror` sets from the training options, since nerfstudio's tools read them."""
+
+
+@dataclass
+class AbcdDataManagerConfig(FullImageDatamanagerConfig):
+    """Photos, served by crop to the block in training."""
+
+    _target: type = field(default_factory=lambda: AbcdDataManager)
+    dataparser: AbcdDataParserConfig = field(default_factory=AbcdDataParserConfig)
+    """Where photos, poses and points come from: a COLMAP folder or a transforms.json."""
+    photo_cache_gb: float = 0.0
+    """RAM for decoded photos, GB; 0 takes a tenth of the machine's."""
+
+
+@dataclass
+class AbcdModelConfig(SplatfactoModelConfig):
+    """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""
+
+    _target: type = field(default_factory=lambda: AbcdModel)
+    rasterizer: Literal["auto", "torch", "gsplat"] = "auto"
+    """What draws: gsplat's CUDA kernels or the torch rasterizer; auto takes gsplat on CUDA devices."""
+    render: Literal["merged", "composited"] = "merged"
+    """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
+
+    ownership: Literal["auto", "fragments", "means"] = "auto"
+    """What a layer holds in composited pictures; taken over from the training options."""
+
+    def mirror(self, training: TrainingConfig) -> None:
+        """Take over what nerfstudio's tools read from the model's options.
+
+        Raises:
+            UserError: an option of splatfacto was set that ABCD does not use.
+        """
+        for option in dataclasses.fields(SplatfactoModelConfig):
+            if option.name.startswith("_") or option.name in HONOURED | MIRRORED:
+                continue
+            default = option.default_factory() if callable(option.default_factory) else option.default
+            if getattr(self, option.name) != default:
+                flag = option.name.replace("_", "-")
+                raise UserError(
+                    f"--pipeline.model.{flag} is splatfacto's and has no effect here; see the options under "
+                    "--pipeline.training in `ns-train abcd --help`."
+                )
+        self.sh_degree = training.sh_degree
+        self.ssim_lambda = training.ssim_lambda
+        self.rasterize_mode = "antialiased" if training.antialiased else "classic"
+        self.background_color = training.background
+        self.ownership = training.ownership
+
+
+@dataclass
+class AbcdPipelineConfig(VanillaPipelineConfig):
+    """ABCD: how space is cut and how its blocks are trained."""
+
+    _target: type = field(default_factory=lambda: AbcdPipeline)
+    datamanager: AbcdDataManagerConfig = field(default_factory=AbcdDataManagerConfig)
+    model: AbcdModelConfig = field(default_factory=AbcdModelConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    """How blocks are trained."""
+    blocks: int = 8
+    """Number of blocks that space is cut into; 1 is ordinary 3DGS."""
+    partition: Literal["kd", "grid"] = "kd"
+    """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
+    layer_bits: Literal[16, 32] = 16
+    """Bits of a colour or transmittance in cached layers."""
+    max_seconds: float | None = None
+    """Stop after this many seconds of training; evaluation and saving do not count."""
+
+
+@dataclass
+class AbcdTrainerConfig(TrainerConfig):
+    """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""
+
+    _target: type = field(default_factory=lambda: AbcdTrainer)
+
+    def save_config(self) -> None:
+        """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
+        self.check()
+        super().save_config()
+
+    def check(self) -> None:
+        """Choose the device and look at the options and the data, before anything is written.
+
+        Exits with code 2 and one line for each fault that the user can mend.
+        """
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            self.machine.device_type = "cpu"
+            CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
+        try:
+            if self.machine.num_devices * self.machine.num_machines > 1:
+                raise UserError("ABCD trains on one device; leave out --machine.num-devices.")
+            if self.mixed_precision:
+                raise UserError("ABCD trains in float32; leave out --mixed-precision.")
+            self.pipeline.model.mirror(self.pipeline.training)
+            parser = self.pipeline.datamanager.dataparser
+            if self.pipeline.datamanager.data is not None:
+                parser = dataclasses.replace(parser, data=self.pipeline.datamanager.data)
+            parser.setup().check()
+        except UserError as error:
+            CONSOLE.print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
+            raise SystemExit(2) from None

@@ -1,0 +1,91 @@
+"""Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
+
+import random
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.types import Crop
+from abcd_ns.plugin.data.dataset import AbcdDataset
+
+if TYPE_CHECKING:
+    from abcd_ns.plugin.config import AbcdDataManagerConfig
+
+SAMPLE = "abcd_sample"
+"""The key of a camera's metadata under which a training sample travels from here to the model."""
+
+
+class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
+    """The subset of cameras, the crop and the layers come from the coordinator; the photo from here."""
+
+    config: "AbcdDataManagerConfig"
+    train_dataset: AbcdDataset
+    eval_dataset: AbcdDataset
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._coordinator: Coordinator | None = None
+        super().__init__(*args, **kwargs)
+        self._eval_order = random.Random(0)
+
+    @property
+    def dataset_type(self) -> type[AbcdDataset]:
+        """The class of both datasets."""
+        return AbcdDataset
+
+    def follow(self, coordinator: Coordinator) -> None:
+        """Serve what this coordinator asks for from now on."""
+        self._coordinator = coordinator
+
+    def photo(self, row: int, crop: Crop) -> torch.Tensor:
+        """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""
+        return self.train_dataset.photos.crop(row, crop).to(self.device).float() / 255
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
+        """The camera of the next sample, the sample in its metadata, and the photo's crop."""
+        if self._coordinator is None:
+            raise RuntimeError("training samples come from a coordinator: call follow() first")
+        sample = self._coordinator.next_sample()
+        row = sample.view.index
+        camera = self.train_dataset.cameras[row : row + 1].to(self.device)
+        camera.metadata = {"cam_idx": row, SAMPLE: sample}
+        batch: dict[str, Any] = {"image": self.photo(row, sample.crop), "image_idx": row}
+        mask = self.train_dataset.photos.mask(row)
+        if mask is not None:
+            batch["mask"] = mask[sample.crop.slices].to(self.device)
+        return camera, batch
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002
+        """A random held-out camera and its whole photo."""
+        return self._held_out(self._eval_order.randrange(len(self.eval_dataset)))
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> "HeldOut":
+        """All held-out cameras and photos in order, read one at a time."""
+        return HeldOut(self)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a training photo; nerfstudio's logs divide by it."""
+        cameras = self.train_dataset.cameras
+        return int(cameras.width[0]) * int(cameras.height[0])
+
+    def _held_out(self, row: int) -> tuple[Cameras, dict[str, Any]]:
+        camera = self.eval_dataset.cameras[row : row + 1].to(self.device)
+        data = self.eval_dataset.get_data(row, image_type="uint8")
+        return camera, {**data, "image": data["image"].to(self.device)}
+
+
+class HeldOut:
+    """The held-out set as a sequence that holds one photo at a time."""
+
+    def __init__(self, datamanager: AbcdDataManager) -> None:
+        self._datamanager = datamanager
+
+    def __len__(self) -> int:
+        return len(self._datamanager.eval_dataset)
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        return (self._datamanager._held_out(row) for row in range(len(self)))

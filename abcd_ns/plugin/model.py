@@ -1,0 +1,224 @@
+"""Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.colors import get_color
+from torch import Tensor
+from torch.nn import Parameter, ParameterDict
+
+from abcd_ns.engine.blocks import BlockTree, build_kd
+from abcd_ns.engine.coordinator import Coordinator, Sample, resolve_ownership
+from abcd_ns.engine.initialize import gaussians_from_points, random_points
+from abcd_ns.engine.loss import photometric_loss, psnr, ssim_windows
+from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.param_swap import live_gaussians
+from abcd_ns.engine.rasterizer import Raster, Rasterizer, make_rasterizer
+from abcd_ns.engine.scene import BlockScene, MemoryScene
+from abcd_ns.engine.types import Gaussians, Layer, View
+from abcd_ns.plugin.datamanager import SAMPLE
+from abcd_ns.plugin.metrics import image_metrics
+from abcd_ns.plugin.views import view_of
+
+if TYPE_CHECKING:
+    from abcd_ns.plugin.config import AbcdModelConfig
+
+VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
+
+
+class AbcdModel(SplatfactoModel):
+    """Draws samples for training and whole pictures for evaluation, viewer and export.
+
+    While training, the registered parameters are the live block alone and the rest of the scene is reached
+    through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene.
+    `state_dict` gives the merged scene in either case.
+    """
+
+    config: "AbcdModelConfig"
+
+    def populate_modules(self) -> None:
+        """Register empty parameters; the initial Gaussians stay outside, in RAM."""
+        self.initial = self._initial_gaussians()
+        empty = Gaussians.empty(self.config.sh_degree)
+        self.gauss_params = ParameterDict({name: Parameter(value) for name, value in empty.items()})
+        self.camera_optimizer = self.config.camera_optimizer.setup(
+            num_cameras=self.num_train_data, device="cpu"
+        )
+        self.tree = build_kd(torch.zeros(0, 3), 1)
+        self.step = 0
+        self.crop_box: OrientedBox | None = None
+        random = self.config.background_color == "random"
+        self.background_color = (
+            torch.tensor(VIEWER_BACKGROUND) if random else get_color(self.config.background_color)
+        )
+        self._coordinator: Coordinator | None = None
+        self._rasterizer: Rasterizer | None = None
+
+    def follow(self, coordinator: Coordinator) -> None:
+        """From now on the scene is the coordinator's, and the registered parameters its live block."""
+        self._coordinator = coordinator
+        self.tree = coordinator.scene.tree
+
+    def draws_with(self) -> Rasterizer:
+        """The rasterizer, made on first use."""
+        if self._rasterizer is None:
+            self._rasterizer = make_rasterizer(self.config.rasterizer, self.device)
+        return self._rasterizer
+
+    # -- the scene -----------------------------------------------------------------------------------
+
+    def scene(self) -> BlockScene:
+        """The whole scene by blocks, the live one included."""
+        if self._coordinator is not None:
+            return self._coordinator.scene
+        return MemoryScene(self.tree, live_gaussians(self.gauss_params).detach())
+
+    def merged(self) -> Gaussians:
+        """The whole scene in one list, without a graph. Not a property: it may read everything from disk."""
+        if self._coordinator is None:
+            return live_gaussians(self.gauss_params).detach()
+        scene = self._coordinator.scene
+        return Gaussians.cat([scene.gaussians(block).cpu() for block in range(scene.tree.num_blocks)])
+
+    def _initial_gaussians(self) -> Gaussians:
+        config = self.config
+        if self.seed_points is None or config.random_init or len(self.seed_points[0]) == 0:
+            points, colors = random_points(config.num_random, config.random_scale)
+        else:
+            points, colors = (values.cpu() for values in self.seed_points)
+        return gaussians_from_points(points.float(), colors, sh_degree=config.sh_degree)
+
+    # -- checkpoints ---------------------------------------------------------------------------------
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """The merged scene under splatfacto's names, whatever is live."""
+        state = super().state_dict(*args, **kwargs)
+        if self._coordinator is not None:
+            prefix = kwargs.get("prefix", "")
+            state.update({f"{prefix}gauss_params.{n}": value for n, value in self.merged().items()})
+        return state
+
+    def get_extra_state(self) -> dict[str, str]:
+        """How space is cut, which the merged list of Gaussians does not tell."""
+        return {"tree": self.tree.to_json()}
+
+    def set_extra_state(self, state: dict[str, str]) -> None:
+        """Take over the cut of space from a checkpoint."""
+        self.tree = BlockTree.from_json(state["tree"])
+
+    # -- pictures ------------------------------------------------------------------------------------
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """A training sample's crop where the camera carries one, else the whole picture."""
+        sample = (camera.metadata or {}).get(SAMPLE)
+        if self.training and sample is not None:
+            return self._sample_outputs(sample)
+        return self._whole_outputs(view_of(camera.to(self.device)))
+
+    def _sample_outputs(self, sample: Sample) -> dict[str, Any]:
+        if self._coordinator is None:
+            raise RuntimeError(
+                "a training sample needs the coordinator that it came from: call follow() first"
+            )
+        rendered = self._coordinator.render(sample)
+        return {
+            "rgb": rendered.rgb,
+            "accumulation": 1 - rendered.transmittance[..., None],
+            "background": sample.background,
+            "sample": sample,
+            "rendered": rendered,
+        }
+
+    def _whole_outputs(self, view: View) -> dict[str, Tensor]:
+        background = self.background_color.to(self.device)
+        merged = self.draw_merged(view)
+        layer = self.draw_composited(view) if self.config.render == "composited" else merged.layer
+        transmittance = layer.transmittance[..., None]
+        alpha = 1 - merged.transmittance[..., None]
+        # Where nothing is, splatfacto shows the farthest depth of the picture.
+        depth = torch.where(alpha > 0, merged.depth[..., None] / alpha.clamp_min(1e-10), merged.depth.max())
+        return {
+            "rgb": (layer.color + transmittance * background).clamp(0, 1),
+            "depth": depth,
+            "accumulation": 1 - transmittance,
+            "background": background.expand(view.height, view.width, 3),
+        }
+
+    @torch.no_grad()
+    def draw_merged(self, view: View) -> Raster:
+        """All Gaussians at once, sorted by depth: what every ordinary viewer shows."""
+        gaussians = self.merged().to(self.device)
+        if self.crop_box is not None:
+            gaussians = gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
+        return self.draws_with()(
+            gaussians,
+            view,
+            sh_degree=self.config.sh_degree,
+            antialiased=self.config.rasterize_mode == "antialiased",
+        )
+
+    @torch.no_grad()
+    def draw_composited(self, view: View) -> Layer:
+        """Each block alone, then folded front to back: what block training composites."""
+        rasterizer = self.draws_with()
+        painter = Painter(
+            self.scene(),
+            [view],
+            rasterizer,
+            ownership=resolve_ownership(self.config.ownership, rasterizer),
+            pass_gaussians=0,
+            device=self.device,
+        )
+        settings = PaintSettings(self.config.sh_degree, self.config.rasterize_mode == "antialiased")
+        return painter.picture(view, settings)
+
+    # -- loss and metrics ----------------------------------------------------------------------------
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+        """PSNR of what was drawn and the number of Gaussians in the scene."""
+        photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        with torch.no_grad():
+            quality = psnr(outputs["rgb"], photo)
+        return {"psnr": quality, "gaussian_count": self._count()}
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """The coordinator's loss of a sample; of a whole picture the photometric loss."""
+        del metrics_dict
+        photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        rgb = outputs["rgb"]
+        if "mask" in batch:
+            mask = batch["mask"].to(self.device)
+            photo, rgb = photo * mask, rgb * mask
+        if "sample" in outputs and self._coordinator is not None:
+            return {"main_loss": self._coordinator.loss(outputs["sample"], rgb, photo)}
+        height, width = rgb.shape[:2]
+        whole = {"full_pixels": height * width, "full_windows": ssim_windows(height, width)}
+        return {"main_loss": photometric_loss(rgb, photo, ssim_lambda=self.config.ssim_lambda, **whole)}
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Any], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of a whole picture, and photo and picture side by side."""
+        photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        return image_metrics(outputs["rgb"], photo), {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """A photo as float32 in 0..1 on the device; ABCD trains at full resolution from the start."""
+        return (image.float() / 255 if image.dtype == torch.uint8 else image).to(self.device)
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """None: the pipeline's callbacks drive the coordinator, which does what splatfacto's would."""
+        del training_callback_attributes
+        return []
+
+    def _count(self) -> int:
+        return len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()

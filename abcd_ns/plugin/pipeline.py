@@ -1,0 +1,151 @@
+"""Joins datamanager and model to a coordinator when training begins."""
+
+import dataclasses
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+
+from abcd_ns.engine.blocks import BlockTree, build_grid, build_kd
+from abcd_ns.engine.coordinator import Coordinator, blocks_at_rest
+from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.storage import LayerCache, ParameterStore, view_fingerprint
+from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.errors import UserError
+from abcd_ns.plugin.datamanager import AbcdDataManager
+from abcd_ns.plugin.model import AbcdModel
+from abcd_ns.plugin.progress import ProgressReport
+from abcd_ns.plugin.views import views_of
+
+if TYPE_CHECKING:
+    from abcd_ns.plugin.config import AbcdPipelineConfig
+    from abcd_ns.plugin.trainer import AbcdTrainer
+
+STORE, CACHE = "store", "layers"
+"""Folders of a run, under `abcd`: the blocks at rest, which are precious, and layers, which are not."""
+
+
+class AbcdPipeline(VanillaPipeline):
+    """ABCD in nerfstudio. Constructed without side effects: evaluation tools make one, too."""
+
+    config: "AbcdPipelineConfig"
+    datamanager: AbcdDataManager
+    model: AbcdModel
+
+    def __init__(self, config: "AbcdPipelineConfig", *args: Any, **kwargs: Any) -> None:
+        config.model.mirror(config.training)
+        super().__init__(config, *args, **kwargs)
+        self._coordinator: Coordinator | None = None
+
+    @property
+    def coordinator(self) -> Coordinator | None:
+        """Drives the training, once it has begun."""
+        return self._coordinator
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Everything exists by now, checkpoint included: begin, or go on, and drive the coordinator."""
+        trainer: AbcdTrainer = training_callback_attributes.trainer
+        self._coordinator = self._begin(trainer, training_callback_attributes.optimizers.optimizers)
+        self.datamanager.follow(self._coordinator)
+        self.model.follow(self._coordinator)
+        report = ProgressReport(self._coordinator)
+        self._coordinator.announce.subscribe(report)
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+
+        def end_step(step: int) -> None:  # noqa: ARG001 - the coordinator counts
+            self._after_step(trainer)
+
+        def end_run(step: int) -> None:  # noqa: ARG001
+            report.close()
+
+        return [
+            TrainingCallback(after, end_step),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], end_run),
+        ]
+
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """As VanillaPipeline's, but keeps what the coordinator must be told after the step."""
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        self._rendered, self._quality = outputs.pop("rendered"), float(metrics["psnr"])
+        return outputs, losses, metrics
+
+    def _after_step(self, trainer: "AbcdTrainer") -> None:
+        if self._coordinator is None:
+            raise RuntimeError("training has not begun")
+        self._coordinator.after_step(self._rendered, self._quality)
+        self._rendered = None
+        if self._coordinator.finished:
+            trainer.stop_training = True
+
+    # -- set-up --------------------------------------------------------------------------------------
+
+    def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Coordinator:
+        config, folder = self.config, trainer.base_dir / "abcd"
+        views = views_of(self.datamanager.train_dataset.cameras)
+        store, resumed = self._open_store(folder / STORE, trainer)
+        tree = BlockTree.from_json(store.header["tree"])
+        coordinator = Coordinator(
+            dataclasses.replace(config.training, means_lr=optimizers["means"].param_groups[0]["lr"]),
+            Budget(trainer.total_steps, config.max_seconds),
+            StoredScene(tree, store),
+            views,
+            LayerCache(folder / CACHE, bits=config.layer_bits),
+            self.model.draws_with(),
+            self.model.gauss_params,
+            {name: optimizers[name] for name in self.model.gauss_params},
+            scene_key=scene_fingerprint(self.datamanager.get_datapath(), views),
+            device=self.device,
+        )
+        if resumed:
+            coordinator.restore()
+        return coordinator
+
+    def _open_store(self, folder: Path, trainer: "AbcdTrainer") -> tuple[ParameterStore, bool]:
+        """The run's own store: a copy of the one it goes on from, or a new one."""
+        if trainer.resumed_from is not None:
+            source, pin = trainer.resumed_from
+            with ParameterStore.open(source, pin, read_only=True) as old:
+                old.clone_to(folder, pin)
+            return ParameterStore.open(folder), True
+        gaussians = self.model.initial
+        tree = cut_space(gaussians, self.config.blocks, self.config.partition)
+        store = ParameterStore.create(folder, {"tree": tree.to_json()})
+        store.commit(blocks_at_rest(tree, gaussians))
+        return store, False
+
+
+def cut_space(gaussians: Gaussians, blocks: int, partition: str) -> BlockTree:
+    """Cells for a scene that is about to be trained.
+
+    Raises:
+        UserError: fewer than one block.
+    """
+    if blocks < 1:
+        raise UserError(f"--pipeline.blocks must be 1 or more, not {blocks}.")
+    if partition == "kd":
+        return build_kd(gaussians.means, blocks)
+    return build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
+
+
+def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:
+    """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all."""
+    low, high = (gaussians.means.quantile(q, dim=0) for q in (0.05, 0.95))
+    extent = (high - low).clamp_min(1e-9).tolist()
+    counts = [1, 1, 1]
+    while counts[0] * counts[1] * counts[2] < blocks:
+        widest = max(range(3), key=lambda axis: extent[axis] / counts[axis])
+        counts[widest] += 1
+    return counts[0], counts[1], counts[2]
+
+
+def scene_fingerprint(data: Path, views: list[View]) -> str:
+    """Names a capture: its folder and the poses of its views."""
+    digest = hashlib.blake2b(str(Path(data).resolve()).encode(), digest_size=16)
+    for view in views:
+        digest.update(view_fingerprint(view).encode())
+    return digest.hexdigest()

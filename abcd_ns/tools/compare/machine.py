@@ -1,0 +1,125 @@
+"""On what a comparison ran: hardware and versions."""
+
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import psutil
+import torch
+
+import abcd_ns
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What decides how fast a run is."""
+
+    cpu: str
+    cores: int
+    """That this process may use."""
+    torch_threads: int
+    ram_bytes: int
+    gpu: str | None
+    os: str
+
+
+@dataclass(frozen=True)
+class Versions:
+    """What decides what a run computes."""
+
+    python: str
+    torch: str
+    nerfstudio: str | None
+    gsplat: str | None
+    abcd_ns: str
+    commit: str | None
+    """Of the abcd_ns checkout, with "+changes" where files differ from it; None outside a checkout."""
+
+
+def describe_machine() -> Machine:
+    """This machine."""
+    return Machine(
+        cpu=_cpu_model(),
+        cores=_usable_cores(),
+        torch_threads=torch.get_num_threads(),
+        ram_bytes=psutil.virtual_memory().total,
+        gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        os=f"{platform.system()} {platform.machine()}",
+    )
+
+
+def describe_versions() -> Versions:
+    """The versions in this environment."""
+    return Versions(
+        python=platform.python_version(),
+        torch=torch.__version__,
+        nerfstudio=_version("nerfstudio"),
+        gsplat=_version("gsplat"),
+        abcd_ns=abcd_ns.__version__,
+        commit=_commit(Path(abcd_ns.__file__).resolve().parent.parent),
+    )
+
+
+def peak_rss_bytes() -> int:
+    """The most RAM that this process has held so far."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # Not getrusage: on Linux its ru_maxrss starts from the parent's peak, across fork and exec.
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024  # in kB, which means KiB here
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB elsewhere
+
+
+def disk_bytes(folder: Path) -> int:
+    """What the files under `folder` take on disk; 0 where there is no such folder."""
+    # st_blocks counts 512 bytes each, whatever the block size; sparse files take less than st_size.
+    return sum(path.stat().st_blocks * 512 for path in folder.rglob("*") if path.is_file())
+
+
+def _cpu_model() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _commit(checkout: Path) -> str | None:
+    if not (checkout / ".git").exists():
+        return None
+    head = _git(checkout, "rev-parse", "HEAD")
+    if head is None:
+        return None
+    return head + ("+changes" if _git(checkout, "status", "--porcelain") else "")
+
+
+def _git(checkout: Path, *words: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(checkout), *words], capture_output=True, text=True, check=True, timeout=30
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

@@ -1,0 +1,117 @@
+"""The comparison as a table: a row per measure, a column per method."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from abcd_ns.tools.compare.results import Results, Run
+
+NOTHING = "-"
+"""Stands where there is no value."""
+Value = Callable[[Run], float | None]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One row."""
+
+    title: str
+    """With its unit."""
+    value: Value
+    digits: int
+
+
+def _gib(get: Value) -> Value:
+    return lambda run: None if (size := get(run)) is None else size / 2**30
+
+
+MEASURES = (
+    Measure("PSNR, composited (dB)", lambda run: run.psnr, 2),
+    Measure("SSIM, composited", lambda run: run.ssim, 3),
+    Measure("LPIPS, composited", lambda run: run.lpips, 3),
+    Measure("PSNR, merged (dB)", lambda run: run.psnr_merged, 2),
+    Measure("SSIM, merged", lambda run: run.ssim_merged, 3),
+    Measure("ordering gap (dB)", lambda run: run.ordering_gap_db, 1),
+    Measure("Gaussians", lambda run: run.gaussians, 0),
+    Measure("blocks", lambda run: run.blocks, 0),
+    Measure("steps", lambda run: run.steps, 0),
+    Measure("training (s)", lambda run: run.train_seconds, 1),
+    Measure("of it, layers (s)", lambda run: run.layer_seconds, 1),
+    Measure("whole process (s)", lambda run: run.total_seconds, 1),
+    Measure("peak GPU memory (GiB)", _gib(lambda run: run.peak_device_bytes), 2),
+    Measure("peak RAM (GiB)", _gib(lambda run: run.peak_rss_bytes), 2),
+    Measure("blocks on disk (GiB)", _gib(lambda run: run.store_bytes), 2),
+    Measure("layers on disk (GiB)", _gib(lambda run: run.cache_bytes), 2),
+)
+
+
+def cell(runs: Sequence[Run], measure: Measure) -> str:
+    """The measure of a method's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
+    values = [measure.value(run) for run in runs]
+    if not values or any(value is None for value in values):
+        return NOTHING
+    mean = sum(values) / len(values)
+    text = f"{mean:,.{measure.digits}f}"
+    if len(values) == 1:
+        return text
+    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
+    return f"{text} ± {deviation:,.{measure.digits}f}"
+
+
+def rows(results: Results) -> list[list[str]]:
+    """The table: titles first, then a row per measure."""
+    titles = ["", *results.methods]
+    return [titles, *([m.title, *(cell(results.of(x), m) for x in results.methods)] for m in MEASURES)]
+
+
+def notes(results: Results) -> list[str]:
+    """What a reader of the table has to know, a sentence each."""
+    p, machine = results.protocol, results.machine
+    budget = f"{p.steps:,} steps" if p.seconds is None else f"{p.seconds:g} s of training"
+    seeds = ", ".join(map(str, p.seeds))
+    growth = "the number of Gaussians fixed" if not p.densify else ""
+    limit = f"at most {p.max_gaussians:,} Gaussians" if p.max_gaussians else ""
+    conditions = ", ".join(filter(None, [f"{budget} a run", f"seed {seeds}", growth, limit]))
+    found = [
+        f"Scene {p.scene} at 1/{p.downscale} of its size; held out: {p.held_out}; {conditions}.",
+        f"{machine.cpu}, {machine.cores} cores, {machine.torch_threads} torch threads, "
+        f"{machine.ram_bytes / 2**30:.0f} GiB RAM, {machine.gpu or 'no GPU'}, {machine.os}.",
+        "Evaluation, saving and compiling are left out of the training time.",
+    ]
+    reasons = {}
+    for run in results.runs:
+        reasons |= {"LPIPS": run.lpips_reason, "peak GPU memory": run.peak_device_note}
+        if run.ordering_gap_note:
+            found.append(f"{run.method}: no ordering gap ({run.ordering_gap_note}).")
+    found += [f"{name} is missing: {reason}." for name, reason in reasons.items() if reason]
+    found += [f"{left.method} is left out: {left.reason}." for left in results.left_out]
+    found += [f"{f.method}, seed {f.seed} failed ({f.log}): {f.reason}" for f in results.failures]
+    return list(dict.fromkeys(found))
+
+
+def write_table(results: Results, path: Path) -> None:
+    """The table as Markdown."""
+    titles, *body = rows(results)
+    lines = ["| " + " | ".join(row) + " |" for row in body]
+    head = "| " + " | ".join(titles) + " |"
+    rule = "| --- |" + " ---: |" * (len(titles) - 1)
+    text = "\n".join([head, rule, *lines, "", *(f"- {note}" for note in notes(results)), ""])
+    path.write_text(text, encoding="utf-8")
+
+
+def print_table(results: Results, console: Console) -> None:
+    """The table in the terminal."""
+    titles, *body = rows(results)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for i, title in enumerate(titles):
+        table.add_column(title, justify="right" if i else "left", no_wrap=True)
+    for row in body:
+        table.add_row(*row)
+    console.print(table)
+    for note in notes(results):
+        console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,311 @@
+"""Visits: gradients, nothing lost, exact resumption, and that one block is plain 3DGS."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.compositing import composite, sandwich
+from abcd_ns.engine.coordinator import resolve_ownership
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+from abcd_ns.engine.run_state import RunState
+from abcd_ns.engine.storage import StaleLayerError
+from abcd_ns.engine.training_loop import train, train_step
+from abcd_ns.engine.types import Gaussians
+from tests.reference.plain_3dgs import train_plain
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
+
+
+@pytest.fixture(scope="module")
+def views():
+    return ring_of_views(5)
+
+
+@pytest.fixture(scope="module")
+def photos(views):
+    return Photos(random_gaussians(150, seed=7, size=0.12), views)
+
+
+@pytest.fixture(scope="module")
+def start():
+    return random_gaussians(120, seed=1, size=0.12)
+
+
+def equal(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(value, getattr(b, name)) for name, value in a.items())
+
+
+def test_training_improves_every_photo(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=120)
+
+    def error() -> list[float]:
+        draw = TorchRasterizer(compile="never")
+        scene = whole_scene(coordinator)
+        with torch.no_grad():
+            pictures = [draw(scene, v, sh_degree=1).color.clamp(0, 1) for v in views]
+        return [
+            float((p - photos.images[v.index]).square().mean()) for p, v in zip(pictures, views, strict=True)
+        ]
+
+    before = error()
+    train(coordinator, photos)
+    assert coordinator.state.step == 120
+    assert all(new < 0.8 * old for old, new in zip(before, error(), strict=True))
+
+
+@pytest.mark.parametrize("growing", [False, True])
+def test_one_block_is_plain_3dgs_bit_for_bit(tmp_path, views, photos, start, growing):
+    density = GROWING if growing else DensityConfig(strategy="off")
+    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=40, density=density)
+    train(coordinator, photos)
+    expected = train_plain(start, views, photos, steps=40, config=coordinator.config)
+    assert len(expected) != len(start) or not growing
+    assert equal(whole_scene(coordinator), expected)
+
+
+def test_ablated_with_one_block_is_the_same_too(tmp_path, views, photos, start):
+    results = []
+    for layers in (True, False):
+        folder = tmp_path / str(layers)
+        folder.mkdir()
+        coordinator = make_coordinator(folder, start, views, blocks=1, steps=12, layers=layers)
+        train(coordinator, photos)
+        results.append(whole_scene(coordinator))
+    assert equal(*results)
+
+
+@pytest.mark.parametrize("ownership", ["fragments", "means"])
+def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership):
+    """Through cached F and B == through a render of all blocks at once (invariant 3), in float64."""
+    gaussians = random_gaussians(100, size=0.08, dtype=torch.float64)
+    views = ring_of_views(3, dtype=torch.float64)
+    percentile = 1.0
+    coordinator = make_coordinator(
+        tmp_path, gaussians, views, blocks=4, ownership=ownership, window_percentile=percentile
+    )
+    for _ in range(3):
+        sample = coordinator.next_sample()
+        weights = torch.rand(sample.crop.height, sample.crop.width, 3, dtype=torch.float64)
+        sample = dataclasses.replace(sample, background=torch.rand(3, dtype=torch.float64))
+        rendered = coordinator.render(sample)
+        (weights * rendered.rgb).sum().backward()
+        block = coordinator.state.active.geometry.block
+        found = {name: p.grad.clone() for name, p in coordinator.params.items()}
+        expected = _gradient_of_whole_picture(coordinator, sample, weights, block, ownership)
+        for name, gradient in expected.items():
+            # F and B pass through the cache as float32, which bounds the agreement.
+            assert torch.allclose(
+                found[name], gradient, rtol=2e-5, atol=1e-6 * float(gradient.abs().max())
+            ), name
+        for optimizer in coordinator.optimizers.values():
+            optimizer.zero_grad()
+        coordinator.after_step(rendered)
+
+
+def _gradient_of_whole_picture(coordinator, sample, weights, block, ownership) -> dict[str, torch.Tensor]:
+    """By autograd through one render of everything (fragments) or through the fold of all blocks (means)."""
+    draw, tree = TorchRasterizer(compile="never"), coordinator.scene.tree
+    blocks = {b: coordinator.scene.gaussians(b) for b in range(tree.num_blocks)}
+    active = Gaussians(**{n: v.clone().requires_grad_() for n, v in blocks[block].items()})
+    degree = coordinator._active.sh_degree
+    if ownership == "fragments":
+        others = Gaussians.cat([g for b, g in blocks.items() if b != block])
+        layer = draw(active, sample.view, sh_degree=degree, crop=sample.crop, frozen=others).layer
+        picture = composite(layer, sample.background)
+    else:
+        from abcd_ns.engine.compositing import fold
+        from abcd_ns.engine.ordering import front_to_back
+
+        order = front_to_back(tree, sample.view.center)
+        parts = {**blocks, block: active}
+        picture = composite(
+            fold([draw(parts[b], sample.view, sh_degree=degree, crop=sample.crop).layer for b in order]),
+            sample.background,
+        )
+    (weights * picture.clamp(0, 1)).sum().backward()
+    return {name: value.grad for name, value in active.items()}
+
+
+@pytest.mark.parametrize("blocks", [1, 3, 8])
+def test_nothing_is_lost_when_gaussians_migrate(tmp_path, views, photos, start, blocks):
+    """Means are thrown about; each Gaussian keeps its own colour, by which it is found again."""
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=blocks, steps=60, density=DensityConfig(strategy="off")
+    )
+    generator = torch.Generator().manual_seed(0)
+    total = len(start)
+    moved = 0
+
+    def count_moved(event) -> None:
+        nonlocal moved
+        if isinstance(event, VisitEnded):
+            moved += event.migrated
+
+    coordinator.announce.subscribe(count_moved)
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        with torch.no_grad():
+            noise = torch.randn(coordinator.params["means"].shape, generator=generator)
+            coordinator.params["means"].add_(0.05 * noise)
+        store, tree = coordinator.scene.store, coordinator.scene.tree
+        assert sum(store.counts(b) for b in range(tree.num_blocks)) == total
+        if coordinator.state.active is None:
+            for b in range(tree.num_blocks):
+                state = BlockState.from_tensors(*store.load(b))
+                assert bool((tree.assign(state.gaussians.means) == b).all())
+    assert (moved > 0) == (blocks > 1)
+
+
+def test_migrants_take_their_moments_along(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=2, steps=30, density=DensityConfig(strategy="off")
+    )
+    while coordinator.state.active is None or coordinator._active.done < coordinator._active.steps - 1:
+        train_step(coordinator, photos)
+    block = coordinator._active.geometry.block
+    with torch.no_grad():
+        coordinator.params["means"][0] = coordinator.scene.gaussians(1 - block).means[0]
+    moments = coordinator.optimizers["scales"].state[coordinator.params["scales"]]["exp_avg"]
+    row = coordinator.params["scales"][0].detach().clone()
+    arrived_before = coordinator.scene.store.counts(1 - block)
+    train_step(coordinator, photos)
+    arrived = BlockState.from_tensors(*coordinator.scene.store.load(1 - block))
+    assert len(arrived) == arrived_before + 1
+    assert torch.allclose(arrived.gaussians.scales[-1], row, atol=0.02)
+    assert torch.allclose(arrived.exp_avg.scales[-1], moments[0], atol=1e-3)
+    assert float(arrived.exp_avg.scales[-1].abs().max()) > 0
+
+
+@pytest.mark.parametrize("stop", [3, 17, 26])
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop, blocks):
+    """Bit for bit, in the middle of a visit too (invariant 7), with 16-bit layers and densification."""
+    runs = {}
+    for name in ("whole", "stopped"):
+        (tmp_path / name).mkdir()
+        runs[name] = make_coordinator(
+            tmp_path / name, start, views, blocks=blocks, steps=40, density=GROWING, bits=16
+        )
+    train(runs["whole"], photos)
+    train(runs["stopped"], photos, steps=stop)
+    runs["stopped"].save(pin="here")
+    runs["stopped"].scene.store.close()
+    went_on = make_coordinator(
+        tmp_path / "stopped", start, views, steps=40, density=GROWING, bits=16, resume=True
+    )
+    assert went_on.state.step == stop
+    train(went_on, photos)
+    assert went_on.state.step == 40
+    assert equal(whole_scene(went_on), whole_scene(runs["whole"]))
+
+
+def test_the_same_seed_gives_the_same_run_and_another_another(tmp_path, views, photos, start):
+    results = []
+    for number, seed in enumerate((0, 0, 1)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        coordinator = make_coordinator(folder, start, views, blocks=3, steps=25, density=GROWING, seed=seed)
+        train(coordinator, photos)
+        results.append(whole_scene(coordinator))
+    assert equal(results[0], results[1])
+    assert not equal(results[0], results[2])
+
+
+def test_a_frozen_block_that_changes_during_a_visit_is_noticed(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=3, steps=30)
+    train_step(coordinator, photos)
+    other = next(b for b in range(3) if b != coordinator._active.geometry.block)
+    coordinator.scene.store.commit({other: coordinator.scene.store.load(other)})
+    with pytest.raises(StaleLayerError):
+        train_step(coordinator, photos)
+
+
+def test_blocks_that_no_view_sees_are_left_alone(tmp_path, views, photos, start):
+    start.means[:20] += 50.0
+    coordinator = make_coordinator(tmp_path, start, views, blocks=8, steps=60)
+    unseen = [b for b in range(8) if bool((coordinator.scene.gaussians(b).means > 40).all())]
+    assert unseen
+    before = [coordinator.scene.gaussians(b) for b in unseen]
+    visited = []
+    coordinator.announce.subscribe(lambda e: visited.append(e.block) if isinstance(e, VisitBegan) else None)
+    train(coordinator, photos)
+    assert not set(visited) & set(unseen)
+    assert all(coordinator.state.views[b] == 0 for b in unseen)
+    assert all(equal(coordinator.scene.gaussians(b), g) for b, g in zip(unseen, before, strict=True))
+
+
+def test_events_tell_the_whole_story(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=3, steps=45)
+    events = []
+    coordinator.announce.subscribe(events.append)
+    train(coordinator, photos)
+    kinds = [type(e) for e in events]
+    begun = [e for e in events if isinstance(e, VisitBegan)]
+    assert kinds.count(StepTaken) == 45 == sum(e.steps for e in begun)
+    assert kinds.count(VisitBegan) == kinds.count(VisitEnded) == coordinator.state.visit
+    assert kinds.count(SweepEnded) == coordinator.state.sweep + 1
+    assert {e.block for e in begun} == {0, 1, 2}
+    for visit in begun:
+        drawn = [e for e in events if isinstance(e, LayersDrawn) and e.visit == visit.visit]
+        assert [e.done for e in drawn] == list(range(1, len(drawn) + 1))
+        assert len(drawn) == min(visit.views, visit.steps)
+
+
+def test_a_limit_on_gaussians_is_kept_at_every_step(tmp_path, views, photos, start):
+    limit = len(start) + 15
+    density = dataclasses.replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0)
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=60, density=density)
+    counts = []
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        counts.append(coordinator.count())
+    assert max(counts) <= limit
+    assert counts[-1] > len(start)
+
+
+def test_a_scene_that_no_view_sees_is_an_error_that_says_so(tmp_path, views, photos, start):
+    start.means[:] += 1000.0
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2)
+    with pytest.raises(RuntimeError, match="no training view sees any Gaussian"):
+        train_step(coordinator, photos)
+
+
+def test_the_state_of_a_run_survives_json(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=50)
+    train(coordinator, photos, steps=9)
+    state = coordinator.state
+    again = RunState.from_json(state.to_json())
+    assert again.to_json() == state.to_json()
+    assert again.active.geometry.crops == state.active.geometry.crops
+    assert torch.equal(again.active.geometry.window.lower, state.active.geometry.window.lower)
+
+
+def test_auto_ownership_is_what_the_rasterizer_can_do():
+    class Plain(TorchRasterizer):
+        supports_z_window = False
+
+    assert resolve_ownership("auto", TorchRasterizer(compile="never")) == "fragments"
+    assert resolve_ownership("auto", Plain(compile="never")) == "means"
+    assert resolve_ownership("means", TorchRasterizer(compile="never")) == "means"
+
+
+def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start):
+    """What a step sees of the scene, before any training, is what a viewer would see."""
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, window_percentile=1.0)
+    draw = TorchRasterizer(compile="never")
+    scene = whole_scene(coordinator)
+    for _ in range(4):
+        sample = coordinator.next_sample()
+        with torch.no_grad():
+            rendered = coordinator.render(sample)
+            layer = draw(scene, sample.view, sh_degree=0, crop=sample.crop).layer
+        expected = composite(layer, sample.background).clamp(0, 1)
+        assert float((rendered.rgb - expected).abs().max()) < 1e-5
+        assert sample.layers is not None
+        assert sandwich is not None
+        coordinator.after_step(rendered)

@@ -1,0 +1,166 @@
+"""Layers: what they hold, and that folding them gives the picture of the whole scene (invariants 2 and 9)."""
+
+import math
+
+import pytest
+import torch
+
+from abcd_ns.engine.blocks import BlockTree, build_grid, build_kd
+from abcd_ns.engine.intervals import ray_interval
+from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+from abcd_ns.engine.scene import MemoryScene
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+DRAW = TorchRasterizer(compile="never")
+SETTINGS = PaintSettings(sh_degree=1)
+
+
+def painter(
+    tree: BlockTree, gaussians: Gaussians, views, *, ownership="fragments", pass_gaussians=0
+) -> Painter:
+    scene = MemoryScene(tree, gaussians)
+    return Painter(scene, views, DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
+
+
+def merged(gaussians: Gaussians, view: View) -> Layer:
+    with torch.no_grad():
+        return DRAW(gaussians, view, sh_degree=1).layer
+
+
+def difference(a: Layer, b: Layer) -> float:
+    return max(float((a.color - b.color).abs().max()), float((a.transmittance - b.transmittance).abs().max()))
+
+
+def views_in_and_out(dtype) -> list[View]:
+    """A camera outside the scene, and two that stand among the Gaussians."""
+    size = {"width": 32, "height": 24, "dtype": dtype}
+    return [*ring_of_views(1, **size), *ring_of_views(2, radius=0.7, **size)]
+
+
+def translucent(count: int, size: float = 0.1, dtype=torch.float64) -> Gaussians:
+    """So thin that no pixel reaches T <= 1e-4, where drawing stops: the merged picture stops for the whole
+    ray, a layer for its own part of it, and the two may then differ by as much as is left out, 1e-4."""
+    gaussians = random_gaussians(count, size=size, dtype=dtype)
+    gaussians.opacities[:] -= 2.5
+    return gaussians
+
+
+@pytest.mark.parametrize("tree", ["kd", "grid", "thin"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
+def test_folding_cells_by_fragments_gives_the_merged_picture(tree, dtype, tolerance):
+    gaussians = translucent(200, 0.12, dtype)
+    cut = {
+        "kd": lambda: build_kd(gaussians.means, 7),
+        "grid": lambda: build_grid(gaussians.means, counts=(2, 2, 2)),
+        "thin": lambda: build_grid(gaussians.means, counts=(6, 1, 1)),
+    }[tree]()
+    views = views_in_and_out(dtype)
+    paint = painter(cut, gaussians, views)
+    for view in views:
+        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < tolerance
+
+
+@pytest.mark.parametrize("pass_gaussians", [0, 60, 130, 1000])
+def test_how_many_blocks_share_a_pass_changes_nothing_by_fragments(pass_gaussians):
+    gaussians = translucent(200)
+    views = views_in_and_out(torch.float64)
+    paint = painter(build_kd(gaussians.means, 8), gaussians, views, pass_gaussians=pass_gaussians)
+    assert (len(paint.units()) == 1) == (pass_gaussians >= 200)
+    for view in views:
+        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12
+
+
+def test_folding_by_means_is_the_block_major_picture_not_the_merged_one():
+    gaussians = random_gaussians(200, size=0.15, dtype=torch.float64)
+    (view,) = ring_of_views(1, dtype=torch.float64)
+    tree = build_kd(gaussians.means, 6)
+    paint = painter(tree, gaussians, [view], ownership="means")
+    owner = tree.assign(gaussians.means)
+    color, light = torch.zeros(36, 48, 3, dtype=torch.float64), torch.ones(36, 48, dtype=torch.float64)
+    for unit in paint.order(paint.units(), view):
+        (block,) = tree.leaves(unit)
+        layer = merged(gaussians[owner == block], view)
+        color, light = color + light[..., None] * layer.color, light * layer.transmittance
+    assert difference(paint.picture(view, SETTINGS), Layer(color, light)) < 1e-12
+    assert difference(Layer(color, light), merged(gaussians, view)) > 1e-3
+
+
+@pytest.mark.parametrize("ownership", ["fragments", "means"])
+def test_units_hold_every_block_but_the_active_one_exactly_once(ownership):
+    gaussians = random_gaussians(300)
+    tree = build_kd(gaussians.means, 11)
+    for pass_gaussians in (0, 90, 10_000):
+        paint = painter(tree, gaussians, ring_of_views(1), ownership=ownership, pass_gaussians=pass_gaussians)
+        for active in range(11):
+            held = [b for unit in paint.units(exclude=active) for b in tree.leaves(unit) if b != active]
+            assert sorted(held) == [b for b in range(11) if b != active]
+
+
+def test_front_and_back_around_a_window_leave_out_just_the_window():
+    """F over the window's own fragments over B is the merged picture, wherever the window lies."""
+    gaussians = translucent(200)
+    views = views_in_and_out(torch.float64)
+    tree = build_kd(gaussians.means, 8)
+    for pass_gaussians in (0, 10_000):
+        paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians)
+        box = tree.cell(3).grown(0.2)
+        for view in views:
+            window = ray_interval(box, view, view.full)
+            parts = {
+                unit: paint.paint(unit, paint.load(unit), view, view.full, SETTINGS, active=3, window=window)
+                for unit in paint.units()
+            }
+            cut = paint.fold(parts, view, view.full)
+            with torch.no_grad():
+                inside = DRAW(gaussians, view, sh_degree=1, z_window=window)
+            color = cut.front.color + cut.front.transmittance[..., None] * (
+                inside.color + inside.transmittance[..., None] * cut.back.color
+            )
+            light = cut.front.transmittance * inside.transmittance * cut.back.transmittance
+            assert difference(Layer(color, light), merged(gaussians, view)) < 1e-12
+
+
+def test_the_picture_does_not_depend_on_names_order_or_empty_blocks():
+    gaussians = random_gaussians(150, size=0.1)
+    (view,) = ring_of_views(1)
+    tree = build_kd(gaussians.means, 4)
+    expected = painter(tree, gaussians, [view]).picture(view, SETTINGS)
+    generator = torch.Generator().manual_seed(3)
+    shuffled = gaussians[torch.randperm(150, generator=generator)]
+    halved = tree.split(2, axis=0, threshold=float(tree.cell(2).contains(gaussians.means).float().mean()))
+    with_empty = tree.split(0, axis=2, threshold=-50.0)
+    for other_tree, scene in ((tree, shuffled), (halved, gaussians), (with_empty, gaussians)):
+        assert difference(painter(other_tree, scene, [view]).picture(view, SETTINGS), expected) < 1e-6
+
+
+def test_a_crop_of_a_layer_is_the_layers_crop():
+    gaussians = random_gaussians(150, size=0.1)
+    (view,) = ring_of_views(1)
+    paint = painter(build_kd(gaussians.means, 5), gaussians, [view])
+    whole, crop = paint.picture(view, SETTINGS), Crop(16, 16, 32, 16)
+    part = paint.picture(view, SETTINGS, crop)
+    assert torch.equal(part.color, whole.color[crop.slices])
+    assert torch.equal(part.transmittance, whole.transmittance[crop.slices])
+
+
+def test_giants_and_far_gaussians_are_drawn_in_every_cell_they_reach():
+    gaussians = translucent(100, 0.05)
+    gaussians.scales[:3] = math.log(1.5)
+    gaussians.means[3:6] *= 40.0
+    gaussians.scales[3:6] = math.log(8.0)
+    views = views_in_and_out(torch.float64)
+    paint = painter(build_kd(gaussians.means, 8), gaussians, views)
+    for view in views:
+        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12
+
+
+def test_a_rasterizer_without_windows_cannot_own_fragments():
+    class Plain(TorchRasterizer):
+        supports_z_window = False
+
+    gaussians = random_gaussians(10)
+    scene = MemoryScene(build_kd(gaussians.means, 2), gaussians)
+    with pytest.raises(ValueError, match="ownership='means'"):
+        Painter(scene, ring_of_views(1), Plain(compile="never"), ownership="fragments", pass_gaussians=0)

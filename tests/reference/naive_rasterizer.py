@@ -1,0 +1,191 @@
+"""The slow twin of the rasterizers: textbook formulas, one pixel and one Gaussian at a time, in float64.
+
+Written from the papers (EWA splatting; Kerbl et al. 2023) and gsplat 1.4.0's CUDA sources; shares no code
+with the package. Differentiable by autograd.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+
+@dataclass
+class NaiveRaster:
+    color: Tensor
+    transmittance: Tensor
+    depth: Tensor
+    means2d: Tensor
+    """[n, 2], of `gaussians` alone; in the graph."""
+    radii: list[int]
+    fragments: int
+    """How many fragments passed all tests and were drawn."""
+
+
+def rotation(quat: Tensor) -> Tensor:
+    """By the cross-product form R v = v + 2 w (u x v) + 2 u x (u x v)."""
+    quat = quat / quat.norm()
+    w, u = quat[0], quat[1:]
+    cross = torch.stack([torch.linalg.cross(u, e) for e in torch.eye(3, dtype=quat.dtype)], dim=1)
+    return torch.eye(3, dtype=quat.dtype) + 2 * w * cross + 2 * cross @ cross
+
+
+def sh_color(dc: Tensor, rest: Tensor, direction: Tensor, degree: int) -> Tensor:
+    """The polynomials of the 3DGS reference, with its printed constants."""
+    x, y, z = direction / direction.norm()
+    bases = [
+        *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
+        *(
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * z * z - x * x - y * y),
+        ),
+        *(-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    color = 0.28209479177387814 * dc
+    for k in range((degree + 1) ** 2 - 1):
+        color = color + bases[k] * rest[k]
+    return torch.clamp_min(color + 0.5, 0.0)
+
+
+@dataclass
+class _Splat:
+    mean: Tensor
+    conic: Tensor
+    opacity: Tensor
+    color: Tensor
+    depth: Tensor
+    radius: int
+    windowed: bool
+
+
+def _project(g: Gaussians, i: int, mean: Tensor, mean_c: Tensor, view: View, antialiased: bool) -> tuple:
+    """(conic matrix, opacity, radius) of the i-th Gaussian."""
+    fx, fy, cx, cy = (float(view.K[r, c]) for r, c in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    x, y, z = mean_c
+    pad_x, pad_y = 0.3 * 0.5 * view.width / fx, 0.3 * 0.5 * view.height / fy
+    tx = z * torch.clamp(x / z, -(cx / fx + pad_x), (view.width - cx) / fx + pad_x)
+    ty = z * torch.clamp(y / z, -(cy / fy + pad_y), (view.height - cy) / fy + pad_y)
+    zero = torch.zeros_like(z)
+    J = torch.stack(
+        [torch.stack([fx / z, zero, -fx * tx / z**2]), torch.stack([zero, fy / z, -fy * ty / z**2])]
+    )
+    axes = rotation(g.quats[i]) @ torch.diag(g.scales[i].exp())
+    R = view.viewmat[:3, :3]
+    sharp = J @ R @ axes @ axes.T @ R.T @ J.T
+    cov = sharp + 0.3 * torch.eye(2, dtype=z.dtype)
+    det = torch.linalg.det(cov)
+    opacity = torch.sigmoid(g.opacities[i, 0])
+    if antialiased:
+        opacity = opacity * torch.sqrt(torch.linalg.det(sharp).clamp_min(0) / det)
+    mid = float(cov.trace()) / 2
+    radius = math.ceil(3 * math.sqrt(mid + math.sqrt(max(0.01, mid * mid - float(det)))))
+    outside = (
+        float(mean[0]) + radius <= 0
+        or float(mean[0]) - radius >= view.width
+        or float(mean[1]) + radius <= 0
+        or float(mean[1]) - radius >= view.height
+    )
+    return torch.linalg.inv(cov), opacity, 0 if outside else radius
+
+
+def _splats(
+    g: Gaussians, view: View, sh_degree: int, antialiased: bool, windowed: bool
+) -> tuple[Tensor, list[_Splat]]:
+    R, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
+    center = -R.T @ t
+    means_c = [R @ g.means[i] + t for i in range(len(g))]
+    projected = [
+        (view.K @ (m if m[2] > 0.01 else torch.ones_like(m)))[:2] / (m[2] if m[2] > 0.01 else 1)
+        for m in means_c
+    ]
+    means2d = torch.stack(projected) if projected else g.means.new_zeros((0, 2))
+    splats = []
+    for i in range(len(g)):
+        if not 0.01 <= float(means_c[i][2]) <= 1e10:
+            splats.append(None)
+            continue
+        conic, opacity, radius = _project(g, i, means2d[i], means_c[i], view, antialiased)
+        color = sh_color(g.features_dc[i], g.features_rest[i], g.means[i] - center, sh_degree)
+        splats.append(_Splat(means2d[i], conic, opacity, color, means_c[i][2], radius, windowed))
+    return means2d, splats
+
+
+def _touches_tile(splat: _Splat, px: int, py: int) -> bool:
+    """Whether the square of the radius touches the 16 px tile that holds the pixel."""
+    for center, pixel in zip(splat.mean.tolist(), (px, py), strict=True):
+        tile = pixel // 16
+        if not math.floor((center - splat.radius) / 16) <= tile < math.ceil((center + splat.radius) / 16):
+            return False
+    return True
+
+
+def _pixel(
+    splats: list[_Splat], px: int, py: int, near: float, far: float
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    zero = torch.zeros((), dtype=torch.float64)
+    color, depth, T, drawn = torch.zeros(3, dtype=torch.float64), zero, zero + 1, 0
+    for splat in splats:
+        if not _touches_tile(splat, px, py) or (splat.windowed and not near <= float(splat.depth) < far):
+            continue
+        delta = splat.mean - torch.tensor([px + 0.5, py + 0.5], dtype=torch.float64)
+        sigma = 0.5 * delta @ splat.conic @ delta
+        alpha = torch.clamp_max(splat.opacity * torch.exp(-sigma), 0.999)
+        if float(sigma) < 0 or float(alpha) < 1 / 255:
+            continue
+        if float(T * (1 - alpha)) <= 1e-4:
+            break
+        color = color + alpha * T * splat.color
+        depth = depth + alpha * T * splat.depth
+        T = T * (1 - alpha)
+        drawn += 1
+    return color, T, depth, drawn
+
+
+def naive_rasterize(
+    gaussians: Gaussians,
+    view: View,
+    *,
+    sh_degree: int,
+    crop: Crop | None = None,
+    frozen: Gaussians | None = None,
+    near: Tensor | None = None,
+    far: Tensor | None = None,
+    antialiased: bool = False,
+) -> NaiveRaster:
+    """Draw in float64. `near` and `far` [h, w] are the z window, of the frozen if any, else of all."""
+    crop = crop or view.full
+    means2d, own = _splats(
+        gaussians, view, sh_degree, antialiased, windowed=near is not None and frozen is None
+    )
+    everyone = list(own)
+    if frozen is not None:
+        everyone += _splats(frozen.detach(), view, sh_degree, antialiased, windowed=near is not None)[1]
+    drawable = [s for s in everyone if s is not None and s.radius > 0]
+    drawable.sort(key=lambda s: float(s.depth))  # stable: ties by index
+    pixels = []
+    for row in range(crop.height):
+        for col in range(crop.width):
+            low, high = (
+                (-math.inf, math.inf) if near is None else (float(near[row, col]), float(far[row, col]))
+            )
+            pixels.append(_pixel(drawable, crop.x + col, crop.y + row, low, high))
+    color, T, depth = (torch.stack([p[k] for p in pixels]) for k in range(3))
+    return NaiveRaster(
+        color.view(crop.height, crop.width, 3),
+        T.view(crop.height, crop.width),
+        depth.view(crop.height, crop.width),
+        means2d,
+        [0 if s is None else s.radius for s in own],
+        sum(p[3] for p in pixels),
+    )

@@ -1,0 +1,65 @@
+"""3DGS as a plain loop over whole pictures: no blocks, no layers, no store. The oracle for one block."""
+
+import random
+
+import torch
+
+from abcd_ns.engine.coordinator import TrainingConfig
+from abcd_ns.engine.density import DensityClock, DensityControl
+from abcd_ns.engine.loss import photometric_loss
+from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+from abcd_ns.engine.schedule import exponential_decay, passes_of_sweep, plan_sweep, sh_degree_at, view_order
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
+from tests.reference.scenes import RATES, Photos
+
+
+def train_plain(
+    gaussians: Gaussians, views: list[View], photos: Photos, *, steps: int, config: TrainingConfig
+) -> Gaussians:
+    """Train for `steps` on the views in the order that a run of one block takes, and return the result."""
+    params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
+    adam = {name: torch.optim.Adam([params[name]], lr=RATES[name], eps=1e-15) for name in PARAM_NAMES}
+    draw, density, growth, taken = TorchRasterizer(compile="never"), DensityControl(config.density), {}, 0
+    for row, degree in _rows(views, steps, config):
+        view = views[row]
+        adam["means"].param_groups[0]["lr"] = exponential_decay(
+            taken / steps, config.means_lr, config.means_lr_final
+        )
+        raster = draw(
+            Gaussians(**{name: params[name] for name in PARAM_NAMES}),
+            view,
+            sh_degree=degree,
+            absgrad=density.absgrad,
+        )
+        density.before_backward(raster.info)
+        seed = random.Random(f"background {config.seed} {taken}").getrandbits(62)
+        background = torch.rand(3, generator=torch.Generator().manual_seed(seed))
+        picture = (raster.color + raster.transmittance[..., None] * background).clamp(0, 1)
+        loss = photometric_loss(
+            picture,
+            photos.images[row],
+            full_pixels=view.width * view.height,
+            full_windows=(view.width - 10) * (view.height - 10),
+        )
+        for optimizer in adam.values():
+            optimizer.zero_grad()
+        loss.backward()
+        for optimizer in adam.values():
+            optimizer.step()
+        taken += 1
+        seed = random.Random(f"density {config.seed} {taken}").getrandbits(62)
+        clock = DensityClock(taken / steps, taken, len(views), None, seed)
+        growth = density.after_step(params, adam, growth, raster.info, clock)
+    return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
+
+
+def _rows(views: list[View], steps: int, config: TrainingConfig):
+    """(view, degree) of each step; the degree changes between visits only, as in a run of blocks."""
+    taken, sweep = 0, 0
+    while taken < steps:
+        passes = passes_of_sweep(sweep, config.first_passes, config.last_passes)
+        (plan,) = plan_sweep(sweep, {0: len(views)}, passes, steps - taken, config.seed)
+        degree = sh_degree_at(taken / steps, config.sh_ramp, config.sh_degree)
+        for row in view_order(tuple(range(len(views))), plan.steps, sweep, config.seed):
+            yield row, degree
+        taken, sweep = taken + plan.steps, sweep + 1

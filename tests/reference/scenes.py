@@ -1,0 +1,127 @@
+"""Small scenes for tests: Gaussians in a box, cameras around it, photos drawn from a known truth."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from abcd_ns.engine.blocks import BlockTree, build_kd
+from abcd_ns.engine.coordinator import Coordinator, TrainingConfig, blocks_at_rest
+from abcd_ns.engine.param_swap import make_adam
+from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+RATES = {
+    "means": 1.6e-4,
+    "features_dc": 2.5e-3,
+    "features_rest": 1.25e-4,
+    "opacities": 0.05,
+    "scales": 5e-3,
+    "quats": 1e-3,
+}
+
+
+def random_gaussians(
+    count: int, seed: int = 0, *, size: float = 0.06, sh_degree: int = 1, dtype=torch.float32
+) -> Gaussians:
+    """`count` Gaussians with means in [-1, 1]^3, about `size` wide, of all shapes, colours and opacities."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator, dtype=dtype)
+
+    return Gaussians(
+        means=torch.rand((count, 3), generator=generator, dtype=dtype) * 2 - 1,
+        scales=math.log(size) + 0.4 * normal(count, 3),
+        quats=normal(count, 4),
+        features_dc=normal(count, 3),
+        features_rest=0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3),
+        opacities=normal(count, 1),
+    )
+
+
+def look_at(eye: Tensor, target: Tensor) -> Tensor:
+    """[4, 4] world to camera, OpenCV convention, with the world's z up."""
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0]).to(eye)), dim=0
+    )
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4, dtype=eye.dtype)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    return viewmat
+
+
+def ring_of_views(
+    count: int, *, radius: float = 3.0, width: int = 48, height: int = 36, dtype=torch.float32
+) -> list[View]:
+    """Cameras on a circle around the origin, at varying heights, all looking at it."""
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=dtype)
+    views = []
+    for index in range(count):
+        angle = 2 * math.pi * index / count
+        eye = torch.tensor(
+            [radius * math.cos(angle), radius * math.sin(angle), 0.6 * (index % 3)], dtype=dtype
+        )
+        views.append(View(look_at(eye, torch.zeros(3, dtype=dtype)), K, width, height, index))
+    return views
+
+
+class Photos:
+    """Photos of `truth`, drawn once; callable as the training loop's photo reader."""
+
+    def __init__(self, truth: Gaussians, views: list[View]) -> None:
+        draw = TorchRasterizer(compile="never")
+        with torch.no_grad():
+            rasters = {v.index: draw(truth, v, sh_degree=truth.sh_degree) for v in views}
+        self.images = {i: r.color.clamp(0, 1) for i, r in rasters.items()}
+
+    def __call__(self, index: int, crop: Crop) -> Tensor:
+        return self.images[index][crop.slices]
+
+
+def make_coordinator(
+    folder,
+    gaussians: Gaussians,
+    views: list[View],
+    *,
+    blocks: int = 4,
+    steps: int = 40,
+    tree: BlockTree | None = None,
+    resume: bool = False,
+    bits: int = 32,
+    **training,
+) -> Coordinator:
+    """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is."""
+    if resume:
+        store = ParameterStore.open(folder / "store")
+        tree = BlockTree.from_json(store.header["tree"])
+    else:
+        tree = tree or build_kd(gaussians.means, blocks)
+        store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
+        store.commit(blocks_at_rest(tree, gaussians))
+    empty = Gaussians.empty(gaussians.sh_degree)
+    params = {name: torch.nn.Parameter(value) for name, value in empty.items()}
+    config = TrainingConfig(sh_degree=gaussians.sh_degree, **training)
+    coordinator = Coordinator(
+        config,
+        Budget(steps=steps),
+        StoredScene(tree, store),
+        views,
+        LayerCache(None, bits=bits),
+        TorchRasterizer(compile="never"),
+        params,
+        make_adam(params, RATES),
+    )
+    if resume:
+        coordinator.restore()
+    return coordinator
+
+
+def whole_scene(coordinator: Coordinator) -> Gaussians:
+    """All blocks in one list, in the order of the blocks."""
+    scene = coordinator.scene
+    return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)])

@@ -1,0 +1,290 @@
+"""The rules of the house (CONTRIBUTING.md), as far as a machine can check them.
+
+Every rule is a function from source text to complaints, so that each is first shown to notice an offence.
+"""
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import abcd_ns
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # comes with pytest on 3.10
+
+ROOT = Path(__file__).resolve().parent.parent
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PACKAGE_FILES = sorted((ROOT / "abcd_ns").rglob("*.py"))
+TEST_FILES = sorted((ROOT / "tests").rglob("*.py"))
+
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 60
+
+Rule = Callable[[str], Iterator[str]]
+_FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def file_length(source: str) -> Iterator[str]:
+    """A file is read in one sitting."""
+    lines = len(source.splitlines())
+    if lines > MAX_FILE_LINES:
+        yield f"1: {lines} lines, more than {MAX_FILE_LINES}"
+
+
+def function_length(source: str) -> Iterator[str]:
+    """A function is read on one screen."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, _FUNCTION) and node.end_lineno - node.lineno >= MAX_FUNCTION_LINES:
+            yield f"{node.lineno}: {node.name} has {node.end_lineno - node.lineno + 1} lines"
+
+
+def public_docstrings(source: str) -> Iterator[str]:
+    """A module and its public functions and classes say what they are for."""
+    module = ast.parse(source)
+    if module.body and not ast.get_docstring(module):
+        yield "1: the module has no docstring"
+    for node in module.body:
+        public = isinstance(node, (*_FUNCTION, ast.ClassDef)) and not node.name.startswith("_")
+        if public and not ast.get_docstring(node):
+            yield f"{node.lineno}: {node.name} has no docstring"
+
+
+def no_shortcuts(source: str) -> Iterator[str]:
+    """Nothing is put off, and no check is silenced wholesale."""
+    for number, line in enumerate(source.splitlines(), 1):
+        for shortcut in re.findall(r"#\s*type:\s*ignore|#.*\b(?:TODO|FIXME|XXX)\b|#\s*noqa(?!:)", line):
+            yield f"{number}: {shortcut}"
+
+
+def no_swallowed_errors(source: str) -> Iterator[str]:
+    """Whoever catches everything raises it again."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ExceptHandler):
+            caught = ast.unparse(node.type) if node.type else "everything"
+            raises = any(isinstance(inner, ast.Raise) for inner in ast.walk(node))
+            if caught in ("everything", "Exception", "BaseException") and not raises:
+                yield f"{node.lineno}: catches {caught}"
+
+
+def skips_have_reasons(source: str) -> Iterator[str]:
+    """A skipped or expected failure says why; a skipif is given its condition."""
+    tree = ast.parse(source)
+    called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    marks = ("pytest.mark.skip", "pytest.mark.skipif", "pytest.mark.xfail")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and id(node) not in called and ast.unparse(node) in marks:
+            yield f"{node.lineno}: bare {ast.unparse(node)}"
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            keywords = {keyword.arg for keyword in node.keywords}
+            wants_reason = name in ("pytest.mark.skipif", "pytest.mark.xfail")
+            takes_it_first = name in ("pytest.mark.skip", "pytest.skip", "pytest.xfail")
+            if (wants_reason or (takes_it_first and not node.args)) and "reason" not in keywords:
+                yield f"{node.lineno}: {name} without a reason"
+
+
+def machine_independent(source: str) -> Iterator[str]:
+    """No path of one machine."""
+    for number, line in enumerate(source.splitlines(), 1):
+        for path in re.findall(r"(?<![\w.~-])/(?:root|work|home/\w+|Users/\w+|opt/\w+)/[\w.-]*", line):
+            yield f"{number}: {path}"
+
+
+def no_index_hosts(source: str) -> Iterator[str]:
+    """Where packages come from is the user's setting."""
+    hosts = r"pypi\.org|pythonhosted\.org|download\.pytorch\.org|--(?:extra-)?index-url|--find-links|--hash"
+    for number, line in enumerate(source.splitlines(), 1):
+        for host in re.findall(hosts, line):
+            yield f"{number}: {host}"
+
+
+def no_postponed_annotations(source: str) -> Iterator[str]:
+    """beartype checks the engine's annotations; as strings it could not."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and node.module == "__future__":
+            yield f"{node.lineno}: from __future__ import {node.names[0].name}"
+
+
+def no_circular_nerfstudio_imports(source: str) -> Iterator[str]:
+    """nerfstudio loads our methods while importing method_configs: to ask for it again breaks every ns-*."""
+    for node in ast.parse(source).body:
+        imported = [ast.unparse(node)] if isinstance(node, (ast.Import, ast.ImportFrom)) else []
+        for statement in imported:
+            if re.search(
+                r"nerfstudio\.(configs\.method_configs|scripts)|nerfstudio\.configs import method_", statement
+            ):
+                yield f"{node.lineno}: {statement}"
+
+
+def complaints(rule: Rule, paths: list[Path]) -> list[str]:
+    """What `rule` finds in the files, as path:line: text."""
+    return [f"{path.relative_to(ROOT)}:{found}" for path in paths for found in rule(path.read_text())]
+
+
+def config_files() -> list[Path]:
+    """The files that configure, install or build, but no results and no environment."""
+    wanted = {".toml", ".txt", ".cfg", ".ini", ".yml", ".yaml", ".sh"}
+    top = [
+        p
+        for p in ROOT.iterdir()
+        if p.suffix in wanted or p.name in ("Makefile", ".importlinter", ".gitignore")
+    ]
+    folders = [ROOT / name for name in (".ci", ".github", "configs", "scripts")]
+    return sorted(top + [p for folder in folders for p in folder.rglob("*") if p.is_file()])
+
+
+def text_files() -> list[Path]:
+    """Config, documents and code; not this file, which has to name what it looks for."""
+    documents = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+    return [
+        p for p in [*config_files(), *documents, *PACKAGE_FILES, *TEST_FILES] if p != Path(__file__).resolve()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rule", "paths"),
+    [
+        (file_length, [*PACKAGE_FILES, *TEST_FILES]),
+        (function_length, [*PACKAGE_FILES, *TEST_FILES]),
+        (public_docstrings, PACKAGE_FILES),
+        (no_shortcuts, [p for p in [*PACKAGE_FILES, *TEST_FILES] if p != Path(__file__).resolve()]),
+        (no_swallowed_errors, [*PACKAGE_FILES, *TEST_FILES]),
+        (skips_have_reasons, TEST_FILES),
+        (machine_independent, text_files()),
+        (no_index_hosts, config_files()),
+        (no_postponed_annotations, sorted((ROOT / "abcd_ns" / "engine").rglob("*.py"))),
+        (no_circular_nerfstudio_imports, [p for p in PACKAGE_FILES if "tools" not in p.parts]),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_the_house_is_clean(rule, paths):
+    assert paths
+    assert complaints(rule, paths) == []
+
+
+@pytest.mark.parametrize(
+    ("rule", "offence"),
+    [
+        (file_length, "\n" * (MAX_FILE_LINES + 1)),
+        (function_length, "def f():\n" + "    1\n" * MAX_FUNCTION_LINES),
+        (public_docstrings, "x = 1"),
+        (public_docstrings, '"""A module."""\nclass Public: pass'),
+        (no_shortcuts, "x = 1  # TODO"),
+        (no_shortcuts, "x = 1  # noqa"),
+        (no_swallowed_errors, "try: f()\nexcept Exception as error: print(error)"),
+        (no_swallowed_errors, "try: f()\nexcept: pass"),
+        (skips_have_reasons, "@pytest.mark.skip\ndef test(): pass"),
+        (skips_have_reasons, "pytest.skip()"),
+        (skips_have_reasons, "pytest.mark.skipif(True)"),
+        (machine_independent, "see /home/me/scene"),
+        (no_index_hosts, "--index-url https://mirror"),
+        (no_postponed_annotations, "from __future__ import annotations"),
+        (no_circular_nerfstudio_imports, "from nerfstudio.configs.method_configs import all_methods"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_each_rule_notices_an_offence(rule, offence):
+    assert len(list(rule(offence))) == 1
+
+
+@pytest.mark.parametrize(
+    ("rule", "innocent"),
+    [
+        (function_length, "def f():\n" + "    1\n" * (MAX_FUNCTION_LINES - 1)),
+        (public_docstrings, '"""A module."""\ndef _private(): pass'),
+        (no_swallowed_errors, "try: f()\nexcept BaseException:\n    g()\n    raise"),
+        (skips_have_reasons, "pytest.skip('no data'); pytest.mark.skipif(True, reason='no data')"),
+        (machine_independent, "https://host/work/page ../work/x ~/root/x"),
+        (no_circular_nerfstudio_imports, "def f():\n    from nerfstudio.configs.method_configs import x"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_no_rule_bothers_the_innocent(rule, innocent):
+    assert list(rule(innocent)) == []
+
+
+def lint_imports(folder: Path) -> subprocess.CompletedProcess:
+    """Run import-linter with this project's contracts on the package in `folder`."""
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()"]
+    options = ["--no-cache", "--config", str(ROOT / ".importlinter")]
+    return subprocess.run([*command, *options], cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_imports_keep_to_the_contracts():
+    result = lint_imports(ROOT)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize(
+    ("contract", "module", "statement"),
+    [
+        ("never the other way", "engine/types.py", "import abcd_ns.plugin"),
+        ("never the other way", "engine/types.py", "import abcd_ns.tools.cli"),
+        ("never the other way", "plugin/model.py", "from abcd_ns.tools import cli"),
+        ("nor any user interface", "engine/types.py", "from nerfstudio.utils import colormaps"),
+        ("nor any user interface", "engine/types.py", "def late():\n    import viser"),
+        ("nor any user interface", "engine/types.py", "import rich.console"),
+        ("nor any user interface", "engine/types.py", "import tyro"),
+        ("density control only", "engine/types.py", "import gsplat"),
+        ("density control only", "plugin/model.py", "from gsplat.strategy import DefaultStrategy"),
+        ("No cycles", "engine/types.py", "import abcd_ns.engine.blocks"),
+    ],
+)
+def test_the_contracts_notice_an_offence(contract, module, statement, tmp_path):
+    skeleton = {"errors.py": "", "tools/cli.py": "import abcd_ns.plugin.model", "plugin/model.py": ""}
+    skeleton |= {"engine/types.py": "", "engine/blocks.py": "import abcd_ns.engine.types"}
+    skeleton |= {"engine/density.py": "import gsplat", "engine/rasterizer/gsplat_backend.py": "import gsplat"}
+    for name, source in {**skeleton, module: statement}.items():
+        path = tmp_path / "abcd_ns" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(source)
+    for folder in [tmp_path / "abcd_ns", *(p for p in (tmp_path / "abcd_ns").rglob("*") if p.is_dir())]:
+        (folder / "__init__.py").touch()
+
+    result = lint_imports(tmp_path)
+
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert f"{contract} BROKEN" in result.stdout
+
+
+def entry_points() -> list[str]:
+    """Every "module:name" that installing the package announces."""
+    project = PYPROJECT["project"]
+    groups = [project["scripts"], *project["entry-points"].values()]
+    return [target for group in groups for target in group.values()]
+
+
+@pytest.mark.parametrize("target", entry_points())
+def test_entry_points_exist(target):
+    module, name = target.split(":")
+    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text())
+    defined = {node.name for node in tree.body if isinstance(node, (*_FUNCTION, ast.ClassDef))}
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        defined |= {target.id for target in targets if isinstance(target, ast.Name)}
+    assert name in defined
+
+
+def test_versions_agree():
+    version = PYPROJECT["project"]["version"]
+    assert abcd_ns.__version__ == version
+    headings = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert headings[0] == version
+
+
+def test_the_pinned_set_is_names_and_versions_and_complete():
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    pin = re.compile(r"([a-z0-9-]+)==[0-9][\w.]*( ; python_full_version .+)?")
+    assert [line for line in lines if not pin.fullmatch(line)] == []
+
+    project = PYPROJECT["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    names = {re.match(r"[\w-]+", requirement).group().lower() for requirement in wanted}
+    assert names - {line.split("==")[0] for line in lines} == set()
