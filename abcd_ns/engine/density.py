@@ -156,11 +156,10 @@ class DensityControl:
         config = self.config
         if clock.progress >= config.refine_stop or info["means2d"].grad is None:
             return growth
-        full = clock.room is not None and clock.room <= 0
         has_reset = 0 < config.reset_every < clock.steps
         strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=float("inf") if full else config.densify_grad_thresh,
+            grow_grad2d=config.densify_grad_thresh,
             grow_scale3d=config.densify_size_thresh,
             prune_scale3d=config.cull_scale_thresh,
             refine_start_iter=0,
@@ -169,8 +168,12 @@ class DensityControl:
             absgrad=config.use_absgrad,
         )
         state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": 1.0, **growth}
-        step = REFINE if self.is_due(clock) else GATHER
-        strategy.step_post_backward(params, optimizers, state, step, info)
+        strategy.step_post_backward(params, optimizers, state, GATHER, info)
+        if self.is_due(clock):
+            strategy.grow_grad2d = _threshold_within(state, config.densify_grad_thresh, clock.room)
+            # Nothing is visible in this info, so the statistics are not gathered twice.
+            unseen = {**info, "radii": torch.zeros_like(info["radii"])}
+            strategy.step_post_backward(params, optimizers, state, REFINE, unseen)
         if config.reset_every > 0 and clock.steps % config.reset_every == 0:
             gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
         return {name: value for name, value in state.items() if isinstance(value, Tensor)}
@@ -187,6 +190,15 @@ class DensityControl:
         step = REFINE if self.is_due(clock) else GATHER
         learning_rate = optimizers["means"].param_groups[0]["lr"]
         strategy.step_post_backward(params, optimizers, {"binoms": binomials()}, step, {}, lr=learning_rate)
+
+
+def _threshold_within(state: dict[str, Tensor], threshold: float, room: int | None) -> float:
+    """The gradient over which to grow, such that no more than `room` Gaussians are added."""
+    gradients = state["grad2d"] / state["count"].clamp_min(1)
+    if room is None or int((gradients > threshold).sum()) <= room:
+        return threshold
+    # gsplat grows where gradient > threshold, so the (room + 1)-th largest is the first that must not.
+    return float(gradients.sort(descending=True).values[max(room, 0)])
 
 
 @contextmanager

@@ -158,6 +158,7 @@ class VisitLayers:
         """
         if self._frozen_versions() != self._versions:
             raise StaleLayerError(f"a frozen block changed during the visit of block {self._geometry.block}")
+        crop = self._geometry.crops[view]
         layers = self._cached(view)
         if layers is None:  # never drawn, or the disposable cache has lost it
             ((_, layers),) = self.draw([view])

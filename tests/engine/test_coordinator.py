@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from abcd_ns.engine.block_state import BlockState
-from abcd_ns.engine.compositing import composite, sandwich
+from abcd_ns.engine.compositing import composite, fold
 from abcd_ns.engine.coordinator import resolve_ownership
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.ordering import front_to_back
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import RunState
 from abcd_ns.engine.storage import StaleLayerError
@@ -31,7 +32,7 @@ def photos(views):
     return Photos(random_gaussians(150, seed=7, size=0.12), views)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def start():
     return random_gaussians(120, seed=1, size=0.12)
 
@@ -41,7 +42,7 @@ def equal(a: Gaussians, b: Gaussians) -> bool:
 
 
 def test_training_improves_every_photo(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=120)
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=120, background="black")
 
     def error() -> list[float]:
         draw = TorchRasterizer(compile="never")
@@ -55,7 +56,7 @@ def test_training_improves_every_photo(tmp_path, views, photos, start):
     before = error()
     train(coordinator, photos)
     assert coordinator.state.step == 120
-    assert all(new < 0.8 * old for old, new in zip(before, error(), strict=True))
+    assert all(new < 0.8 * old for old, new in zip(before, error(), strict=True)), (before, error())
 
 
 @pytest.mark.parametrize("growing", [False, True])
@@ -84,9 +85,9 @@ def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership):
     """Through cached F and B == through a render of all blocks at once (invariant 3), in float64."""
     gaussians = random_gaussians(100, size=0.08, dtype=torch.float64)
     views = ring_of_views(3, dtype=torch.float64)
-    percentile = 1.0
+    still = DensityConfig(strategy="off")
     coordinator = make_coordinator(
-        tmp_path, gaussians, views, blocks=4, ownership=ownership, window_percentile=percentile
+        tmp_path, gaussians, views, blocks=4, ownership=ownership, window_percentile=1.0, density=still
     )
     for _ in range(3):
         sample = coordinator.next_sample()
@@ -118,9 +119,6 @@ def _gradient_of_whole_picture(coordinator, sample, weights, block, ownership) -
         layer = draw(active, sample.view, sh_degree=degree, crop=sample.crop, frozen=others).layer
         picture = composite(layer, sample.background)
     else:
-        from abcd_ns.engine.compositing import fold
-        from abcd_ns.engine.ordering import front_to_back
-
         order = front_to_back(tree, sample.view.center)
         parts = {**blocks, block: active}
         picture = composite(
@@ -307,5 +305,4 @@ def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start):
         expected = composite(layer, sample.background).clamp(0, 1)
         assert float((rendered.rgb - expected).abs().max()) < 1e-5
         assert sample.layers is not None
-        assert sandwich is not None
         coordinator.after_step(rendered)

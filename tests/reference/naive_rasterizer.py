@@ -88,13 +88,13 @@ def _project(g: Gaussians, i: int, mean: Tensor, mean_c: Tensor, view: View, ant
     opacity = torch.sigmoid(g.opacities[i, 0])
     if antialiased:
         opacity = opacity * torch.sqrt(torch.linalg.det(sharp).clamp_min(0) / det)
-    mid = float(cov.trace()) / 2
-    radius = math.ceil(3 * math.sqrt(mid + math.sqrt(max(0.01, mid * mid - float(det)))))
+    mid = cov.trace().item() / 2
+    radius = math.ceil(3 * math.sqrt(mid + math.sqrt(max(0.01, mid * mid - det.item()))))
     outside = (
-        float(mean[0]) + radius <= 0
-        or float(mean[0]) - radius >= view.width
-        or float(mean[1]) + radius <= 0
-        or float(mean[1]) - radius >= view.height
+        mean[0].item() + radius <= 0
+        or mean[0].item() - radius >= view.width
+        or mean[1].item() + radius <= 0
+        or mean[1].item() - radius >= view.height
     )
     return torch.linalg.inv(cov), opacity, 0 if outside else radius
 
@@ -112,7 +112,7 @@ def _splats(
     means2d = torch.stack(projected) if projected else g.means.new_zeros((0, 2))
     splats = []
     for i in range(len(g)):
-        if not 0.01 <= float(means_c[i][2]) <= 1e10:
+        if not 0.01 <= means_c[i][2].item() <= 1e10:
             splats.append(None)
             continue
         conic, opacity, radius = _project(g, i, means2d[i], means_c[i], view, antialiased)
@@ -136,14 +136,14 @@ def _pixel(
     zero = torch.zeros((), dtype=torch.float64)
     color, depth, T, drawn = torch.zeros(3, dtype=torch.float64), zero, zero + 1, 0
     for splat in splats:
-        if not _touches_tile(splat, px, py) or (splat.windowed and not near <= float(splat.depth) < far):
+        if not _touches_tile(splat, px, py) or (splat.windowed and not near <= splat.depth.item() < far):
             continue
         delta = splat.mean - torch.tensor([px + 0.5, py + 0.5], dtype=torch.float64)
         sigma = 0.5 * delta @ splat.conic @ delta
         alpha = torch.clamp_max(splat.opacity * torch.exp(-sigma), 0.999)
-        if float(sigma) < 0 or float(alpha) < 1 / 255:
+        if sigma.item() < 0 or alpha.item() < 1 / 255:
             continue
-        if float(T * (1 - alpha)) <= 1e-4:
+        if (T * (1 - alpha)).item() <= 1e-4:
             break
         color = color + alpha * T * splat.color
         depth = depth + alpha * T * splat.depth
@@ -172,7 +172,7 @@ def naive_rasterize(
     if frozen is not None:
         everyone += _splats(frozen.detach(), view, sh_degree, antialiased, windowed=near is not None)[1]
     drawable = [s for s in everyone if s is not None and s.radius > 0]
-    drawable.sort(key=lambda s: float(s.depth))  # stable: ties by index
+    drawable.sort(key=lambda s: s.depth.item())  # stable: ties by index
     pixels = []
     for row in range(crop.height):
         for col in range(crop.width):

@@ -23,12 +23,10 @@ def make_rasterizer(
         compile: passed to TorchRasterizer.
 
     Raises:
-        ValueError: gsplat was asked for on a device other than CUDA, or `name` is unknown.
+        ValueError: gsplat was asked for on a device other than CUDA.
         RuntimeError: gsplat's kernels do not agree with the torch backend.
     """
     device = torch.device(device)
-    if name not in ("auto", "torch", "gsplat"):
-        raise ValueError(f'rasterizer is "{name}"; choose one of "auto", "torch", "gsplat".')
     if name == "torch" or (name == "auto" and device.type != "cuda"):
         return TorchRasterizer(compile)
     if device.type != "cuda":

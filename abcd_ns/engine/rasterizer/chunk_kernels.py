@@ -34,7 +34,7 @@ class ChunkKernels:
 
     def __init__(self, policy: CompilePolicy) -> None:
         self.policy = policy
-        self._eager_seconds = 0.0
+        self.eager_seconds = 0.0
 
     def forward(self, params: Tensor, origins: Tensor, state: Tensor, window: Tensor | None, side: int) -> Tensor:
         """See torch_kernels.forward_chunk."""
@@ -53,21 +53,21 @@ class ChunkKernels:
         """See torch_kernels.backward_chunk."""
         return self._run(torch_kernels.backward_chunk, params, origins, state, upstream, window, side, absgrad)
 
-    def _compiles(self, params: Tensor) -> bool:
+    def compiles(self, params: Tensor) -> bool:
         if self.policy == "never":
             return False
         if self.policy == "always":
             return True
         suited = params.device.type == "cpu" and params.dtype == torch.float32
-        return suited and self._eager_seconds > EAGER_SECONDS and has_cpp_compiler()
+        return suited and self.eager_seconds > EAGER_SECONDS and has_cpp_compiler()
 
     def _run(self, kernel: Callable[..., Tensor], *args: Tensor | int | None) -> Tensor:
         params = args[0]
-        if self._compiles(params):
+        if self.compiles(params):
             return self._run_compiled(kernel, *args)
         started = time.perf_counter()
         result = kernel(*args)
-        self._eager_seconds += time.perf_counter() - started
+        self.eager_seconds += time.perf_counter() - started
         return result
 
     def _run_compiled(self, kernel: Callable[..., Tensor], *args: Tensor | int | None) -> Tensor:

@@ -41,11 +41,11 @@ class _Trace:
     """Per level, the state before it."""
 
 
-def _parameter_table(job: Job, means2d, conics, colors, opacities, depths) -> Float[Tensor, "c m+1"]:
+def _parameter_table(job: Job, means2d, conics, colors, opacities, depths) -> Float[Tensor, "c columns"]:
     """One column per rank, in the order of torch_kernels; the last, for empty slots, has opacity 0."""
     rows = job.lists.rows
-    by_row = (x.index_select(0, rows).view(rows.numel(), -1).T for x in (means2d, conics, opacities, depths))
-    means2d, conics, opacities, depths = by_row
+    columns = (means2d, conics, opacities[:, None], depths[:, None])
+    means2d, conics, opacities, depths = (x.index_select(0, rows).T for x in columns)
     parts = [means2d, conics, opacities, colors.T, depths]
     if job.always is not None:
         parts.append(job.always[None])

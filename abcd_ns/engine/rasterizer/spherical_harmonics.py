@@ -67,8 +67,8 @@ def sh_colors(
             f"sh_degree is {degree}, but the Gaussians hold {features_rest.shape[1]} coefficients above degree 0 "
             f"and at most degree {MAX_SH_DEGREE} is supported; lower sh_degree."
         )
-    colors = SH_C0 * features_dc + 0.5
-    if degree > 0:
-        bases = sh_bases(F.normalize(means - camera_center, dim=-1), degree)
-        colors = colors + torch.bmm(bases[:, None], features_rest[:, :used])[:, 0]
-    return colors.clamp_min(0.0)
+    bases = sh_bases(F.normalize(means - camera_center, dim=-1), degree)
+    # With degree 0 this adds nothing, yet gives `features_rest` a gradient of zeros, as gsplat does: Adam
+    # counts such steps.
+    directional = torch.bmm(bases[:, None], features_rest[:, :used])[:, 0]
+    return (SH_C0 * features_dc + directional + 0.5).clamp_min(0.0)

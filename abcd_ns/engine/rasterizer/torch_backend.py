@@ -1,5 +1,6 @@
 """The torch rasterizer: gsplat's drawing in plain torch, for any device, with a z window per pixel."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -99,19 +100,20 @@ class TorchRasterizer:
         absgrad: bool = False,
     ) -> Raster:
         """See Rasterizer.__call__."""
-        own = project(gaussians, view, antialiased=antialiased)
-        info = _info(own, view)
-        means2d = info["means2d"][0]
-        splats = Splats(means2d, own.covs2d, own.conics, own.depths, own.radii, own.opacities)
+        crop = crop or view.full
+        _check_window(z_window, crop)
+        splats = project(gaussians, view, antialiased=antialiased)
+        info = _info(splats, view)
+        splats = replace(splats, means2d=info["means2d"][0])  # so that info's tensor is in the graph
         if frozen is not None:
             with torch.no_grad():
-                splats = _append(splats, project(frozen, view, antialiased=antialiased))
+                others = project(frozen, view, antialiased=antialiased)
+            splats = Splats.cat(splats, others)
         windowed = None
         if z_window is not None:
             is_frozen = torch.arange(len(splats), device=gaussians.device) >= len(gaussians)
             windowed = is_frozen if frozen is not None else ~is_frozen
-        grid = TileGrid(crop or view.full, self.tile_side)
-        lists = bin_splats(splats, grid, self.chunk, windowed=windowed, window=z_window)
+        lists = bin_splats(splats, TileGrid(crop, self.tile_side), self.chunk, windowed=windowed, window=z_window)
         colors = _ranked_colors(gaussians, frozen, lists.rows, view, sh_degree)
         job = self._job(lists, colors, windowed, z_window, info["means2d"] if absgrad else None)
         planes = Composite.apply(splats.means2d, splats.conics, colors, splats.opacities, splats.depths, job)
@@ -126,9 +128,10 @@ class TorchRasterizer:
         return Job(lists, self.kernels, planes, (~windowed[lists.rows]).to(colors), target)
 
 
-def _append(own: Splats, frozen: Splats) -> Splats:
-    with torch.enable_grad():
-        return Splats.cat(own, frozen)
+def _check_window(window: ZWindow | None, crop: Crop) -> None:
+    if window is not None and window.near.shape != (crop.height, crop.width):
+        shape = tuple(window.near.shape)
+        raise ValueError(f"The z window is {shape}, but the crop is {(crop.height, crop.width)}; give it the crop's size.")
 
 
 def _info(splats: Splats, view: View) -> dict[str, Any]:

@@ -99,7 +99,15 @@ def _draw_curves(axes: Axes, method: str, runs: Sequence[Run]) -> tuple[float, f
                 alpha=0.45,
             )
     curve = mean_curve(runs)
-    axes.plot(*zip(*curve, strict=True), color=color, marker=MARKERS[method], markersize=4, linewidth=1.6)
+    axes.plot(
+        *zip(*curve, strict=True),
+        color=color,
+        marker=MARKERS[method],
+        markersize=4.5,
+        markeredgecolor="white",
+        markeredgewidth=0.5,
+        linewidth=1.4,
+    )
     return curve[-1]
 
 
@@ -125,11 +133,17 @@ def _label(axes: Axes, ends: dict[str, tuple[float, float]]) -> None:
     right = max(seconds for seconds, _ in ends.values())
     for (method, (seconds, psnr)), height in zip(ends.items(), heights, strict=True):
         axes.annotate(
-            f"{method}  {psnr:.1f}",
+            f"{method}  {psnr:.2f}",
             xy=(seconds, psnr),
             xytext=(right * 1.04, height),
             color=COLORS[method],
             va="center",
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": COLORS[method], "linewidth": 0.5, "shrinkB": 3},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": COLORS[method],
+                "linewidth": 0.5,
+                "shrinkB": 3,
+                "relpos": (0, 0.5),
+            },
         )

@@ -6,7 +6,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -37,30 +39,42 @@ def psnr_of(picture: PictureArray, photo: PictureArray) -> float:
     return float("inf") if squared == 0 else float(-10 * np.log10(squared))
 
 
+def evenly(count: int, wanted: int) -> tuple[int, ...]:
+    """`wanted` of the rows 0 .. count - 1, as far apart from each other as from both ends."""
+    wanted = min(count, wanted)
+    return tuple(int((k + 0.5) * count / wanted) for k in range(wanted))
+
+
 def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], title: str, path: Path) -> None:
     """Write one figure: photo and pictures above, errors below, on one scale with its legend.
+
+    With a single picture all stand in one row.
 
     Args:
         pictures: by the name to print above each, of the photo's size.
     """
     height, width = photo.shape[:2]
-    columns = 1 + len(pictures)
-    inches = COLUMN_INCHES * height / width
+    single = len(pictures) == 1
+    rows, columns = (1, 3) if single else (2, 1 + len(pictures))
+    size = (COLUMN_INCHES * columns, rows * (COLUMN_INCHES * height / width + 0.25) + 0.25)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(COLUMN_INCHES * columns, 2 * inches + 0.75), layout="constrained")
-        grid = figure.subplots(2, columns, squeeze=False)
+        figure = Figure(figsize=(size[0] + 0.8 * single, size[1]), layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False)
         figure.suptitle(title, fontsize=9)
         _show(grid[0, 0], photo, "photo")
-        grid[1, 0].axis("off")
-        errors = []
         for column, (name, picture) in enumerate(pictures.items(), start=1):
             _show(grid[0, column], picture, f"{name}  {psnr_of(picture, photo):.2f} dB")
-            error = error_map(picture, photo)
-            errors.append(_show_error(grid[1, column], error, name))
-        _add_scale(figure, grid[1, 0], errors[0])
+            below = grid[0, 2] if single else grid[1, column]
+            error = _show_error(below, error_map(picture, photo), name)
+        if single:
+            _add_scale(figure.colorbar(error, ax=grid[0, 2], extend="max", fraction=0.05, pad=0.02))
+        else:
+            grid[1, 0].axis("off")
+            inset = grid[1, 0].inset_axes((0.08, 0.52, 0.84, 0.09))
+            bar = figure.colorbar(error, cax=inset, orientation="horizontal", extend="max")
+            _add_scale(bar, "\n(mean of R, G, B; share of full scale)")
         # No less than a dot per pixel, so that nothing that is shown is lost.
-        dpi = min(max(200.0, 1.1 * width / COLUMN_INCHES), 400.0)
-        figure.savefig(path, dpi=dpi)
+        figure.savefig(path, dpi=min(max(200.0, 1.1 * width / COLUMN_INCHES), 400.0))
 
 
 def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
@@ -84,7 +98,7 @@ def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
     return paths
 
 
-def _show(axes: Axes, picture: NDArray, title: str):
+def _show(axes: Axes, picture: NDArray, title: str) -> AxesImage:
     axes.set_title(title)
     axes.set_xticks([])
     axes.set_yticks([])
@@ -92,17 +106,14 @@ def _show(axes: Axes, picture: NDArray, title: str):
     return axes.imshow(picture, interpolation="nearest")
 
 
-def _show_error(axes: Axes, error: NDArray[np.float32], name: str):
+def _show_error(axes: Axes, error: NDArray[np.float32], name: str) -> AxesImage:
     image = _show(axes, error, f"error of {name}, mean {100 * float(error.mean()):.1f}%")
     image.set_cmap(ERROR_COLORS)
     image.set_clim(0, 1 / ERROR_GAIN)
     return image
 
 
-def _add_scale(figure: Figure, axes: Axes, image) -> None:
-    """The error's colour scale, below the photo."""
-    inset = axes.inset_axes((0.08, 0.52, 0.84, 0.09))
-    bar = figure.colorbar(image, cax=inset, orientation="horizontal", extend="max")
+def _add_scale(bar: Colorbar, more: str = "") -> None:
     ticks = np.linspace(0, 1 / ERROR_GAIN, 6)
     bar.set_ticks(ticks, labels=[f"{100 * tick:g}%" for tick in ticks])
-    bar.set_label(f"|picture - photo| x {ERROR_GAIN}\n(mean of R, G, B; share of full scale)")
+    bar.set_label(f"|picture - photo| x {ERROR_GAIN}{more}")

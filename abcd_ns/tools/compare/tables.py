@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich import box
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from abcd_ns.tools.compare.results import Results, Run
@@ -26,8 +27,11 @@ class Measure:
     digits: int
 
 
-def _gib(get: Value) -> Value:
-    return lambda run: None if (size := get(run)) is None else size / 2**30
+def _in(unit: int, get: Value) -> Value:
+    return lambda run: None if (size := get(run)) is None else size / unit
+
+
+MIB, GIB = 2**20, 2**30
 
 
 MEASURES = (
@@ -43,10 +47,10 @@ MEASURES = (
     Measure("training (s)", lambda run: run.train_seconds, 1),
     Measure("of it, layers (s)", lambda run: run.layer_seconds, 1),
     Measure("whole process (s)", lambda run: run.total_seconds, 1),
-    Measure("peak GPU memory (GiB)", _gib(lambda run: run.peak_device_bytes), 2),
-    Measure("peak RAM (GiB)", _gib(lambda run: run.peak_rss_bytes), 2),
-    Measure("blocks on disk (GiB)", _gib(lambda run: run.store_bytes), 2),
-    Measure("layers on disk (GiB)", _gib(lambda run: run.cache_bytes), 2),
+    Measure("peak GPU memory (GiB)", _in(GIB, lambda run: run.peak_device_bytes), 2),
+    Measure("peak RAM (GiB)", _in(GIB, lambda run: run.peak_rss_bytes), 2),
+    Measure("blocks on disk (MiB)", _in(MIB, lambda run: run.store_bytes), 1),
+    Measure("layers on disk (MiB)", _in(MIB, lambda run: run.cache_bytes), 1),
 )
 
 
@@ -73,10 +77,10 @@ def notes(results: Results) -> list[str]:
     """What a reader of the table has to know, a sentence each."""
     p, machine = results.protocol, results.machine
     budget = f"{p.steps:,} steps" if p.seconds is None else f"{p.seconds:g} s of training"
-    seeds = ", ".join(map(str, p.seeds))
+    seeds = ("seed " if len(p.seeds) == 1 else "seeds ") + ", ".join(map(str, p.seeds))
     growth = "the number of Gaussians fixed" if not p.densify else ""
     limit = f"at most {p.max_gaussians:,} Gaussians" if p.max_gaussians else ""
-    conditions = ", ".join(filter(None, [f"{budget} a run", f"seed {seeds}", growth, limit]))
+    conditions = ", ".join(filter(None, [f"{budget} a run", seeds, growth, limit]))
     found = [
         f"Scene {p.scene} at 1/{p.downscale} of its size; held out: {p.held_out}; {conditions}.",
         f"{machine.cpu}, {machine.cores} cores, {machine.torch_threads} torch threads, "
@@ -112,6 +116,11 @@ def print_table(results: Results, console: Console) -> None:
         table.add_column(title, justify="right" if i else "left", no_wrap=True)
     for row in body:
         table.add_row(*row)
+    width = console.width
+    # Wider than a narrow terminal rather than with numbers cut off.
+    needed = Measurement.get(console, console.options.update(width=1000), table).maximum
+    console.width = max(width, needed)
     console.print(table)
+    console.width = width
     for note in notes(results):
         console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)

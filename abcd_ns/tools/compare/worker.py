@@ -22,13 +22,13 @@ from abcd_ns.plugin.pipeline import CACHE, STORE
 from abcd_ns.tools.compare.configs import trainer_config
 from abcd_ns.tools.compare.evaluate import (
     draw_held_out,
-    evenly,
     mean,
     ordering_gap,
     score,
     squared_gap,
 )
 from abcd_ns.tools.compare.machine import describe_versions, disk_bytes, peak_rss_bytes
+from abcd_ns.tools.compare.pictures import evenly
 from abcd_ns.tools.compare.protocol import Job
 from abcd_ns.tools.compare.records import decode, encode, read_json, write_json
 from abcd_ns.tools.compare.results import CurvePoint, Run, ViewScore
@@ -55,20 +55,12 @@ def run(job: Job, folder: Path) -> Run:
     config.save_config()
     trainer.setup()
     training = Training(trainer, job.settings)
-    warm_up(training)
+    training.warm_up()
     trainer.train()
     total = time.time() - psutil.Process().create_time() - training.recorder.seconds
     memory = _memory()
     scores, gaps = score_held_out(training, job, folder / "pictures")
     return _record(job, training, total, scores, gaps, folder, memory)
-
-
-def warm_up(training: Training) -> None:
-    """Compile the torch rasterizer's kernels, so that no method's clock runs meanwhile."""
-    if training.coordinator is not None:
-        prepare = getattr(training.pipeline.model.draws_with(), "warm_up", None)
-        if prepare is not None:
-            prepare()
 
 
 def seed_everything(seed: int) -> None:
@@ -131,7 +123,7 @@ def _record(
         train_seconds=end.seconds,
         total_seconds=total,
         **means,
-        lpips_reason=lpips_missing(),
+        lpips_reason=_without_home(lpips_missing()),
         ordering_gap_db=gap,
         ordering_gap_note=note,
         gaussians=training.gaussians,
@@ -143,6 +135,11 @@ def _record(
         views=tuple(scores),
         versions=describe_versions(),
     )
+
+
+def _without_home(text: str | None) -> str | None:
+    """Results are published: whose home folder it was is nobody's business."""
+    return text and text.replace(str(Path.home()), "~")
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,0 +1,63 @@
+"""Small scenes and helpers that the rasterizer tests share."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
+
+
+def random_gaussians(n: int, seed: int = 0, sh_degree: int = 3, dtype: torch.dtype = torch.float64) -> Gaussians:
+    """Overlapping Gaussians in front of `small_view`, some beside the image, some dense enough to stop rays."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    means = normal(n, 3) * torch.tensor([1.5, 1.0, 1.0]) + torch.tensor([0.0, 0.0, 4.0])
+    rest = 0.3 * normal(n, (sh_degree + 1) ** 2 - 1, 3)
+    gaussians = Gaussians(means, 0.7 * normal(n, 3) - 1.6, normal(n, 4), normal(n, 3), rest, 2 * normal(n, 1) + 1)
+    return gaussians.to(dtype)
+
+
+def small_view(width: int = 37, height: int = 21, dtype: torch.dtype = torch.float64) -> View:
+    """A slightly turned camera; the image is no multiple of a tile, the principal point off its centre."""
+    angle = torch.tensor(0.1, dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 0] = viewmat[2, 2] = angle.cos()
+    viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
+    viewmat[:3, 3] = torch.tensor([-0.3, 0.1, 0.2])
+    K = torch.tensor([[0.8 * width, 0, width / 2 + 1], [0, 1.3 * height, height / 2 - 1], [0, 0, 1]])
+    return View(viewmat, K, width, height).to(dtype)
+
+
+def as_leaves(gaussians: Gaussians) -> Gaussians:
+    """Copies that take gradients."""
+    return Gaussians(**{name: value.detach().clone().requires_grad_() for name, value in gaussians.items()})
+
+
+def probe(height: int, width: int, seed: int = 5, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Random weights [h, w, 5] for colour, transmittance and depth."""
+    return torch.randn(height, width, 5, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+def stacked(raster) -> Tensor:
+    """All outputs as one image [h, w, 5]."""
+    return torch.cat((raster.color, raster.transmittance[..., None], raster.depth[..., None]), dim=-1)
+
+
+def gradients(draw: Callable[[Gaussians], object], gaussians: Gaussians) -> tuple[Tensor, dict[str, Tensor]]:
+    """(stacked image, gradients by name) of a random weighting of all outputs of `draw`."""
+    leaves = as_leaves(gaussians)
+    image = stacked(draw(leaves))
+    (image * probe(*image.shape[:2], dtype=image.dtype)).sum().backward()
+    grads = {name: getattr(leaves, name).grad for name in PARAM_NAMES}
+    return image.detach(), {n: torch.zeros_like(getattr(leaves, n)) if g is None else g for n, g in grads.items()}
+
+
+def relative_error(value: Tensor, reference: Tensor) -> float:
+    """The largest difference, as a share of the largest reference value."""
+    if reference.numel() == 0:
+        return 0.0
+    return float((value - reference).abs().max() / reference.abs().max().clamp_min(1e-300))

@@ -1,0 +1,128 @@
+"""The gsplat backend's own logic (crops, frozen Gaussians, absgrad), with CPU stand-ins for the CUDA ops.
+
+The stand-ins are gsplat's torch twins where they exist, and a plain loop for compositing; the real kernels
+are compared under tests/gpu.
+"""
+
+import math
+
+import pytest
+import torch
+from gsplat.cuda import _torch_impl
+
+from abcd_ns.engine.rasterizer import TorchRasterizer, ZWindow, gsplat_backend, self_check
+from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
+from tests.engine.rasterizer_scenes import as_leaves, gradients, probe, random_gaussians, relative_error, small_view, stacked
+
+VIEW = small_view(70, 45)
+
+
+def fake_projection(means, covars, quats, scales, viewmats, Ks, width, height, packed, calc_compensations):
+    assert covars is None
+    assert not packed
+    covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    return _torch_impl._fully_fused_projection(
+        means, covars, viewmats, Ks, width, height, calc_compensations=calc_compensations
+    )
+
+
+def fake_harmonics(degree, dirs, coeffs, masks):
+    return torch.where(masks[..., None], _torch_impl._spherical_harmonics(degree, dirs, coeffs), 0.0)
+
+
+def fake_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
+    return _torch_impl._isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height)
+
+
+def fake_compositing(means2d, conics, colors, opacities, width, height, tile_size, offsets, flatten_ids, absgrad):
+    """Tile by tile from the lists, as the CUDA kernel; its `absgrad` is only |grad|, enough to see it arrive."""
+    if absgrad:
+        means2d.register_hook(lambda grad: setattr(means2d, "absgrad", grad.abs()))
+    bounds = [*offsets.flatten().tolist(), flatten_ids.numel()]
+    rows = []
+    for row in range(offsets.shape[1]):
+        tiles = []
+        for col in range(offsets.shape[2]):
+            index = row * offsets.shape[2] + col
+            ids = flatten_ids[bounds[index] : bounds[index + 1]]
+            tiles.append(fake_tile(means2d, conics, colors, opacities, ids, col * tile_size, row * tile_size, tile_size))
+        rows.append(torch.cat(tiles, dim=1))
+    image = torch.cat(rows, dim=0)[None, :height, :width]
+    return image[..., :-1], 1 - image[..., -1:]
+
+
+def fake_tile(means2d, conics, colors, opacities, ids, x, y, size):
+    centers = torch.stack(torch.meshgrid(torch.arange(size), torch.arange(size), indexing="xy"), dim=-1) + 0.5
+    color, T, live = means2d.new_zeros((size, size, 4)), means2d.new_ones((size, size)), torch.ones(size, size).bool()
+    for i in ids.tolist():
+        dx, dy = (means2d[0, i] - torch.tensor([x, y]) - centers).unbind(-1)
+        a, b, c = conics[0, i]
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        alpha = (opacities[0, i] * torch.exp(-sigma)).clamp_max(0.999)
+        alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0.0)
+        live = live & ~((T * (1 - alpha) <= 1e-4) & (alpha > 0))
+        alpha = torch.where(live, alpha, 0.0)
+        color, T = color + (alpha * T)[..., None] * colors[0, i], T * (1 - alpha)
+    return torch.cat((color, T[..., None]), dim=-1)
+
+
+@pytest.fixture()
+def backend(monkeypatch):
+    """A GsplatRasterizer on CPU stand-ins."""
+    monkeypatch.setattr(gsplat_backend, "fully_fused_projection", fake_projection)
+    monkeypatch.setattr(gsplat_backend, "spherical_harmonics", fake_harmonics)
+    monkeypatch.setattr(gsplat_backend, "isect_tiles", fake_tiles)
+    monkeypatch.setattr(gsplat_backend, "isect_offset_encode", _torch_impl._isect_offset_encode)
+    monkeypatch.setattr(gsplat_backend, "rasterize_to_pixels", fake_compositing)
+    return GsplatRasterizer()
+
+
+@pytest.mark.parametrize(
+    ("crop", "with_frozen", "antialiased", "sh_degree"),
+    [(None, False, True, 3), (Crop(16, 16, 40, 20), False, False, 0), (Crop(19, 5, 30, 31), True, False, 2)],
+)
+def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_degree):
+    gaussians, frozen = random_gaussians(40), random_gaussians(15, seed=3) if with_frozen else None
+    options = {"crop": crop, "frozen": frozen, "antialiased": antialiased, "sh_degree": sh_degree}
+    image, grads = gradients(lambda g: backend(g, VIEW, **options), gaussians)
+    expected, expected_grads = gradients(lambda g: TorchRasterizer("never")(g, VIEW, **options), gaussians)
+    torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
+    for name in PARAM_NAMES:
+        assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
+
+
+@pytest.mark.parametrize("crop", [None, Crop(19, 5, 30, 31)])
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen):
+    frozen = random_gaussians(15, seed=3) if with_frozen else None
+    raster = backend(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True)
+    expected = TorchRasterizer("never")(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen)
+    size = raster.transmittance.shape
+    for drawing in (raster, expected):
+        drawing.info["means2d"].retain_grad()
+        (stacked(drawing) * probe(*size)).sum().backward()
+    info = raster.info
+    assert torch.equal(info["radii"], expected.info["radii"])
+    assert relative_error(info["means2d"].grad, expected.info["means2d"].grad) < 1e-8
+    torch.testing.assert_close(info["means2d"].absgrad, info["means2d"].grad.abs())
+    assert (info["width"], info["height"]) == (VIEW.width, VIEW.height)
+
+
+def test_nothing_to_draw(backend):
+    raster = backend(as_leaves(Gaussians.empty(dtype=torch.float64)), VIEW, sh_degree=3, crop=Crop(3, 3, 5, 4))
+    raster.info["means2d"].retain_grad()
+    assert raster.color.shape == (4, 5, 3)
+    assert (raster.transmittance == 1).all()
+    assert raster.info["means2d"].shape == (1, 0, 2)
+
+
+def test_self_check_accepts_it(backend):
+    self_check(backend, "cpu")
+
+
+def test_a_z_window_is_refused(backend):
+    near = torch.zeros(VIEW.height, VIEW.width, dtype=torch.float64)
+    assert not backend.supports_z_window
+    with pytest.raises(ValueError, match="no z window"):
+        backend(random_gaussians(3), VIEW, sh_degree=0, z_window=ZWindow(near, near + math.inf))

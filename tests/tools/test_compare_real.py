@@ -1,0 +1,162 @@
+"""One comparison that really trains, on a scene of a few dozen pixels."""
+
+import json
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+
+from abcd_ns.engine.rasterizer import TorchRasterizer
+from abcd_ns.tools.compare.command import carry_out
+from abcd_ns.tools.compare.protocol import Options, make_plan
+from abcd_ns.tools.compare.results import read_results
+from abcd_ns.tools.compare.warm_up import warm_up
+
+WIDTH, HEIGHT, VIEWS, STEPS = 48, 32, 10, 20
+HELD_OUT = 2
+"""Rows 0 and 8 of ten."""
+
+
+def write_scene(folder: Path) -> None:
+    """Coloured points on a wall, and photos of a wall in two colours, by cameras that move along it."""
+    rng = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[40.0, 40.0, WIDTH / 2, HEIGHT / 2]
+    )
+    model.add_camera_with_trivial_rig(camera)
+    (folder / "images").mkdir(parents=True)
+    for i in range(VIEWS):
+        name, shift = f"{i:02d}.png", 0.2 * i - 1
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-shift, 0.0, 4.0]))
+        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=i + 1), pose)
+        x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / 40 * 4 + shift
+        row = np.where((x > 0)[:, None], (200, 60, 40), (40, 80, 200)).astype(np.uint8)
+        Image.fromarray(np.tile(row, (HEIGHT, 1, 1))).save(folder / "images" / name)
+    for xyz in rng.uniform((-3, -2, -0.05), (3, 2, 0.05), (300, 3)):
+        color = np.array((200, 60, 40) if xyz[0] > 0 else (40, 80, 200), np.uint8)
+        model.add_point3D(xyz, pycolmap.Track(), color)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(str(folder / "sparse" / "0"))
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """(results, output folder, plan, what was printed) of two methods, each really trained in a process."""
+    folder = tmp_path_factory.mktemp("compare")
+    write_scene(folder / "scene")
+    options = Options(
+        data=str(folder / "scene"),
+        out=str(folder / "out"),
+        methods=("abcd-monolithic", "abcd"),
+        steps=STEPS,
+        blocks=2,
+        evals=3,
+        pictures=1,
+    )
+    plan, stream = make_plan(options), StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCHDYNAMO_DISABLE", "1")  # compiling takes longer than everything else here
+        code = carry_out(plan, Console(file=stream, width=100))
+    assert code == 0, stream.getvalue()
+    return read_results(plan.out / "results.json"), plan, stream.getvalue()
+
+
+@pytest.mark.cli
+def test_runs_report_what_was_asked_for(compared):
+    results, _, printed = compared
+    assert [run.method for run in results.runs] == ["abcd-monolithic", "abcd"]
+    for run in results.runs:
+        assert run.steps == STEPS
+        assert len(run.views) == HELD_OUT
+        assert [view.name for view in run.views] == ["00.png", "08.png"]
+        assert run.psnr == pytest.approx(sum(view.psnr for view in run.views) / HELD_OUT)
+        assert run.psnr > 12
+        assert run.gaussians > 0
+        assert 0 < run.train_seconds < run.total_seconds
+        assert run.peak_rss_bytes > 100 << 20
+        assert run.store_bytes > 0
+        assert run.method in printed
+
+
+@pytest.mark.cli
+def test_curves_rise_in_time_to_the_final_score(compared):
+    results, plan, _ = compared
+    for run in results.runs:
+        seconds, steps = ([getattr(p, name) for p in run.curve] for name in ("seconds", "steps"))
+        assert len(run.curve) == plan.settings.evals
+        assert seconds == sorted(seconds)
+        assert steps == sorted(set(steps))
+        assert run.curve[-1].psnr == run.psnr_merged
+        assert (seconds[-1], steps[-1]) == (run.train_seconds, STEPS)
+        for share, point in zip(plan.settings.moments, run.curve, strict=True):
+            assert point.steps == int(np.ceil(share * STEPS))
+
+
+@pytest.mark.cli
+def test_blocks_and_layers_are_accounted_for(compared):
+    single, blocks = compared[0].runs
+    assert (single.blocks, blocks.blocks) == (1, 2)
+    assert single.ordering_gap_db is None
+    assert single.ordering_gap_note
+    assert single.layer_seconds < blocks.layer_seconds < blocks.train_seconds
+    assert single.psnr == pytest.approx(single.psnr_merged, abs=1e-4)
+    assert blocks.cache_bytes > 0
+    # By fragments, composited is merged to rounding.
+    assert blocks.ordering_gap_db is None or blocks.ordering_gap_db > 80
+    assert blocks.psnr == pytest.approx(blocks.psnr_merged, abs=1e-2)
+
+
+@pytest.mark.cli
+def test_reports_are_there_and_a_second_call_trains_nothing(compared):
+    results, plan, _ = compared
+    pictures = [path.name for path in (plan.out / "pictures").iterdir()]
+    assert pictures == ["view-0001.png"]
+    for name in ("table.md", "speed_accuracy.png", "speed_accuracy.svg"):
+        assert (plan.out / name).stat().st_size > 0
+    stream = StringIO()
+    assert carry_out(plan, Console(file=stream, width=100)) == 0
+    assert stream.getvalue().count("reused") == 2
+    assert read_results(plan.out / "results.json").runs == results.runs
+
+
+@pytest.mark.cli
+def test_nothing_in_the_results_names_a_folder_of_this_machine(compared):
+    _, plan, _ = compared
+    text = (plan.out / "results.json").read_text()
+    assert json.loads(text)["protocol"]["scene"] == "scene"
+    assert str(plan.out.parent) not in text
+    assert f"{Path.home()}/" not in text
+
+
+@pytest.mark.parametrize("windows", [False, True])
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_warm_up_compiles_the_kernels_that_training_will_use(monkeypatch, absgrad, windows):
+    used = set()
+    rasterizer = TorchRasterizer()
+
+    def note(kernel, *args):
+        assert rasterizer.kernels.policy == "always"
+        if kernel.__name__ == "forward_chunk":
+            used.add(("forward", args[3] is not None))
+        else:
+            used.add(("backward", args[4] is not None, args[6]))
+        return kernel(*args)
+
+    monkeypatch.setattr(rasterizer.kernels, "_run", note)
+    monkeypatch.setattr("abcd_ns.tools.compare.warm_up.has_cpp_compiler", lambda: True)
+    warm_up(rasterizer, torch.device("cpu"), absgrad=absgrad, windows=windows)
+    shapes = (False, True) if windows else (False,)
+    assert used == {("forward", w) for w in shapes} | {("backward", w, absgrad) for w in shapes}
+
+
+def test_nothing_is_warmed_up_where_nothing_is_compiled(monkeypatch):
+    rasterizer = TorchRasterizer()
+    monkeypatch.setattr("abcd_ns.tools.compare.warm_up.has_cpp_compiler", lambda: False)
+    warm_up(rasterizer, torch.device("cpu"), absgrad=True, windows=True)
+    assert rasterizer.kernels.policy == "auto"
