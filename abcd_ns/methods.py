@@ -4,7 +4,7 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from abcd_ns.engine.coordinator import TrainingConfig
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig
 
 LEARNING_RATES = {

@@ -24,11 +24,22 @@ from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, has_cpp_compil
 from abcd_ns.engine.rasterizer.projection import project
 from abcd_ns.engine.rasterizer.spherical_harmonics import sh_colors
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
-from abcd_ns.engine.rasterizer.torch_kernels import BLUE, CONIC_XX, CONIC_XY, CONIC_YY, DEPTH, OPACITY, RED, X, Y
+from abcd_ns.engine.rasterizer.torch_kernels import (
+    BLUE,
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    DEPTH,
+    OPACITY,
+    RED,
+    X,
+    Y,
+)
 from abcd_ns.engine.types import Gaussians, View
 
 SIZES = ((160, 106), (320, 213))
 TILES = 1080
+"""As many 4 x 4 px tiles as 160 x 106 pixels have. A power of two would make every plane fall on the same cache lines."""
 
 
 @dataclass
@@ -45,6 +56,8 @@ class Args:
     """Pixels along a tile's side."""
     chunk: int = backend.CHUNK
     """Gaussians per kernel call and tile."""
+    threads: int = 0
+    """CPU threads; 0 leaves torch's choice. On a busy machine, 1 disturbs the figures least."""
 
 
 def synthetic_scene(n: int, seed: int) -> Gaussians:
@@ -85,7 +98,11 @@ def cumprod_chunk(params: Tensor, origins: Tensor, state: Tensor, side: int) -> 
     pixel = torch.arange(side * side)
     dx = (params[X] - origins[0])[:, None] - (pixel % side + 0.5)[:, None]
     dy = (params[Y] - origins[1])[:, None] - (pixel // side + 0.5)[:, None]
-    half_xx, xy, half_yy = 0.5 * params[CONIC_XX, :, None], params[CONIC_XY, :, None], 0.5 * params[CONIC_YY, :, None]
+    half_xx, xy, half_yy = (
+        0.5 * params[CONIC_XX, :, None],
+        params[CONIC_XY, :, None],
+        0.5 * params[CONIC_YY, :, None],
+    )
     sigma = half_xx * dx * dx + half_yy * dy * dy + xy * dx * dy
     alpha = (params[OPACITY, :, None] * torch.exp(-sigma)).clamp_max(0.999)
     alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0.0)
@@ -113,7 +130,9 @@ def kernel_inputs(args: Args) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def measure_kernels(args: Args) -> None:
     params, origins, state, upstream = kernel_inputs(args)
     leaf, side = params.clone().requires_grad_(), args.tile_side
-    forward: dict[str, Callable[[], object]] = {"eager cumprod": lambda: cumprod_chunk(params, origins, state, side)}
+    forward: dict[str, Callable[[], object]] = {
+        "eager cumprod": lambda: cumprod_chunk(params, origins, state, side)
+    }
 
     def cumprod_both() -> None:
         (cumprod_chunk(leaf, origins, state, side) * upstream).sum().backward()
@@ -136,7 +155,9 @@ def measure_kernels(args: Args) -> None:
     with torch.no_grad():
         forward_ms = take_turns(forward, args.rounds)
     both_ms = take_turns(both, args.rounds)
-    print(f"\n## Kernels: {TILES} tiles of {side}x{side} pixels, chunks of {args.chunk}, ns per pixel-Gaussian pair\n")
+    print(
+        f"\n## Kernels: {TILES} tiles of {side}x{side} pixels, chunks of {args.chunk}, ns per pixel-Gaussian pair\n"
+    )
     print("| form | forward | forward + backward |\n| --- | --- | --- |")
     for name in forward:
         print(f"| {name} | {1e6 * forward_ms[name] / pairs:.2f} | {1e6 * both_ms[name] / pairs:.2f} |")
@@ -146,7 +167,9 @@ def as_leaves(gaussians: Gaussians) -> Gaussians:
     return Gaussians(**{name: value.clone().requires_grad_() for name, value in gaussians.items()})
 
 
-def step_sides(rasterizer: TorchRasterizer, gaussians: Gaussians, view: View) -> dict[str, Callable[[], object]]:
+def step_sides(
+    rasterizer: TorchRasterizer, gaussians: Gaussians, view: View
+) -> dict[str, Callable[[], object]]:
     leaves = as_leaves(gaussians)
 
     def forward() -> None:
@@ -194,7 +217,9 @@ def measure_steps(args: Args, width: int, height: int) -> None:
     print(f"\n## Steps: {width}x{height}, {args.gaussians} Gaussians, ms\n")
     visible = splats.radii > 0
     radius = float(splats.radii[visible].float().median())
-    print(f"{int(visible.sum())} visible, median radius {radius:.0f} px, {lists.fragments / 1e6:.2f} M pairs in lists\n")
+    print(
+        f"{int(visible.sum())} visible, median radius {radius:.0f} px, {lists.fragments / 1e6:.2f} M pairs in lists\n"
+    )
     print("| part | ms |\n| --- | --- |")
     for name, ms in take_turns(sides, args.rounds).items():
         print(f"| {name} | {ms:.1f} |")
@@ -202,8 +227,12 @@ def measure_steps(args: Args, width: int, height: int) -> None:
 
 def main(args: Args) -> None:
     """Print all tables as Markdown."""
+    if args.threads > 0:
+        torch.set_num_threads(args.threads)
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads, {platform.machine()}, seed {args.seed}")
+    print(
+        f"torch {torch.__version__}, {torch.get_num_threads()} threads, {platform.machine()}, seed {args.seed}"
+    )
     print(f"load average at the start: {load:.1f}")
     measure_kernels(args)
     for width, height in SIZES:

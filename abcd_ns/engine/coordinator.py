@@ -6,8 +6,8 @@ everything else at rest in the store, and tells its listeners what happens.
 """
 
 import random
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,8 @@ from torch import Tensor
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.compositing import sandwich
-from abcd_ns.engine.density import DensityClock, DensityConfig, DensityControl
+from abcd_ns.engine.config import TrainingConfig, resolve_ownership
+from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, Parts
@@ -35,43 +36,6 @@ from abcd_ns.engine.schedule import (
 from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
-
-
-@dataclass
-class TrainingConfig:
-    """How a scene is trained, whatever calls the engine."""
-
-    layers: bool = True
-    """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
-    ownership: Literal["auto", "fragments", "means"] = "auto"
-    """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
-    paper). `auto` takes fragments where the rasterizer can mask by depth."""
-    window_percentile: float = 0.9
-    """Share of the active Gaussians' extents that the window of sorted-in fragments must hold."""
-    first_passes: int = 1
-    """Uses of each view in a visit of the first sweep."""
-    last_passes: int = 4
-    """Uses of each view in a visit of late sweeps."""
-    pass_gaussians: int = 0
-    """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
-    sh_degree: int = 3
-    """Highest degree of spherical harmonics."""
-    sh_ramp: float = 0.1
-    """Share of the run over which the degree rises from 0 to the highest."""
-    ssim_lambda: float = 0.2
-    """Weight of 1 - SSIM in the loss; the rest is L1."""
-    antialiased: bool = False
-    """Scale opacities by gsplat's compensation for its low-pass filter."""
-    background: Literal["random", "black", "white"] = "random"
-    """What lies behind the scene while training."""
-    means_lr: float = 1.6e-4
-    """Learning rate of the means at the start."""
-    means_lr_final: float = 1.6e-6
-    """Learning rate of the means at the end; exponential between the two over the run."""
-    seed: int = 0
-    """Of the order of blocks and views, backgrounds and splits."""
-    density: DensityConfig = field(default_factory=DensityConfig)
-    """Growing and pruning."""
 
 
 @dataclass(frozen=True)
@@ -393,15 +357,6 @@ class Coordinator:
             )
             return torch.rand(3, generator=generator).to(self.device)
         return torch.full((3,), float(self.config.background == "white"), device=self.device)
-
-
-def resolve_ownership(
-    wanted: Literal["auto", "fragments", "means"], rasterizer: Rasterizer
-) -> Literal["fragments", "means"]:
-    """What `auto` means for a rasterizer."""
-    if wanted == "auto":
-        return "fragments" if rasterizer.supports_z_window else "means"
-    return wanted
 
 
 def blocks_at_rest(

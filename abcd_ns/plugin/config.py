@@ -10,8 +10,9 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
-from abcd_ns.engine.coordinator import TrainingConfig
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
@@ -121,5 +122,5 @@ class AbcdTrainerConfig(TrainerConfig):
                 parser = dataclasses.replace(parser, data=self.pipeline.datamanager.data)
             parser.setup().check()
         except UserError as error:
-            CONSOLE.print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
+            CONSOLE.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
             raise SystemExit(2) from None

@@ -36,6 +36,18 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         """The class of both datasets."""
         return AbcdDataset
 
+    def create_train_dataset(self) -> AbcdDataset:
+        """The training photos, under their share of RAM."""
+        return AbcdDataset(self.train_dataparser_outputs, budget_bytes=self._photo_budget())
+
+    def create_eval_dataset(self) -> AbcdDataset:
+        """The held-out photos; looked at one after the other, so hardly any need to be kept."""
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        return AbcdDataset(outputs, budget_bytes=self._photo_budget())
+
+    def _photo_budget(self) -> int | None:
+        return int(self.config.photo_cache_gb * 2**30) or None
+
     def follow(self, coordinator: Coordinator) -> None:
         """Serve what this coordinator asks for from now on."""
         self._coordinator = coordinator

@@ -18,15 +18,15 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from abcd_ns.plugin.colmap_model import MODEL_FOLDERS, find_model, read_colmap
+from abcd_ns.plugin.data.colmap_model import MODEL_FOLDERS, find_model, read_colmap
 from abcd_ns.plugin.data.normalize import Center, Orientation, Similarity, normalizing_similarity
 from abcd_ns.plugin.data.photo_folders import PhotoFile, assume_photos, locate_photos
+from abcd_ns.plugin.data.photos import PhotoSource
 from abcd_ns.plugin.data.picture_files import check_regular
 from abcd_ns.plugin.data.scene import Frame, Lens, Scene, check_layout
+from abcd_ns.plugin.data.transforms_json import read_transforms
 from abcd_ns.plugin.data.undistort import Undistortion, undistortion
 from abcd_ns.plugin.input_errors import InputError, Problems, one_line
-from abcd_ns.plugin.photos import PhotoSource
-from abcd_ns.plugin.transforms_json import read_transforms
 
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 

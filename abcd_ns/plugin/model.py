@@ -11,12 +11,14 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from abcd_ns.engine.blocks import BlockTree, build_kd
-from abcd_ns.engine.coordinator import Coordinator, Sample, resolve_ownership
+from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.config import resolve_ownership
+from abcd_ns.engine.coordinator import Coordinator, Sample
 from abcd_ns.engine.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.loss import photometric_loss, psnr, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings
 from abcd_ns.engine.param_swap import live_gaussians
+from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.scene import BlockScene, MemoryScene
 from abcd_ns.engine.types import Gaussians, Layer, View

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
-from abcd_ns.engine.blocks import BlockTree, build_grid, build_kd
+from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.coordinator import Coordinator, blocks_at_rest
+from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore, view_fingerprint

@@ -8,7 +8,9 @@ from torch import Tensor
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 
 
-def random_gaussians(n: int, seed: int = 0, sh_degree: int = 3, dtype: torch.dtype = torch.float64) -> Gaussians:
+def random_gaussians(
+    n: int, seed: int = 0, sh_degree: int = 3, dtype: torch.dtype = torch.float64
+) -> Gaussians:
     """Overlapping Gaussians in front of `small_view`, some beside the image, some dense enough to stop rays."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -17,7 +19,9 @@ def random_gaussians(n: int, seed: int = 0, sh_degree: int = 3, dtype: torch.dty
 
     means = normal(n, 3) * torch.tensor([1.5, 1.0, 1.0]) + torch.tensor([0.0, 0.0, 4.0])
     rest = 0.3 * normal(n, (sh_degree + 1) ** 2 - 1, 3)
-    gaussians = Gaussians(means, 0.7 * normal(n, 3) - 1.6, normal(n, 4), normal(n, 3), rest, 2 * normal(n, 1) + 1)
+    gaussians = Gaussians(
+        means, 0.7 * normal(n, 3) - 1.6, normal(n, 4), normal(n, 3), rest, 2 * normal(n, 1) + 1
+    )
     return gaussians.to(dtype)
 
 
@@ -39,7 +43,9 @@ def as_leaves(gaussians: Gaussians) -> Gaussians:
 
 def probe(height: int, width: int, seed: int = 5, dtype: torch.dtype = torch.float64) -> Tensor:
     """Random weights [h, w, 5] for colour, transmittance and depth."""
-    return torch.randn(height, width, 5, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    return torch.randn(
+        height, width, 5, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    ).to(dtype)
 
 
 def stacked(raster) -> Tensor:
@@ -53,7 +59,9 @@ def gradients(draw: Callable[[Gaussians], object], gaussians: Gaussians) -> tupl
     image = stacked(draw(leaves))
     (image * probe(*image.shape[:2], dtype=image.dtype)).sum().backward()
     grads = {name: getattr(leaves, name).grad for name in PARAM_NAMES}
-    return image.detach(), {n: torch.zeros_like(getattr(leaves, n)) if g is None else g for n, g in grads.items()}
+    return image.detach(), {
+        n: torch.zeros_like(getattr(leaves, n)) if g is None else g for n, g in grads.items()
+    }
 
 
 def relative_error(value: Tensor, reference: Tensor) -> float:

@@ -10,7 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.blocks import MAX_CELLS, BlockTree, Box, best_split, build_grid, build_kd
+from abcd_ns.engine.blocks import BlockTree, Box
+from abcd_ns.engine.partition import MAX_CELLS, best_split, build_grid, build_kd
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -7,7 +7,7 @@ import torch
 
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
-from abcd_ns.engine.coordinator import resolve_ownership
+from abcd_ns.engine.config import resolve_ownership
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.ordering import front_to_back

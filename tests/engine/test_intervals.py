@@ -8,9 +8,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.blocks import BlockTree, Box, build_grid
+from abcd_ns.engine.blocks import BlockTree, Box
 from abcd_ns.engine.intervals import cell_windows, front_and_behind, ray_directions, ray_interval
 from abcd_ns.engine.ordering import front_to_back
+from abcd_ns.engine.partition import build_grid
 from abcd_ns.engine.types import Crop, View
 from tests.engine.test_blocks import SEEDS, lattice_points, random_tree
 

@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.blocks import BlockTree, build_grid
+from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.ordering import front_to_back, node_children_in_order, siblings_around, split_around
+from abcd_ns.engine.partition import build_grid
 from tests.engine.test_blocks import SEEDS, lattice_points, random_tree
 
 

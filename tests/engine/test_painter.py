@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
-from abcd_ns.engine.blocks import BlockTree, build_grid, build_kd
+from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.scene import MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View

@@ -159,10 +159,14 @@ def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 def test_fold_of_complementary_windows_is_the_whole_drawing(dtype, tolerance):
     gaussians, view = random_gaussians(60, dtype=dtype), small_view(dtype=dtype)
-    faint = Gaussians(**{n: v for n, v in gaussians.items() if n != "opacities"}, opacities=gaussians.opacities - 3)
+    faint = Gaussians(
+        **{n: v for n, v in gaussians.items() if n != "opacities"}, opacities=gaussians.opacities - 3
+    )
     whole = EAGER(faint, view, sh_degree=3)
     assert whole.transmittance.min() > 1e-4  # no ray stops early: a layer of its own would not know
-    cuts = torch.rand(3, view.height, view.width, generator=torch.Generator().manual_seed(0)).to(dtype) * 4 + 2
+    cuts = (
+        torch.rand(3, view.height, view.width, generator=torch.Generator().manual_seed(0)).to(dtype) * 4 + 2
+    )
     edge = torch.full_like(cuts[:1], math.inf)
     bounds = torch.cat((-edge, cuts.sort(dim=0).values, edge))
     color, transmittance = torch.zeros_like(whole.color), torch.ones_like(whole.transmittance)
@@ -183,14 +187,22 @@ def test_window_work_is_in_proportion_to_its_fragments():
     window = ZWindow(near, torch.full_like(near, cut))
     nothing_left = ZWindow(-near, near)
     windowed = torch.ones(300, dtype=torch.bool)
-    assert bin_splats(splats, grid, 16, windowed=windowed, window=window).slots.numel() < 0.35 * everything.slots.numel()
+    assert (
+        bin_splats(splats, grid, 16, windowed=windowed, window=window).slots.numel()
+        < 0.35 * everything.slots.numel()
+    )
     assert bin_splats(splats, grid, 16, windowed=windowed, window=nothing_left).slots.numel() == 0
-    assert bin_splats(splats, grid, 16, windowed=~windowed, window=nothing_left).slots.numel() == everything.slots.numel()
+    assert (
+        bin_splats(splats, grid, 16, windowed=~windowed, window=nothing_left).slots.numel()
+        == everything.slots.numel()
+    )
 
 
 def test_lists_hold_every_fragment_and_few_others():
     gaussians = random_gaussians(60)
-    faint = Gaussians(**{n: v for n, v in gaussians.items() if n != "opacities"}, opacities=gaussians.opacities - 4)
+    faint = Gaussians(
+        **{n: v for n, v in gaussians.items() if n != "opacities"}, opacities=gaussians.opacities - 4
+    )
     drawn = naive_rasterize(faint, VIEW, sh_degree=0).fragments
     lists = bin_splats(project(faint, VIEW), TileGrid(VIEW.full, 1), 4)
     assert drawn <= lists.fragments <= 1.05 * drawn + 10  # with tiles of one pixel, lists are fragments
@@ -212,7 +224,9 @@ def test_what_cannot_be_seen_leaves_nothing_and_no_gradient_breaks():
     gaussians = random_gaussians(6)
     z = torch.tensor([-3.0, 0.0, 0.005, -1e-9, 2e10, 1e6], dtype=torch.float64)
     center, forward = VIEW.center, VIEW.viewmat[2, :3]
-    odd = Gaussians(means=center + z[:, None] * forward, **{n: v for n, v in gaussians.items() if n != "means"})
+    odd = Gaussians(
+        means=center + z[:, None] * forward, **{n: v for n, v in gaussians.items() if n != "means"}
+    )
     leaves = as_leaves(odd)
     raster = EAGER(leaves, VIEW, sh_degree=3, antialiased=True)
     stacked(raster).sum().backward()
@@ -226,7 +240,9 @@ def test_needle_and_giant_gaussians_have_finite_gradients_in_float32():
     gaussians = random_gaussians(8, dtype=torch.float32)
     scales = torch.tensor([[-12.0, -12, 3], [6, 6, 6], [-20, -20, -20], [3, -9, -9]]).repeat(2, 1)
     odd = Gaussians(scales=scales, **{n: v for n, v in gaussians.items() if n != "scales"})
-    image, grads = gradients(lambda g: EAGER(g, small_view(dtype=torch.float32), sh_degree=3, antialiased=True), odd)
+    image, grads = gradients(
+        lambda g: EAGER(g, small_view(dtype=torch.float32), sh_degree=3, antialiased=True), odd
+    )
     assert image.isfinite().all()
     assert all(grad.isfinite().all() for grad in grads.values())
 

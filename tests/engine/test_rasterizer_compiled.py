@@ -36,7 +36,9 @@ print("graphs", torch._dynamo.utils.counters["stats"]["unique_graphs"])
 """
 
 
-@pytest.mark.skipif(not has_cpp_compiler(), reason="torch.compile needs a C++ compiler, and none is on the PATH")
+@pytest.mark.skipif(
+    not has_cpp_compiler(), reason="torch.compile needs a C++ compiler, and none is on the PATH"
+)
 def test_compiled_equals_eager():
     environment = {**os.environ, "TORCHINDUCTOR_COMPILE_THREADS": "1"}  # starting workers would cost more
     command = [sys.executable, "-c", COMPARE]

@@ -26,13 +26,22 @@ def gsplat_projection(gaussians: Gaussians, antialiased: bool) -> tuple[torch.Te
         calc_compensations=antialiased,
     )
     opacities = gaussians.opacities[:, 0].sigmoid()
-    return radii[0], means2d[0], depths[0], conics[0], opacities * compensations[0] if antialiased else opacities
+    return (
+        radii[0],
+        means2d[0],
+        depths[0],
+        conics[0],
+        opacities * compensations[0] if antialiased else opacities,
+    )
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_projection_equals_gsplats(antialiased):
     gaussians = random_gaussians(400)
-    shifted = Gaussians(means=gaussians.means - torch.tensor([0.0, 0.0, 3.0]), **{n: v for n, v in gaussians.items() if n != "means"})
+    shifted = Gaussians(
+        means=gaussians.means - torch.tensor([0.0, 0.0, 3.0]),
+        **{n: v for n, v in gaussians.items() if n != "means"},
+    )
     ours, theirs = as_leaves(shifted), as_leaves(shifted)
     splats = project(ours, VIEW, antialiased=antialiased)
     radii, *expected = gsplat_projection(theirs, antialiased)
@@ -46,7 +55,10 @@ def test_projection_equals_gsplats(antialiased):
     for value, reference in zip(found, expected, strict=True):
         torch.testing.assert_close(value[seen], reference[seen], rtol=1e-9, atol=1e-10)
         weights = torch.randn(value[seen].shape, generator=generator, dtype=torch.float64)
-        ours_loss, theirs_loss = ours_loss + (value[seen] * weights).sum(), theirs_loss + (reference[seen] * weights).sum()
+        ours_loss, theirs_loss = (
+            ours_loss + (value[seen] * weights).sum(),
+            theirs_loss + (reference[seen] * weights).sum(),
+        )
     ours_loss.backward()
     theirs_loss.backward()
     for name in ("means", "scales", "quats", "opacities"):
@@ -59,7 +71,9 @@ def test_bounds_use_the_inverse_of_the_conics():
     xx, xy, yy = splats.covs2d.unbind(-1)
     a, b, c = splats.conics.unbind(-1)
     identity = torch.stack((xx * a + xy * b, xx * b + xy * c, xy * a + yy * b, xy * b + yy * c), dim=-1)
-    torch.testing.assert_close(identity, torch.tensor([1.0, 0, 0, 1]).double().expand(50, 4), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        identity, torch.tensor([1.0, 0, 0, 1]).double().expand(50, 4), rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -84,7 +98,9 @@ def test_colours_equal_gsplats(degree):
 
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_default_strategy_runs_unchanged(absgrad):
-    params = torch.nn.ParameterDict({n: torch.nn.Parameter(v) for n, v in random_gaussians(30, dtype=torch.float32).items()})
+    params = torch.nn.ParameterDict(
+        {n: torch.nn.Parameter(v) for n, v in random_gaussians(30, dtype=torch.float32).items()}
+    )
     optimizers = {name: torch.optim.Adam([params[name]], lr=1e-3) for name in PARAM_NAMES}
     strategy = DefaultStrategy(
         refine_start_iter=0, refine_every=2, reset_every=5, grow_grad2d=1e-5, prune_opa=0.05, absgrad=absgrad
@@ -104,7 +120,9 @@ def test_default_strategy_runs_unchanged(absgrad):
         if step == 1:
             grads = raster.info["means2d"].absgrad if absgrad else raster.info["means2d"].grad
             size = torch.tensor([view.width / 2, view.height / 2])
-            torch.testing.assert_close(state["grad2d"], torch.where(seen, (grads[0] * size).norm(dim=-1), 0.0))
+            torch.testing.assert_close(
+                state["grad2d"], torch.where(seen, (grads[0] * size).norm(dim=-1), 0.0)
+            )
             assert state["grad2d"].max() > 1e-5
         for optimizer in optimizers.values():
             optimizer.step()

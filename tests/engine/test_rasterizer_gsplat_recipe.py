@@ -13,7 +13,15 @@ from gsplat.cuda import _torch_impl
 from abcd_ns.engine.rasterizer import TorchRasterizer, ZWindow, gsplat_backend, self_check
 from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
-from tests.engine.rasterizer_scenes import as_leaves, gradients, probe, random_gaussians, relative_error, small_view, stacked
+from tests.engine.rasterizer_scenes import (
+    as_leaves,
+    gradients,
+    probe,
+    random_gaussians,
+    relative_error,
+    small_view,
+    stacked,
+)
 
 VIEW = small_view(70, 45)
 
@@ -35,7 +43,9 @@ def fake_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
     return _torch_impl._isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height)
 
 
-def fake_compositing(means2d, conics, colors, opacities, width, height, tile_size, offsets, flatten_ids, absgrad):
+def fake_compositing(
+    means2d, conics, colors, opacities, width, height, tile_size, offsets, flatten_ids, absgrad
+):
     """Tile by tile from the lists, as the CUDA kernel; its `absgrad` is only |grad|, enough to see it arrive."""
     if absgrad:
         means2d.register_hook(lambda grad: setattr(means2d, "absgrad", grad.abs()))
@@ -46,7 +56,11 @@ def fake_compositing(means2d, conics, colors, opacities, width, height, tile_siz
         for col in range(offsets.shape[2]):
             index = row * offsets.shape[2] + col
             ids = flatten_ids[bounds[index] : bounds[index + 1]]
-            tiles.append(fake_tile(means2d, conics, colors, opacities, ids, col * tile_size, row * tile_size, tile_size))
+            tiles.append(
+                fake_tile(
+                    means2d, conics, colors, opacities, ids, col * tile_size, row * tile_size, tile_size
+                )
+            )
         rows.append(torch.cat(tiles, dim=1))
     image = torch.cat(rows, dim=0)[None, :height, :width]
     return image[..., :-1], 1 - image[..., -1:]
@@ -54,7 +68,11 @@ def fake_compositing(means2d, conics, colors, opacities, width, height, tile_siz
 
 def fake_tile(means2d, conics, colors, opacities, ids, x, y, size):
     centers = torch.stack(torch.meshgrid(torch.arange(size), torch.arange(size), indexing="xy"), dim=-1) + 0.5
-    color, T, live = means2d.new_zeros((size, size, 4)), means2d.new_ones((size, size)), torch.ones(size, size).bool()
+    color, T, live = (
+        means2d.new_zeros((size, size, 4)),
+        means2d.new_ones((size, size)),
+        torch.ones(size, size).bool(),
+    )
     for i in ids.tolist():
         dx, dy = (means2d[0, i] - torch.tensor([x, y]) - centers).unbind(-1)
         a, b, c = conics[0, i]
@@ -67,7 +85,7 @@ def fake_tile(means2d, conics, colors, opacities, ids, x, y, size):
     return torch.cat((color, T[..., None]), dim=-1)
 
 
-@pytest.fixture()
+@pytest.fixture
 def backend(monkeypatch):
     """A GsplatRasterizer on CPU stand-ins."""
     monkeypatch.setattr(gsplat_backend, "fully_fused_projection", fake_projection)
@@ -96,8 +114,12 @@ def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_de
 @pytest.mark.parametrize("with_frozen", [False, True])
 def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen):
     frozen = random_gaussians(15, seed=3) if with_frozen else None
-    raster = backend(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True)
-    expected = TorchRasterizer("never")(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen)
+    raster = backend(
+        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True
+    )
+    expected = TorchRasterizer("never")(
+        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen
+    )
     size = raster.transmittance.shape
     for drawing in (raster, expected):
         drawing.info["means2d"].retain_grad()
@@ -110,7 +132,9 @@ def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen
 
 
 def test_nothing_to_draw(backend):
-    raster = backend(as_leaves(Gaussians.empty(dtype=torch.float64)), VIEW, sh_degree=3, crop=Crop(3, 3, 5, 4))
+    raster = backend(
+        as_leaves(Gaussians.empty(dtype=torch.float64)), VIEW, sh_degree=3, crop=Crop(3, 3, 5, 4)
+    )
     raster.info["means2d"].retain_grad()
     assert raster.color.shape == (4, 5, 3)
     assert (raster.transmittance == 1).all()

@@ -24,7 +24,10 @@ class Broken(TorchRasterizer):
             wrong = 2 * gaussians.quats.detach() - gaussians.quats
             gaussians = Gaussians(**{**dict(gaussians.items()), "quats": wrong})
         if self.fault == "gradient of opacities":  # right picture, no gradient
-            parts = {**dict(gaussians.items()), "opacities": gaussians.opacities.detach() + 0 * gaussians.opacities}
+            parts = {
+                **dict(gaussians.items()),
+                "opacities": gaussians.opacities.detach() + 0 * gaussians.opacities,
+            }
             gaussians = Gaussians(**parts)
         raster = super().__call__(gaussians, view, **options)
         if self.fault in ("color", "depth"):
@@ -38,9 +41,13 @@ def test_a_sound_backend_passes():
     self_check(TorchRasterizer("never", tile_side=8, chunk=5), "cpu")
 
 
-@pytest.mark.parametrize("fault", ["color", "transmittance", "depth", "gradient of quats", "gradient of opacities"])
+@pytest.mark.parametrize(
+    "fault", ["color", "transmittance", "depth", "gradient of quats", "gradient of opacities"]
+)
 def test_a_fault_is_refused(fault):
-    with pytest.raises(RuntimeError, match=rf'"broken" on cpu is off in {fault} by .* Set the rasterizer to "torch"'):
+    with pytest.raises(
+        RuntimeError, match=rf'"broken" on cpu is off in {fault} by .* Set the rasterizer to "torch"'
+    ):
         self_check(Broken(fault), "cpu")
 
 

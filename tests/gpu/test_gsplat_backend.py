@@ -5,7 +5,15 @@ import torch
 
 from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
-from tests.engine.rasterizer_scenes import as_leaves, gradients, probe, random_gaussians, relative_error, small_view, stacked
+from tests.engine.rasterizer_scenes import (
+    as_leaves,
+    gradients,
+    probe,
+    random_gaussians,
+    relative_error,
+    small_view,
+    stacked,
+)
 
 pytestmark = [
     pytest.mark.gpu,

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from abcd_ns.plugin.colmap_model import Z_UP, read_colmap
+from abcd_ns.plugin.data.colmap_model import Z_UP, read_colmap
 from abcd_ns.plugin.data.dataset import AbcdDataset
 from abcd_ns.plugin.data.ply import read_points
 from abcd_ns.plugin.dataparser import AbcdDataParser, AbcdDataParserConfig, split_rows

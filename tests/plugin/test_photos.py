@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from abcd_ns.engine.types import Crop
+from abcd_ns.plugin.data.photos import Photos, PhotoSource, area_reduce, default_budget
 from abcd_ns.plugin.data.scene import Lens
 from abcd_ns.plugin.data.undistort import distort, undistortion
 from abcd_ns.plugin.input_errors import InputError
-from abcd_ns.plugin.photos import Photos, PhotoSource, area_reduce, default_budget
 
 WIDTH, HEIGHT = 40, 24
 

@@ -4,7 +4,7 @@ import random
 
 import torch
 
-from abcd_ns.engine.coordinator import TrainingConfig
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.loss import photometric_loss
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer

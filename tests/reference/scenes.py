@@ -5,9 +5,11 @@ import math
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.blocks import BlockTree, build_kd
-from abcd_ns.engine.coordinator import Coordinator, TrainingConfig, blocks_at_rest
+from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.coordinator import Coordinator, blocks_at_rest
 from abcd_ns.engine.param_swap import make_adam
+from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scene import StoredScene

@@ -30,7 +30,9 @@ def make_rasterizer(
     if name == "torch" or (name == "auto" and device.type != "cuda"):
         return TorchRasterizer(compile)
     if device.type != "cuda":
-        raise ValueError(f'The gsplat rasterizer needs a CUDA device, not "{device}"; set the rasterizer to "torch".')
+        raise ValueError(
+            f'The gsplat rasterizer needs a CUDA device, not "{device}"; set the rasterizer to "torch".'
+        )
     from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer  # imports gsplat
 
     rasterizer = GsplatRasterizer()

@@ -76,7 +76,9 @@ def _exclusive_cumsum(counts: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     return counts.cumsum(0) - counts
 
 
-def _gsplat_bounds(mean: Float[Tensor, "n"], radius: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+def _gsplat_bounds(
+    mean: Float[Tensor, "n"], radius: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """First and last pixel, along one axis, of the 16 px tiles that the square of the radius touches."""
     first = (mean / GSPLAT_TILE - radius / GSPLAT_TILE).floor() * GSPLAT_TILE
     last = (mean / GSPLAT_TILE + radius / GSPLAT_TILE).ceil() * GSPLAT_TILE - 1
@@ -95,7 +97,9 @@ def _tile_span(
     return first_tile.long(), count.long()
 
 
-def _candidates(splats: Splats, grid: TileGrid, windowed: Tensor | None, window: ZWindow | None) -> Int[Tensor, "m"]:
+def _candidates(
+    splats: Splats, grid: TileGrid, windowed: Tensor | None, window: ZWindow | None
+) -> Int[Tensor, "m"]:
     """Splats that can leave a fragment in the crop, by increasing depth; ties by index, as gsplat's radix sort."""
     crop, x, y, radii = grid.crop, splats.means2d[:, 0], splats.means2d[:, 1], splats.radii.to(splats.means2d)
     reach = radii + GSPLAT_TILE
@@ -144,7 +148,9 @@ def _pairs(splats: Splats, grid: TileGrid) -> _Pairs:
     return _Pairs(owner.index_select(0, band), tile, bag_of_band.index_select(0, band_start))
 
 
-def _within_window(pairs: _Pairs, splats: Splats, grid: TileGrid, windowed: Bool[Tensor, "m"], window: ZWindow) -> _Pairs:
+def _within_window(
+    pairs: _Pairs, splats: Splats, grid: TileGrid, windowed: Bool[Tensor, "m"], window: ZWindow
+) -> _Pairs:
     """Without the pairs of windowed Gaussians that no pixel of their tile lets through."""
     near = grid.to_tiles(window.near[None], fill=math.inf)[0].amin(dim=0)
     far = grid.to_tiles(window.far[None], fill=-math.inf)[0].amax(dim=0)
@@ -185,7 +191,11 @@ def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], grid: TileGrid, chunk: int) 
     starts = torch.tensor([level.start for level in levels], dtype=torch.long, device=device)
     widths = torch.tensor([level.width for level in levels], dtype=torch.long, device=device)
     depth, lane = torch.div(place, chunk, rounding_mode="floor"), place % chunk
-    slot = starts.index_select(0, depth) + lane * widths.index_select(0, depth) + column.index_select(0, sorted_tile)
+    slot = (
+        starts.index_select(0, depth)
+        + lane * widths.index_select(0, depth)
+        + column.index_select(0, sorted_tile)
+    )
 
     n_slots = levels[-1].start + chunk * levels[-1].width if levels else 0
     ranks = torch.full((n_slots,), len(rows), dtype=torch.long, device=device)

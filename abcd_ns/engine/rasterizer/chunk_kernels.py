@@ -14,8 +14,9 @@ from torch import Tensor
 from abcd_ns.engine.rasterizer import torch_kernels
 
 CompilePolicy = Literal["auto", "always", "never"]
-EAGER_SECONDS = 2.0
-"""With "auto": time spent in eager kernels after which compiling starts to pay."""
+EAGER_SECONDS = 10.0
+"""With "auto": time spent in eager kernels after which they are compiled. Compiling takes some 20 s the first
+time and a few once inductor has it in its cache, so that short runs are better off without."""
 
 
 def has_cpp_compiler() -> bool:
@@ -36,7 +37,9 @@ class ChunkKernels:
         self.policy = policy
         self.eager_seconds = 0.0
 
-    def forward(self, params: Tensor, origins: Tensor, state: Tensor, window: Tensor | None, side: int) -> Tensor:
+    def forward(
+        self, params: Tensor, origins: Tensor, state: Tensor, window: Tensor | None, side: int
+    ) -> Tensor:
         """See torch_kernels.forward_chunk."""
         return self._run(torch_kernels.forward_chunk, params, origins, state, window, side)
 
@@ -51,7 +54,9 @@ class ChunkKernels:
         absgrad: bool,
     ) -> Tensor:
         """See torch_kernels.backward_chunk."""
-        return self._run(torch_kernels.backward_chunk, params, origins, state, upstream, window, side, absgrad)
+        return self._run(
+            torch_kernels.backward_chunk, params, origins, state, upstream, window, side, absgrad
+        )
 
     def compiles(self, params: Tensor) -> bool:
         if self.policy == "never":

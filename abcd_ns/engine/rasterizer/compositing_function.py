@@ -106,7 +106,11 @@ def _composite(
             trace.states.append(state)
         params = gather_params(table, _level_ranks(lists, index, columns))
         state = job.kernels.forward(
-            params, _take(origins, level.width, columns), state, _take(job.windows, level.width, columns), lists.grid.side
+            params,
+            _take(origins, level.width, columns),
+            state,
+            _take(job.windows, level.width, columns),
+            lists.grid.side,
         )
     if columns is None:
         final[..., : state.shape[2]] = state
@@ -183,7 +187,9 @@ def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> 
     return per_slot
 
 
-def sum_bags(values: Float[Tensor, "s g"], members: Int[Tensor, "q"], starts: Int[Tensor, "m"]) -> Float[Tensor, "m g"]:
+def sum_bags(
+    values: Float[Tensor, "s g"], members: Int[Tensor, "q"], starts: Int[Tensor, "m"]
+) -> Float[Tensor, "m g"]:
     """For each bag j the sum of values[members[starts[j] : starts[j + 1]]], in that order."""
     if starts.numel() == 0 or members.numel() == 0:
         return values.new_zeros((starts.numel(), values.shape[1]))

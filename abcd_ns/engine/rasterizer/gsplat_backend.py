@@ -128,7 +128,9 @@ class GsplatRasterizer:
     ) -> Raster:
         """See Rasterizer.__call__."""
         if z_window is not None:
-            raise ValueError('The gsplat rasterizer has no z window; use ownership by means or the rasterizer "torch".')
+            raise ValueError(
+                'The gsplat rasterizer has no z window; use ownership by means or the rasterizer "torch".'
+            )
         crop = crop or view.full
         if len(gaussians) + (0 if frozen is None else len(frozen)) == 0:
             return _nothing(gaussians, view, crop)
@@ -145,7 +147,9 @@ class GsplatRasterizer:
         return Raster(features[..., :3], 1.0 - alphas[..., 0], features[..., 3], _info(own, view))
 
 
-def _draw(own: _Projected, everyone: _Projected, crop: Crop, view: View, absgrad: bool) -> tuple[Tensor, Tensor]:
+def _draw(
+    own: _Projected, everyone: _Projected, crop: Crop, view: View, absgrad: bool
+) -> tuple[Tensor, Tensor]:
     """The second half of gsplat's `rasterization`: (features [h, w, 4], alphas [h, w, 1]) of an aligned crop."""
     means2d, radii = everyone.means2d, everyone.radii
     if crop != view.full:
@@ -173,7 +177,13 @@ def _draw(own: _Projected, everyone: _Projected, crop: Crop, view: View, absgrad
 def _info(own: _Projected, view: View) -> dict[str, Any]:
     names = ("means2d", "radii", "depths", "conics", "opacities")
     info: dict[str, Any] = {name: getattr(own, name) for name in names}
-    return info | {"width": view.width, "height": view.height, "n_cameras": 1, "camera_ids": None, "gaussian_ids": None}
+    return info | {
+        "width": view.width,
+        "height": view.height,
+        "n_cameras": 1,
+        "camera_ids": None,
+        "gaussian_ids": None,
+    }
 
 
 def _nothing(gaussians: Gaussians, view: View, crop: Crop) -> Raster:

@@ -81,7 +81,12 @@ def _safe_sqrt(x: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 
 @torch.no_grad()
 def _radii(
-    means2d: Float[Tensor, "2 n"], xx: Tensor, yy: Tensor, det: Float[Tensor, "n"], z: Float[Tensor, "n"], view: View
+    means2d: Float[Tensor, "2 n"],
+    xx: Tensor,
+    yy: Tensor,
+    det: Float[Tensor, "n"],
+    z: Float[Tensor, "n"],
+    view: View,
 ) -> Int[Tensor, "n"]:
     mid = 0.5 * (xx + yy)
     largest = mid + (mid * mid - det).clamp_min(0.01).sqrt()

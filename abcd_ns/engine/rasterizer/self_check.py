@@ -23,7 +23,8 @@ def check_scene(device: torch.device | str) -> tuple[Gaussians, View]:
 
     rest = wave(*(0.37 * (k + 1) for k in range(45))).view(COUNT, 15, 3)
     gaussians = Gaussians(
-        means=wave(1.3, 2.1, 0.7) * torch.tensor([1.6, 1.0, 1.0], dtype=torch.float64) + torch.tensor([0.0, 0.0, 4.0]),
+        means=wave(1.3, 2.1, 0.7) * torch.tensor([1.6, 1.0, 1.0], dtype=torch.float64)
+        + torch.tensor([0.0, 0.0, 4.0]),
         scales=0.5 * wave(0.9, 1.7, 2.9) - 1.5,
         quats=wave(0.3, 1.1, 1.9, 2.3),
         features_dc=wave(0.6, 1.4, 2.2),
@@ -39,7 +40,9 @@ def check_scene(device: torch.device | str) -> tuple[Gaussians, View]:
 def _loss(raster: Raster) -> Float[Tensor, ""]:
     """Depends on every output of every pixel, differently."""
     planes = torch.cat((raster.color, raster.transmittance[..., None], 0.2 * raster.depth[..., None]), dim=-1)
-    weights = torch.cos(torch.arange(planes.numel(), device=planes.device, dtype=planes.dtype)).view_as(planes)
+    weights = torch.cos(torch.arange(planes.numel(), device=planes.device, dtype=planes.dtype)).view_as(
+        planes
+    )
     return (planes * weights).sum()
 
 

@@ -43,7 +43,9 @@ class TileGrid:
     def pixels_per_tile(self) -> int:
         return self.side * self.side
 
-    def origins(self, tiles: Int[Tensor, "a"], dtype: torch.dtype) -> tuple[Float[Tensor, "a"], Float[Tensor, "a"]]:
+    def origins(
+        self, tiles: Int[Tensor, "a"], dtype: torch.dtype
+    ) -> tuple[Float[Tensor, "a"], Float[Tensor, "a"]]:
         """(x, y) of the tiles' upper left corners, in pixels of the full image."""
         x = (self.first_col + tiles % self.cols) * self.side
         y = (self.first_row + tiles // self.cols) * self.side

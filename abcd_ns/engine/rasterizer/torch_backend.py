@@ -80,7 +80,9 @@ class TorchRasterizer:
     name = "torch-1"
     supports_z_window = True
 
-    def __init__(self, compile: CompilePolicy = "auto", *, tile_side: int = TILE_SIDE, chunk: int = CHUNK) -> None:
+    def __init__(
+        self, compile: CompilePolicy = "auto", *, tile_side: int = TILE_SIDE, chunk: int = CHUNK
+    ) -> None:
         if tile_side < 1 or 16 % tile_side:
             raise ValueError(f"tile_side is {tile_side}; choose one of 1, 2, 4, 8, 16.")
         self.kernels = ChunkKernels(compile)
@@ -113,25 +115,36 @@ class TorchRasterizer:
         if z_window is not None:
             is_frozen = torch.arange(len(splats), device=gaussians.device) >= len(gaussians)
             windowed = is_frozen if frozen is not None else ~is_frozen
-        lists = bin_splats(splats, TileGrid(crop, self.tile_side), self.chunk, windowed=windowed, window=z_window)
+        lists = bin_splats(
+            splats, TileGrid(crop, self.tile_side), self.chunk, windowed=windowed, window=z_window
+        )
         colors = _ranked_colors(gaussians, frozen, lists.rows, view, sh_degree)
         job = self._job(lists, colors, windowed, z_window, info["means2d"] if absgrad else None)
         planes = Composite.apply(splats.means2d, splats.conics, colors, splats.opacities, splats.depths, job)
         return Raster(planes[1:4].permute(1, 2, 0), planes[0], planes[4], info)
 
     def _job(
-        self, lists: TileLists, colors: Tensor, windowed: Tensor | None, window: ZWindow | None, target: Tensor | None
+        self,
+        lists: TileLists,
+        colors: Tensor,
+        windowed: Tensor | None,
+        window: ZWindow | None,
+        target: Tensor | None,
     ) -> Job:
         if window is None:
             return Job(lists, self.kernels, None, None, target)
-        planes = lists.grid.to_tiles(torch.stack((window.near, window.far)).to(colors)).index_select(2, lists.tiles)
+        planes = lists.grid.to_tiles(torch.stack((window.near, window.far)).to(colors)).index_select(
+            2, lists.tiles
+        )
         return Job(lists, self.kernels, planes, (~windowed[lists.rows]).to(colors), target)
 
 
 def _check_window(window: ZWindow | None, crop: Crop) -> None:
     if window is not None and window.near.shape != (crop.height, crop.width):
         shape = tuple(window.near.shape)
-        raise ValueError(f"The z window is {shape}, but the crop is {(crop.height, crop.width)}; give it the crop's size.")
+        raise ValueError(
+            f"The z window is {shape}, but the crop is {(crop.height, crop.width)}; give it the crop's size."
+        )
 
 
 def _info(splats: Splats, view: View) -> dict[str, Any]:

@@ -46,7 +46,9 @@ def _offsets(params: Params, origins: Float[Tensor, "2 a"], side: int) -> tuple[
     return dx, dy
 
 
-def _alphas(params: Params, dx: Tensor, dy: Tensor, window: Float[Tensor, "2 p a"] | None) -> Float[Tensor, "k p a"]:
+def _alphas(
+    params: Params, dx: Tensor, dy: Tensor, window: Float[Tensor, "2 p a"] | None
+) -> Float[Tensor, "k p a"]:
     """min(0.999, opacity exp(-sigma)) of each fragment, 0 where it is not drawn."""
     half_xx, xy, half_yy = 0.5 * params[CONIC_XX], params[CONIC_XY], 0.5 * params[CONIC_YY]
     sigma = dx * (half_xx[:, None] * dx + xy[:, None] * dy) + half_yy[:, None] * dy * dy
@@ -129,7 +131,13 @@ def backward_chunk(
 
 
 def _sum_pixels(
-    params: Params, dx: Tensor, dy: Tensor, weights: Tensor, sigma_grads: Tensor, upstream: Tensor, absgrad: bool
+    params: Params,
+    dx: Tensor,
+    dy: Tensor,
+    weights: Tensor,
+    sigma_grads: Tensor,
+    upstream: Tensor,
+    absgrad: bool,
 ) -> Float[Tensor, "g k a"]:
     s_dx, s_dy = sigma_grads * dx, sigma_grads * dy
     planes = [sigma_grads, s_dx, s_dy, s_dx * dx, s_dx * dy, s_dy * dy]

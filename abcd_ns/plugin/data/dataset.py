@@ -6,8 +6,8 @@ import numpy as np
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
+from abcd_ns.plugin.data.photos import Photos
 from abcd_ns.plugin.input_errors import InputError
-from abcd_ns.plugin.photos import Photos
 
 
 class AbcdDataset(InputDataset):

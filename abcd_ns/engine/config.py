@@ -1,0 +1,53 @@
+"""How a scene is trained: every option of the engine, with its default."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.rasterizer import Rasterizer
+
+
+@dataclass
+class TrainingConfig:
+    """How a scene is trained, whatever calls the engine."""
+
+    layers: bool = True
+    """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
+    ownership: Literal["auto", "fragments", "means"] = "auto"
+    """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
+    paper). `auto` takes fragments where the rasterizer can mask by depth."""
+    window_percentile: float = 0.9
+    """Share of the active Gaussians' extents that the window of sorted-in fragments must hold."""
+    first_passes: int = 1
+    """Uses of each view in a visit of the first sweep."""
+    last_passes: int = 4
+    """Uses of each view in a visit of late sweeps."""
+    pass_gaussians: int = 0
+    """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
+    sh_degree: int = 3
+    """Highest degree of spherical harmonics."""
+    sh_ramp: float = 0.1
+    """Share of the run over which the degree rises from 0 to the highest."""
+    ssim_lambda: float = 0.2
+    """Weight of 1 - SSIM in the loss; the rest is L1."""
+    antialiased: bool = False
+    """Scale opacities by gsplat's compensation for its low-pass filter."""
+    background: Literal["random", "black", "white"] = "random"
+    """What lies behind the scene while training."""
+    means_lr: float = 1.6e-4
+    """Learning rate of the means at the start."""
+    means_lr_final: float = 1.6e-6
+    """Learning rate of the means at the end; exponential between the two over the run."""
+    seed: int = 0
+    """Of the order of blocks and views, backgrounds and splits."""
+    density: DensityConfig = field(default_factory=DensityConfig)
+    """Growing and pruning."""
+
+
+def resolve_ownership(
+    wanted: Literal["auto", "fragments", "means"], rasterizer: Rasterizer
+) -> Literal["fragments", "means"]:
+    """What `auto` means for a rasterizer."""
+    if wanted == "auto":
+        return "fragments" if rasterizer.supports_z_window else "means"
+    return wanted
