@@ -39,7 +39,7 @@ from abcd_ns.engine.types import Gaussians, View
 
 SIZES = ((160, 106), (320, 213))
 TILES = 1080
-"""As many 4 x 4 px tiles as 160 x 106 pixels have. A power of two would make every plane fall on the same cache lines."""
+"""As many tiles of 4 x 4 as 160 x 106 px have. With a power of two all planes would share cache sets."""
 
 
 @dataclass
@@ -61,7 +61,7 @@ class Args:
 
 
 def synthetic_scene(n: int, seed: int) -> Gaussians:
-    """A box full of Gaussians that are a pixel or a few wide at the resolutions measured, log-normal in size."""
+    """A box full of Gaussians that are a few pixels wide at the sizes measured, log-normally distributed."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -114,7 +114,7 @@ def cumprod_chunk(params: Tensor, origins: Tensor, state: Tensor, side: int) -> 
 
 
 def kernel_inputs(args: Args) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(params, origins, state, upstream) of TILES tiles and one chunk: faint Gaussians, so that no ray stops."""
+    """(params, origins, state, upstream) of TILES tiles and one chunk; faint, so that no ray stops."""
     generator = torch.Generator().manual_seed(args.seed)
     params = torch.rand(10, args.chunk, TILES, generator=generator)
     params[[X, Y]] *= args.tile_side
@@ -156,7 +156,7 @@ def measure_kernels(args: Args) -> None:
         forward_ms = take_turns(forward, args.rounds)
     both_ms = take_turns(both, args.rounds)
     print(
-        f"\n## Kernels: {TILES} tiles of {side}x{side} pixels, chunks of {args.chunk}, ns per pixel-Gaussian pair\n"
+        f"\n## Kernels: {TILES} tiles of {side}x{side} px, {args.chunk} Gaussians: ns per pixel and Gaussian\n"
     )
     print("| form | forward | forward + backward |\n| --- | --- | --- |")
     for name in forward:
@@ -218,7 +218,7 @@ def measure_steps(args: Args, width: int, height: int) -> None:
     visible = splats.radii > 0
     radius = float(splats.radii[visible].float().median())
     print(
-        f"{int(visible.sum())} visible, median radius {radius:.0f} px, {lists.fragments / 1e6:.2f} M pairs in lists\n"
+        f"{int(visible.sum())} visible, median radius {radius:.0f} px, {lists.fragments / 1e6:.2f} M pairs\n"
     )
     print("| part | ms |\n| --- | --- |")
     for name, ms in take_turns(sides, args.rounds).items():
@@ -231,7 +231,7 @@ def main(args: Args) -> None:
         torch.set_num_threads(args.threads)
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     print(
-        f"torch {torch.__version__}, {torch.get_num_threads()} threads, {platform.machine()}, seed {args.seed}"
+        f"torch {torch.__version__}, {platform.machine()}, {torch.get_num_threads()} threads, seed {args.seed}"
     )
     print(f"load average at the start: {load:.1f}")
     measure_kernels(args)

@@ -85,7 +85,7 @@ class AbcdModel(SplatfactoModel):
         if self._coordinator is None:
             return live_gaussians(self.gauss_params).detach()
         scene = self._coordinator.scene
-        return Gaussians.cat([scene.gaussians(block).cpu() for block in range(scene.tree.num_blocks)])
+        return Gaussians.cat([scene.gaussians(block).to("cpu") for block in range(scene.tree.num_blocks)])
 
     def _initial_gaussians(self) -> Gaussians:
         config = self.config

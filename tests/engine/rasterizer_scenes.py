@@ -11,7 +11,7 @@ from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 def random_gaussians(
     n: int, seed: int = 0, sh_degree: int = 3, dtype: torch.dtype = torch.float64
 ) -> Gaussians:
-    """Overlapping Gaussians in front of `small_view`, some beside the image, some dense enough to stop rays."""
+    """Overlapping Gaussians in front of `small_view`, some of them beside the image."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:

@@ -1,6 +1,7 @@
 """TorchRasterizer against the naive twin: forward, gradient, crops, windows, frozen Gaussians."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -65,7 +66,7 @@ def test_equals_the_naive_twin(sh_degree, antialiased, crop, with_frozen, with_w
 
 
 def test_scene_has_what_the_tests_are_about():
-    """Rays that stop early, alphas at the clamp, and Gaussians outside the image, or the oracle proves little."""
+    """Rays that stop early, alphas at the clamp, Gaussians outside the image: or the oracle proves little."""
     gaussians = random_gaussians(12)
     raster = naive_rasterize(gaussians, VIEW, sh_degree=0)
     assert raster.fragments > 700
@@ -170,7 +171,7 @@ def test_fold_of_complementary_windows_is_the_whole_drawing(dtype, tolerance):
     edge = torch.full_like(cuts[:1], math.inf)
     bounds = torch.cat((-edge, cuts.sort(dim=0).values, edge))
     color, transmittance = torch.zeros_like(whole.color), torch.ones_like(whole.transmittance)
-    for near, far in zip(bounds[:-1], bounds[1:], strict=True):
+    for near, far in pairwise(bounds):
         layer = EAGER(faint, view, sh_degree=3, z_window=ZWindow(near, far)).layer
         color = color + transmittance[..., None] * layer.color
         transmittance = transmittance * layer.transmittance
@@ -277,7 +278,7 @@ def test_backward_keeps_little():
 
 
 def test_nothing_is_saved_without_gradients():
-    with torch.autograd.graph.saved_tensors_hooks(lambda x: pytest.fail("saved a tensor"), lambda x: x):
+    with torch.autograd.graph.saved_tensors_hooks(lambda _: pytest.fail("saved a tensor"), lambda x: x):
         raster = EAGER(random_gaussians(20), VIEW, sh_degree=3)
     assert not raster.color.requires_grad
 

@@ -47,7 +47,7 @@ def test_compiled_equals_eager():
     assert "graphs 2" in run.stdout, "one graph per kernel, whatever the sizes"
 
 
-def broken_compile(kernel):
+def broken_compile(_kernel):
     def fail(*_args):
         raise RuntimeError("no such compiler")
 

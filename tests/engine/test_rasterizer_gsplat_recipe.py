@@ -46,7 +46,7 @@ def fake_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
 def fake_compositing(
     means2d, conics, colors, opacities, width, height, tile_size, offsets, flatten_ids, absgrad
 ):
-    """Tile by tile from the lists, as the CUDA kernel; its `absgrad` is only |grad|, enough to see it arrive."""
+    """Tile by tile from the lists, as in CUDA; its `absgrad` is only |grad|, enough to see it arrive."""
     if absgrad:
         means2d.register_hook(lambda grad: setattr(means2d, "absgrad", grad.abs()))
     bounds = [*offsets.flatten().tolist(), flatten_ids.numel()]

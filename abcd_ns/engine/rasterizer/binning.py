@@ -7,6 +7,7 @@ fragment is lost by that, and none is added.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -86,10 +87,17 @@ def _gsplat_bounds(
 
 
 def _tile_span(
-    low: Float[Tensor, "n"], high: Float[Tensor, "n"], bounds, crop_start: int, crop_size: int, side: int
+    low: Float[Tensor, "n"],
+    high: Float[Tensor, "n"],
+    bounds: Sequence[Tensor],
+    crop_start: int,
+    crop_size: int,
+    side: int,
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """First tile (from the image's edge) and number of tiles, along one axis, with a pixel centre in [low, high]
-    that lies in the crop and within `bounds` (first and last pixel)."""
+    """The tiles along one axis with a pixel centre in [low, high], in the crop and in `bounds`.
+
+    Returns (first tile, counted from the image's edge; number of tiles). `bounds` are first and last pixel.
+    """
     first = torch.maximum((low - 0.5).ceil(), bounds[0]).clamp(crop_start, crop_start + crop_size)
     last = torch.minimum((high - 0.5).floor(), bounds[1]).clamp(crop_start - 1, crop_start + crop_size - 1)
     first_tile, last_tile = (first / side).floor(), (last / side).floor()
@@ -100,7 +108,7 @@ def _tile_span(
 def _candidates(
     splats: Splats, grid: TileGrid, windowed: Tensor | None, window: ZWindow | None
 ) -> Int[Tensor, "m"]:
-    """Splats that can leave a fragment in the crop, by increasing depth; ties by index, as gsplat's radix sort."""
+    """Splats that can leave a fragment in the crop, by increasing depth; ties by index, as in gsplat."""
     crop, x, y, radii = grid.crop, splats.means2d[:, 0], splats.means2d[:, 1], splats.radii.to(splats.means2d)
     reach = radii + GSPLAT_TILE
     keep = (splats.radii > 0) & (splats.opacities >= MIN_ALPHA)
@@ -114,7 +122,7 @@ def _candidates(
 
 
 def _pairs(splats: Splats, grid: TileGrid) -> _Pairs:
-    """All pairs of `splats`, whose order is their rank. One row of tiles at a time, each as wide as the ellipse there."""
+    """All pairs of `splats`, whose order is their rank: per row of tiles, those that the ellipse reaches."""
     crop, side = grid.crop, grid.side
     (x, y), radii = splats.means2d.unbind(-1), splats.radii.to(splats.means2d)
     xx, xy, yy = splats.covs2d.unbind(-1)

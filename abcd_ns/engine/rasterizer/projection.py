@@ -47,7 +47,7 @@ class Splats:
 
 
 def _rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "3 3 n"]:
-    """Rotation matrices of quaternions (w, x, y, z), which need not be normalised. Gaussians last: see project."""
+    """Rotation matrices of quaternions (w, x, y, z), which need not be normalised; layout as in project."""
     w, x, y, z = F.normalize(quats.T.contiguous(), dim=0).unbind(0)
     rows = (
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -98,7 +98,7 @@ def _radii(
 
 
 def project(gaussians: Gaussians, view: View, *, antialiased: bool = False) -> Splats:
-    """Project Gaussians into a view; differentiable in the Gaussians, and in the pose if that takes gradients.
+    """Project Gaussians into a view; differentiable in the Gaussians, and in the pose if it takes gradients.
 
     Mathematically gsplat's `fully_fused_projection` with its defaults (near 0.01, far 1e10, blur 0.3 px^2),
     though covariances come as dot products of projected axes: never indefinite, and cheaper. Inside, the
@@ -106,7 +106,7 @@ def project(gaussians: Gaussians, view: View, *, antialiased: bool = False) -> S
     0 hold finite values that mean nothing.
 
     Args:
-        antialiased: multiply opacities by sqrt(det(cov) / det(cov + blur)), as Mip-Splatting (Yu et al. 2024).
+        antialiased: multiply opacities by sqrt(det(cov) / det(cov + blur)), as in Mip-Splatting.
     """
     viewmat, K = view.viewmat.to(gaussians.means), view.K.to(gaussians.means)
     view = View(viewmat, K, view.width, view.height, view.index)

@@ -74,6 +74,6 @@ def self_check(rasterizer: Rasterizer, device: torch.device | str) -> None:
         error = float((found[name] - reference).abs().max() / scale)
         if not error <= TOLERANCE:  # NaN fails too
             raise RuntimeError(
-                f'The rasterizer "{rasterizer.name}" on {device} is off in {name} by {error:.2g} of its largest '
-                f'value; its kernels cannot be trusted on this device. Set the rasterizer to "torch".'
+                f'The rasterizer "{rasterizer.name}" on {device} is off in {name} by {error:.2g} of the '
+                f'largest value, so its kernels cannot be trusted there. Set the rasterizer to "torch".'
             )

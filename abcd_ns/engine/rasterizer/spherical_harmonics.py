@@ -64,8 +64,8 @@ def sh_colors(
     used = (degree + 1) ** 2 - 1
     if not 0 <= degree <= MAX_SH_DEGREE or used > features_rest.shape[1]:
         raise ValueError(
-            f"sh_degree is {degree}, but the Gaussians hold {features_rest.shape[1]} coefficients above degree 0 "
-            f"and at most degree {MAX_SH_DEGREE} is supported; lower sh_degree."
+            f"sh_degree is {degree}, but the Gaussians hold {features_rest.shape[1]} coefficients above "
+            f"degree 0, and degrees above {MAX_SH_DEGREE} are not supported; lower sh_degree."
         )
     bases = sh_bases(F.normalize(means - camera_center, dim=-1), degree)
     # With degree 0 this adds nothing, yet gives `features_rest` a gradient of zeros, as gsplat does: Adam
