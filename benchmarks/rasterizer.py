@@ -155,9 +155,7 @@ def measure_kernels(args: Args) -> None:
     with torch.no_grad():
         forward_ms = take_turns(forward, args.rounds)
     both_ms = take_turns(both, args.rounds)
-    print(
-        f"\n## Kernels: {TILES} tiles of {side}x{side} px, {args.chunk} Gaussians: ns per pixel and Gaussian\n"
-    )
+    print(f"\n## Kernels: {TILES} tiles of {side}x{side} px, {args.chunk} Gaussians; ns per pixel-Gaussian\n")
     print("| form | forward | forward + backward |\n| --- | --- | --- |")
     for name in forward:
         print(f"| {name} | {1e6 * forward_ms[name] / pairs:.2f} | {1e6 * both_ms[name] / pairs:.2f} |")
@@ -231,7 +229,7 @@ def main(args: Args) -> None:
         torch.set_num_threads(args.threads)
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     print(
-        f"torch {torch.__version__}, {platform.machine()}, {torch.get_num_threads()} threads, seed {args.seed}"
+        f"torch {torch.__version__} {platform.machine()}, threads {torch.get_num_threads()} seed {args.seed}"
     )
     print(f"load average at the start: {load:.1f}")
     measure_kernels(args)

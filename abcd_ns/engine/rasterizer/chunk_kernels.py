@@ -15,8 +15,8 @@ from abcd_ns.engine.rasterizer import torch_kernels
 
 CompilePolicy = Literal["auto", "always", "never"]
 EAGER_SECONDS = 10.0
-"""With "auto": time spent in eager kernels after which they are compiled. Compiling takes some 20 s
-on two idle cores, less from inductor's cache on disk, so that short runs are better off without."""
+"""With "auto": time spent in eager kernels after which they are compiled. Compiling takes
+tens of seconds at first, less from inductor's cache on disk: short runs are better off without."""
 
 
 def has_cpp_compiler() -> bool:

@@ -150,7 +150,7 @@ class GsplatRasterizer:
 def _draw(
     own: _Projected, everyone: _Projected, crop: Crop, view: View, absgrad: bool
 ) -> tuple[Tensor, Tensor]:
-    """The second half of gsplat's `rasterization`, for an aligned crop: features [h, w, 4], alphas [h, w, 1]."""
+    """Second half of gsplat's `rasterization`: (features [h, w, 4], alphas [h, w, 1]) of an aligned crop."""
     means2d, radii = everyone.means2d, everyone.radii
     if crop != view.full:
         means2d, radii = _shift_into(crop, means2d, radii)
