@@ -20,11 +20,13 @@ from torch import Tensor
 from abcd_ns.engine.rasterizer import TorchRasterizer
 from abcd_ns.engine.rasterizer import torch_backend as backend
 from abcd_ns.engine.rasterizer.binning import bin_splats
-from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, has_cpp_compiler
+from abcd_ns.engine.rasterizer.built_kernels import can_build
+from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels
 from abcd_ns.engine.rasterizer.projection import project
 from abcd_ns.engine.rasterizer.spherical_harmonics import sh_colors
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.rasterizer.torch_kernels import (
+    ALWAYS,
     BLUE,
     CONIC_XX,
     CONIC_XY,
@@ -116,7 +118,8 @@ def cumprod_chunk(params: Tensor, origins: Tensor, state: Tensor, side: int) -> 
 def kernel_inputs(args: Args) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(params, origins, state, upstream) of TILES tiles and one chunk; faint, so that no ray stops."""
     generator = torch.Generator().manual_seed(args.seed)
-    params = torch.rand(10, args.chunk, TILES, generator=generator)
+    params = torch.rand(ALWAYS + 1, args.chunk, TILES, generator=generator)
+    params[ALWAYS] = 1
     params[[X, Y]] *= args.tile_side
     params[[CONIC_XX, CONIC_YY]] += 0.2
     params[CONIC_XY] *= 0.1
@@ -138,17 +141,17 @@ def measure_kernels(args: Args) -> None:
         (cumprod_chunk(leaf, origins, state, side) * upstream).sum().backward()
 
     both: dict[str, Callable[[], object]] = {"eager cumprod": cumprod_both}
-    for name, policy in (("eager loop", "never"), ("compiled loop", "always")):
-        if policy == "always" and not has_cpp_compiler():
+    for name, policy in (("eager loop", "never"), ("built loop", "always")):
+        if policy == "always" and not can_build():
             continue
-        kernels = ChunkKernels(policy)
+        kernels = ChunkKernels(policy, side, args.chunk)
 
         def run_forward(kernels: ChunkKernels = kernels) -> None:
-            kernels.forward(params, origins, state, None, side)
+            kernels.forward(params, origins, state, None)
 
         def run_both(kernels: ChunkKernels = kernels, forward: Callable[[], None] = run_forward) -> None:
             forward()
-            kernels.backward(params, origins, state, upstream, None, side, False)
+            kernels.backward(params, origins, state, upstream, None, False)
 
         forward[name], both[name] = run_forward, run_both
     pairs = TILES * side**2 * args.chunk
@@ -207,10 +210,10 @@ def measure_steps(args: Args, width: int, height: int) -> None:
         splats = project(gaussians, view)
     lists = bin_splats(splats, TileGrid(view.full, args.tile_side), args.chunk)
     sides = part_sides(args, gaussians, view)
-    policies = ["never", "always"] if has_cpp_compiler() else ["never"]
+    policies = ["never", "always"] if can_build() else ["never"]
     for policy in policies:
         rasterizer = TorchRasterizer(policy, tile_side=args.tile_side, chunk=args.chunk)
-        label = {"never": "eager", "always": "compiled"}[policy]
+        label = {"never": "eager", "always": "built"}[policy]
         sides |= {f"{label}: {name}": run for name, run in step_sides(rasterizer, gaussians, view).items()}
     print(f"\n## Steps: {width}x{height}, {args.gaussians} Gaussians, ms\n")
     visible = splats.radii > 0

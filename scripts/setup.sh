@@ -107,9 +107,16 @@ check_open3d() {
   fi
 }
 
+# The torch rasterizer's kernels for this processor; without a compiler it stays slow and says so itself.
+build_kernels() {
+  say "building the CPU rasterizer's kernels: a minute or two, once per machine"
+  "$VENV_PYTHON" -c 'from abcd_ns.engine.rasterizer import TorchRasterizer; TorchRasterizer().warm_up()'
+}
+
 [[ $(uname -sm) == "Linux x86_64" ]] ||
   die "the pinned set is for Linux on x86-64; here, install into an environment of your own: pip install -e '.[dev]'"
 make_venv
 install_packages
 check_open3d
+build_kernels
 say "done: $VENV is ready"

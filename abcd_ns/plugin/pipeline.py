@@ -88,6 +88,7 @@ class AbcdPipeline(VanillaPipeline):
     def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Coordinator:
         config, folder = self.config, trainer.base_dir / "abcd"
         views = views_of(self.datamanager.train_dataset.cameras)
+        self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer)
         tree = BlockTree.from_json(store.header["tree"])
         coordinator = Coordinator(

@@ -50,6 +50,10 @@ class Rasterizer(Protocol):
     """Identifies backend and version; part of every layer's key."""
     supports_z_window: bool
 
+    def warm_up(self) -> None:
+        """Do now, before a clock runs, what would otherwise be done on first use or not at all: compile."""
+        ...
+
     def __call__(
         self,
         gaussians: Gaussians,

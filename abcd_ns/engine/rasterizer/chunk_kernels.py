@@ -1,47 +1,52 @@
-"""Runs the chunk kernels eagerly or through `torch.compile`, and decides when compiling pays."""
+"""Chooses between the eager chunk kernels and the built ones."""
 
-import functools
-import os
-import shutil
-import time
-import warnings
-from collections.abc import Callable
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer import torch_kernels
+from abcd_ns.engine.rasterizer.built_kernels import BuiltKernels, build_kernels, load_kernels
 
 CompilePolicy = Literal["auto", "always", "never"]
-EAGER_SECONDS = 10.0
-"""With "auto": time spent in eager kernels after which they are compiled. Compiling takes
-tens of seconds at first, less from inductor's cache on disk: short runs are better off without."""
-
-
-def has_cpp_compiler() -> bool:
-    """Whether `torch.compile` finds a C++ compiler for the CPU."""
-    return any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "g++", "clang++"))
-
-
-@functools.cache
-def _compiled(kernel: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """One compiled kernel for the whole process: all rasterizers share it."""
-    return torch.compile(kernel)
 
 
 class ChunkKernels:
-    """`forward_chunk` and `backward_chunk`, eager or compiled."""
+    """`forward_chunk` and `backward_chunk`, eager or built ahead of time.
 
-    def __init__(self, policy: CompilePolicy) -> None:
-        self.policy = policy
-        self.eager_seconds = 0.0
+    Built kernels serve float32 on the CPU; everything else runs eagerly.
 
-    def forward(
-        self, params: Tensor, origins: Tensor, state: Tensor, window: Tensor | None, side: int
-    ) -> Tensor:
+    Args:
+        policy: "auto" takes built kernels where they are found and builds them when `warm_up` is called;
+            "always" builds them now; "never" is eager.
+    """
+
+    def __init__(self, policy: CompilePolicy, side: int, chunk: int) -> None:
+        self._policy, self._size = policy, (side, chunk)
+        self._built: BuiltKernels | None = None
+        if policy == "auto":
+            self._built = load_kernels(side, chunk)
+        elif policy == "always":
+            self._built = build_kernels(side, chunk)
+
+    @property
+    def are_built(self) -> bool:
+        """Whether float32 on the CPU runs fast."""
+        return self._built is not None
+
+    def warm_up(self) -> None:
+        """Build the kernels, about a minute once per machine, unless the policy is "never"."""
+        if self._policy != "never" and self._built is None:
+            self._built = build_kernels(*self._size)
+
+    def forward(self, params: Tensor, origins: Tensor, state: Tensor, window: Tensor | None) -> Tensor:
         """See torch_kernels.forward_chunk."""
-        return self._run(torch_kernels.forward_chunk, params, origins, state, window, side)
+        side = self._size[0]
+        if not self._suits(params):
+            return torch_kernels.forward_chunk(params, origins, state, window, side)
+        width = params.shape[-1]
+        args = _two_wide(params, origins, state, _window(window, state))
+        return self._built.forward(*args)[..., :width]
 
     def backward(
         self,
@@ -50,41 +55,28 @@ class ChunkKernels:
         state: Tensor,
         upstream: Tensor,
         window: Tensor | None,
-        side: int,
         absgrad: bool,
     ) -> Tensor:
-        """See torch_kernels.backward_chunk."""
-        return self._run(
-            torch_kernels.backward_chunk, params, origins, state, upstream, window, side, absgrad
-        )
+        """See torch_kernels.backward_chunk. Built kernels give the absolute gradients unasked."""
+        side = self._size[0]
+        if not self._suits(params):
+            return torch_kernels.backward_chunk(params, origins, state, upstream, window, side, absgrad)
+        width = params.shape[-1]
+        args = _two_wide(params, origins, state, upstream, _window(window, state))
+        sums = self._built.backward(*args)[..., :width]
+        return sums if absgrad else sums[: torch_kernels.GRADIENTS]
 
-    def compiles(self, params: Tensor) -> bool:
-        if self.policy == "never":
-            return False
-        if self.policy == "always":
-            return True
-        suited = params.device.type == "cpu" and params.dtype == torch.float32
-        return suited and self.eager_seconds > EAGER_SECONDS and has_cpp_compiler()
+    def _suits(self, params: Tensor) -> bool:
+        return self._built is not None and params.device.type == "cpu" and params.dtype == torch.float32
 
-    def _run(self, kernel: Callable[..., Tensor], *args: Tensor | int | None) -> Tensor:
-        params = args[0]
-        if self.compiles(params):
-            return self._run_compiled(kernel, *args)
-        started = time.perf_counter()
-        result = kernel(*args)
-        self.eager_seconds += time.perf_counter() - started
-        return result
 
-    def _run_compiled(self, kernel: Callable[..., Tensor], *args: Tensor | int | None) -> Tensor:
-        width = args[0].shape[-1]
-        if width == 1:  # a size of one would be compiled a second time, as a constant
-            args = tuple(torch.cat((x, x), dim=-1) if isinstance(x, Tensor) else x for x in args)
-        for x in args:
-            if isinstance(x, Tensor):
-                torch._dynamo.mark_dynamic(x, x.ndim - 1)
-        try:
-            return _compiled(kernel)(*args)[..., :width]
-        except (RuntimeError, OSError, ImportError) as error:
-            warnings.warn(f"torch.compile failed, so the torch rasterizer stays slow: {error}", stacklevel=2)
-            self.policy = "never"
-            return kernel(*args)[..., :width]
+def _window(window: Tensor | None, state: Tensor) -> Tensor:
+    """Any window will do where there is none: every Gaussian's ALWAYS is 1."""
+    return state.new_zeros((2, *state.shape[1:])) if window is None else window
+
+
+def _two_wide(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """Built kernels take two tiles or more: a single one is drawn twice."""
+    if tensors[0].shape[-1] > 1:
+        return tensors
+    return tuple(torch.cat((tensor, tensor), dim=-1) for tensor in tensors)

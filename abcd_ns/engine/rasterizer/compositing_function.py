@@ -25,8 +25,8 @@ class Job:
     kernels: ChunkKernels
     windows: Float[Tensor, "2 p a"] | None
     """near and far, in the columns of `lists.tiles`."""
-    always: Float[Tensor, "m"] | None
-    """By rank: 1 where the window does not apply."""
+    always: Float[Tensor, "m"]
+    """By rank: 1 where no window applies."""
     absgrad_target: Tensor | None
     """Gets an attribute `absgrad` in the backward pass: means2d [1, n, 2] of the first n splats."""
 
@@ -46,9 +46,7 @@ def _parameter_table(job: Job, means2d, conics, colors, opacities, depths) -> Fl
     rows = job.lists.rows
     columns = (means2d, conics, opacities[:, None], depths[:, None])
     means2d, conics, opacities, depths = (x.index_select(0, rows).T for x in columns)
-    parts = [means2d, conics, opacities, colors.T, depths]
-    if job.always is not None:
-        parts.append(job.always[None])
+    parts = (means2d, conics, opacities, colors.T, depths, job.always[None])
     return F.pad(torch.cat(parts), (0, 1))
 
 
@@ -110,7 +108,6 @@ def _composite(
             _take(origins, level.width, columns),
             state,
             _take(job.windows, level.width, columns),
-            lists.grid.side,
         )
     if columns is None:
         final[..., : state.shape[2]] = state
@@ -175,9 +172,7 @@ def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> 
         params = gather_params(table, _level_ranks(lists, index, columns))
         planes = (_take(x, level.width, columns) for x in (origins, upstream, job.windows))
         level_origins, level_upstream, level_window = planes
-        sums = job.kernels.backward(
-            params, level_origins, state, level_upstream, level_window, lists.grid.side, absgrad
-        )
+        sums = job.kernels.backward(params, level_origins, state, level_upstream, level_window, absgrad)
         by_slot = sums.view(sums.shape[0], -1).T
         if columns is None:
             per_slot[level.start : level.start + by_slot.shape[0]] = by_slot

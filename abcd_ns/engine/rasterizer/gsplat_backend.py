@@ -114,6 +114,9 @@ class GsplatRasterizer:
     def __init__(self) -> None:
         self.name = f"gsplat-{gsplat.__version__}"
 
+    def warm_up(self) -> None:
+        """Nothing: gsplat compiles when it is imported, at the latest for the self-check."""
+
     def __call__(
         self,
         gaussians: Gaussians,

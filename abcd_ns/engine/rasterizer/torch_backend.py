@@ -66,10 +66,9 @@ class TorchRasterizer:
     Works in float32 and float64 and on any device; made to be fast on a CPU. Deterministic.
 
     Args:
-        compile: "auto" compiles the kernels once the eager ones have run for some seconds, in float32 on a
-            CPU where a C++ compiler is found; "always" at the first call; "never" not at all. Compiled and
-            eager kernels agree to rounding only, so that with "auto" the last bits of a run depend on *when*
-            compiling set in: use "always" or "never" where runs must repeat bit for bit.
+        compile: whether float32 on the CPU runs on kernels built ahead of time (see built_kernels): "auto"
+            if they are found, "always" building them now if need be, "never" not at all. Built and eager
+            kernels agree to rounding only: use "never" where last bits must not depend on the machine.
         tile_side: pixels along a tile's side; a divisor of 16. Speed only.
         chunk: Gaussians per kernel call and tile. Speed and memory only.
 
@@ -85,9 +84,13 @@ class TorchRasterizer:
     ) -> None:
         if tile_side < 1 or 16 % tile_side:
             raise ValueError(f"tile_side is {tile_side}; choose one of 1, 2, 4, 8, 16.")
-        self.kernels = ChunkKernels(compile)
+        self.kernels = ChunkKernels(compile, tile_side, chunk)
         self.tile_side = tile_side
         self.chunk = chunk
+
+    def warm_up(self) -> None:
+        """See Rasterizer.warm_up."""
+        self.kernels.warm_up()
 
     def __call__(
         self,
@@ -132,7 +135,7 @@ class TorchRasterizer:
         target: Tensor | None,
     ) -> Job:
         if window is None:
-            return Job(lists, self.kernels, None, None, target)
+            return Job(lists, self.kernels, None, torch.ones_like(colors[:, 0]), target)
         planes = lists.grid.to_tiles(torch.stack((window.near, window.far)).to(colors)).index_select(
             2, lists.tiles
         )

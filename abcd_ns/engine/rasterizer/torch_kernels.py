@@ -1,6 +1,6 @@
 """The two inner kernels of the torch rasterizer, forward and backward, over one chunk of many tiles at once.
 
-Both walk K Gaussians front to back with a Python loop, which `torch.compile` unrolls and fuses. Layout:
+Both walk K Gaussians front to back with a Python loop, which compiling unrolls and fuses. Layout:
 [lane k, pixel p, tile a], tiles innermost, so that every operation runs along contiguous memory.
 
 The state of a pixel is five planes: transmittance T, then premultiplied colour and depth. Compositing
@@ -21,7 +21,7 @@ MIN_TRANSMITTANCE = 1e-4
 STATE_PLANES = 5
 
 X, Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, DEPTH, ALWAYS = range(11)
-"""Rows of the parameter table. ALWAYS (1: not subject to the z window) is there only with a window."""
+"""Rows of the parameter table. ALWAYS is 1 where the z window does not apply."""
 
 MOMENTS = 6
 GRADIENTS = MOMENTS + 4

@@ -11,7 +11,6 @@ from abcd_ns.engine.run_state import Budget, Stopwatch
 from abcd_ns.tools.compare.evaluate import mean_psnr
 from abcd_ns.tools.compare.protocol import Settings
 from abcd_ns.tools.compare.results import CurvePoint
-from abcd_ns.tools.compare.warm_up import warm_up
 
 
 class CurveRecorder:
@@ -118,13 +117,7 @@ class Training:
         """Compile what will be drawn with, before the clock runs."""
         if self.coordinator is None:
             return
-        model = self.pipeline.model
-        warm_up(
-            model.draws_with(),
-            model.device,
-            absgrad=self.coordinator.density.absgrad,
-            windows=self.coordinator.config.layers and self.blocks > 1,
-        )
+        self.pipeline.model.draws_with().warm_up()
 
     @property
     def steps(self) -> int:
