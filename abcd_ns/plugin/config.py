@@ -114,6 +114,8 @@ class AbcdTrainerConfig(TrainerConfig):
         try:
             if self.machine.num_devices * self.machine.num_machines > 1:
                 raise UserError("ABCD trains on one device; leave out --machine.num-devices.")
+            if self.pipeline.blocks < 1:
+                raise UserError(f"--pipeline.blocks must be 1 or more, not {self.pipeline.blocks}.")
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")
             self.pipeline.model.mirror(self.pipeline.training)

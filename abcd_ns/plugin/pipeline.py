@@ -15,7 +15,6 @@ from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore, view_fingerprint
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.errors import UserError
 from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
@@ -122,13 +121,7 @@ class AbcdPipeline(VanillaPipeline):
 
 
 def cut_space(gaussians: Gaussians, blocks: int, partition: str) -> BlockTree:
-    """Cells for a scene that is about to be trained.
-
-    Raises:
-        UserError: fewer than one block.
-    """
-    if blocks < 1:
-        raise UserError(f"--pipeline.blocks must be 1 or more, not {blocks}.")
+    """Cells for a scene that is about to be trained."""
     if partition == "kd":
         return build_kd(gaussians.means, blocks)
     return build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))

@@ -1,6 +1,7 @@
 """Growing and pruning: gsplat's strategies on a block's own clock."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -39,7 +40,7 @@ def test_every_number_of_views_gets_refinements(views):
     steps = range(1, 20 * max(views, 100) + 1)
     due = [s for s in steps if control.is_due(clock(steps=s, views=views))]
     assert len(due) >= 10
-    assert all(b - a >= max(100, views) for a, b in zip(due, due[1:], strict=False))
+    assert all(b - a >= max(100, views) for a, b in pairwise(due))
     assert due[0] >= 4 * views
 
 

@@ -44,7 +44,8 @@ def test_built_equals_eager_and_is_found_again(own_folder):
     assert len(list(own_folder.glob("*.pt2"))) == 2
 
 
-def test_failing_to_build_warns_and_stays_eager(own_folder, monkeypatch):
+@pytest.mark.usefixtures("own_folder")
+def test_failing_to_build_warns_and_stays_eager(monkeypatch):
     def fail(*_args, **_options):
         return subprocess.CompletedProcess([], 1, "", "Traceback\nRuntimeError: no such compiler")
 
@@ -57,7 +58,8 @@ def test_failing_to_build_warns_and_stays_eager(own_folder, monkeypatch):
     assert torch.equal(rasterizer(gaussians, view, sh_degree=0).color, expected.color)
 
 
-def test_a_damaged_file_warns_and_stays_eager(own_folder):
+@pytest.mark.usefixtures("own_folder")
+def test_a_damaged_file_warns_and_stays_eager():
     for path in built_kernels._paths(4, 16):
         path.write_bytes(b"not a package")
     with pytest.warns(UserWarning, match="cannot be loaded"):
@@ -70,7 +72,8 @@ def test_without_built_kernels_nothing_is_built_unasked(own_folder, policy):
     assert not list(own_folder.iterdir())
 
 
-def test_never_means_never(own_folder, monkeypatch):
+@pytest.mark.usefixtures("own_folder")
+def test_never_means_never(monkeypatch):
     monkeypatch.setattr(built_kernels, "can_build", lambda: pytest.fail("asked for a compiler"))
     kernels = ChunkKernels("never", 4, 16)
     kernels.warm_up()

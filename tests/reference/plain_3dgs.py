@@ -19,8 +19,8 @@ def train_plain(
     """Train for `steps` on the views in the order that a run of one block takes, and return the result."""
     params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
     adam = {name: torch.optim.Adam([params[name]], lr=RATES[name], eps=1e-15) for name in PARAM_NAMES}
-    draw, density, growth, taken = TorchRasterizer(compile="never"), DensityControl(config.density), {}, 0
-    for row, degree in _rows(views, steps, config):
+    draw, density, growth = TorchRasterizer(compile="never"), DensityControl(config.density), {}
+    for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
         adam["means"].param_groups[0]["lr"] = exponential_decay(
             taken / steps, config.means_lr, config.means_lr_final
@@ -46,9 +46,8 @@ def train_plain(
         loss.backward()
         for optimizer in adam.values():
             optimizer.step()
-        taken += 1
-        seed = random.Random(f"density {config.seed} {taken}").getrandbits(62)
-        clock = DensityClock(taken / steps, taken, len(views), None, seed)
+        seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
+        clock = DensityClock((taken + 1) / steps, taken + 1, len(views), None, seed)
         growth = density.after_step(params, adam, growth, raster.info, clock)
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 

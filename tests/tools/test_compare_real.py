@@ -5,44 +5,18 @@ from io import StringIO
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 import torch
-from PIL import Image
+from abcd_ns.tools.compare.warm_up import warm_up
 from rich.console import Console
 
 from abcd_ns.engine.rasterizer import TorchRasterizer
 from abcd_ns.tools.compare.command import carry_out
 from abcd_ns.tools.compare.protocol import Options, make_plan
 from abcd_ns.tools.compare.results import read_results
-from abcd_ns.tools.compare.warm_up import warm_up
+from tests.reference.colmap_scene import HELD_OUT, write_scene
 
-WIDTH, HEIGHT, VIEWS, STEPS = 48, 32, 10, 20
-HELD_OUT = 2
-"""Rows 0 and 8 of ten."""
-
-
-def write_scene(folder: Path) -> None:
-    """Coloured points on a wall, and photos of a wall in two colours, by cameras that move along it."""
-    rng = np.random.default_rng(0)
-    model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(
-        camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=[40.0, 40.0, WIDTH / 2, HEIGHT / 2]
-    )
-    model.add_camera_with_trivial_rig(camera)
-    (folder / "images").mkdir(parents=True)
-    for i in range(VIEWS):
-        name, shift = f"{i:02d}.png", 0.2 * i - 1
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-shift, 0.0, 4.0]))
-        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=i + 1), pose)
-        x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / 40 * 4 + shift
-        row = np.where((x > 0)[:, None], (200, 60, 40), (40, 80, 200)).astype(np.uint8)
-        Image.fromarray(np.tile(row, (HEIGHT, 1, 1))).save(folder / "images" / name)
-    for xyz in rng.uniform((-3, -2, -0.05), (3, 2, 0.05), (300, 3)):
-        color = np.array((200, 60, 40) if xyz[0] > 0 else (40, 80, 200), np.uint8)
-        model.add_point3D(xyz, pycolmap.Track(), color)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    model.write_binary(str(folder / "sparse" / "0"))
+STEPS = 20
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +34,7 @@ def compared(tmp_path_factory):
         pictures=1,
     )
     plan, stream = make_plan(options), StringIO()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TORCHDYNAMO_DISABLE", "1")  # compiling takes longer than everything else here
-        code = carry_out(plan, Console(file=stream, width=100))
+    code = carry_out(plan, Console(file=stream, width=100))
     assert code == 0, stream.getvalue()
     return read_results(plan.out / "results.json"), plan, stream.getvalue()
 

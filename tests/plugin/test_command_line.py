@@ -1,0 +1,44 @@
+"""The real commands from the shell, as a user types them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.reference.colmap_scene import write_scene
+
+BIN = Path(sys.executable).parent
+
+
+def shell(command: str, *args: object) -> subprocess.CompletedProcess[str]:
+    words = [str(BIN / command), *map(str, args)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.cli
+def test_train_then_evaluate(tmp_path):
+    data = write_scene(tmp_path / "wall")
+    train = shell(
+        "ns-train", "abcd", "--data", data, "--output-dir", tmp_path / "out", "--timestamp", "run",
+        "--max-num-iterations", 30, "--pipeline.blocks", 2, "--vis", "tensorboard",
+    )  # fmt: skip
+    assert train.returncode == 0, train.stdout[-3000:] + train.stderr[-3000:]
+    assert "training on the CPU" in train.stdout or "GPU" in train.stdout
+    assert "30 steps" in train.stdout
+    run = tmp_path / "out" / "wall" / "abcd" / "run"
+    evaluate = shell("ns-eval", "--load-config", run / "config.yml", "--output-path", tmp_path / "eval.json")
+    assert evaluate.returncode == 0, evaluate.stderr[-3000:]
+    assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 14
+
+
+@pytest.mark.cli
+def test_a_wrong_folder_is_one_line_and_nothing_is_written(tmp_path):
+    out = tmp_path / "out"
+    train = shell("ns-train", "abcd", "--data", tmp_path / "garden", "--output-dir", out)
+    assert train.returncode == 2
+    assert "error:" in train.stdout
+    assert "garden" in train.stdout
+    assert "Traceback" not in train.stdout + train.stderr
+    assert not out.exists()

@@ -1,0 +1,192 @@
+"""ABCD through nerfstudio's own trainer and tools, in this process, on a tiny scene."""
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from nerfstudio.scripts.exporter import ExportGaussianSplat
+from nerfstudio.utils.eval_utils import eval_setup
+from plyfile import PlyData
+
+from abcd_ns import methods
+from abcd_ns.engine.storage import ParameterStore
+from abcd_ns.plugin.config import AbcdTrainerConfig
+from abcd_ns.plugin.trainer import AbcdTrainer
+from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
+
+STEPS = 36
+
+# nerfstudio 1.1.5 calls torch's GradScaler and torch.load by names that newer versions of torch deprecate.
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::UserWarning:nerfstudio")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+def configure(data: Path, out: Path, method=methods.abcd, *, steps: int = STEPS, blocks: int = 3, **options):
+    config: AbcdTrainerConfig = copy.deepcopy(method.config)
+    config.data = config.pipeline.datamanager.data = data
+    config.output_dir, config.vis, config.max_num_iterations = out, "tensorboard", steps
+    config.steps_per_save, config.timestamp = 10, "run"
+    if config.method_name != "abcd-monolithic":
+        config.pipeline.blocks = blocks
+    config.viewer.quit_on_train_completion = True
+    for name, value in options.items():
+        setattr(config, name, value)
+    return config
+
+
+def run(config: AbcdTrainerConfig, stop_after: int | None = None) -> AbcdTrainer:
+    """Train as ns-train does; `stop_after` breaks off without saving, as a kill would."""
+    config.set_timestamp()
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    if stop_after is None:
+        trainer.train()
+    else:
+        after_step = trainer.pipeline._after_step
+
+        def break_off(who) -> None:
+            after_step(who)
+            if trainer.step + 1 == stop_after:
+                raise KeyboardInterrupt
+
+        trainer.pipeline._after_step = break_off
+        with pytest.raises(KeyboardInterrupt):
+            trainer.train()
+    trainer.pipeline.coordinator.scene.store.close()
+    trainer.pipeline.coordinator.cache.close()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory) -> AbcdTrainer:
+    return run(configure(data, tmp_path_factory.mktemp("out")))
+
+
+def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
+    (checkpoint,) = trained.checkpoint_dir.iterdir()
+    assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"
+    state = torch.load(checkpoint, weights_only=True)
+    store = ParameterStore.open(trained.base_dir / "abcd" / "store", read_only=True)
+    in_store = torch.cat([store.load_names(b, ["means"])["means"] for b in store.blocks])
+    assert torch.equal(state["pipeline"]["_model.gauss_params.means"], in_store)
+    assert len(in_store) >= 300
+    assert store.pins == [checkpoint.stem]
+
+
+def test_training_improved_the_held_out_views(trained):
+    _, pipeline, _, step = eval_setup(trained.base_dir / "config.yml")
+    assert step == STEPS - 1
+    metrics = pipeline.get_average_eval_image_metrics()
+    assert len(pipeline.datamanager.fixed_indices_eval_dataloader) == HELD_OUT
+    assert metrics["psnr"] > 14
+    assert 0 < metrics["ssim"] <= 1
+
+
+def test_composited_and_merged_pictures_of_a_checkpoint_agree(trained):
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
+    assert pipeline.model.tree.num_blocks == 3
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    merged = pipeline.model.get_outputs_for_camera(camera)
+    pipeline.model.config.render = "composited"
+    composited = pipeline.model.get_outputs_for_camera(camera)
+    assert set(merged) == {"rgb", "depth", "accumulation", "background"}
+    assert merged["depth"].shape == (HEIGHT, WIDTH, 1)
+    # 1e-4 is what is left of the light where drawing stops.
+    assert float((merged["rgb"] - composited["rgb"]).abs().max()) < 5e-4
+
+
+def test_the_exported_ply_is_the_merged_scene(trained, tmp_path):
+    ExportGaussianSplat(load_config=trained.base_dir / "config.yml", output_dir=tmp_path).main()
+    vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+    state = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)["pipeline"]
+    means = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    assert np.array_equal(means, state["_model.gauss_params.means"].numpy())
+    assert np.array_equal(vertices["opacity"], state["_model.gauss_params.opacities"][:, 0].numpy())
+    assert np.array_equal(vertices["f_dc_1"], state["_model.gauss_params.features_dc"][:, 1].numpy())
+
+
+@pytest.mark.parametrize("stop_after", [14, 27])
+def test_a_run_that_is_broken_off_and_resumed_is_the_run_that_was_not(data, tmp_path, trained, stop_after):
+    broken = run(configure(data, tmp_path / "broken"), stop_after=stop_after)
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=broken.checkpoint_dir))
+    expected = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)["pipeline"]
+    (checkpoint,) = resumed.checkpoint_dir.iterdir()
+    assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"
+    found = torch.load(checkpoint, weights_only=True)["pipeline"]
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert value == found[name] if isinstance(value, dict) else torch.equal(value, found[name]), name
+
+
+def test_resuming_a_finished_run_trains_no_further(data, tmp_path, trained):
+    again = run(configure(data, tmp_path, load_dir=trained.checkpoint_dir))
+    assert again.pipeline.coordinator.state.step == STEPS
+    assert [p.name for p in again.checkpoint_dir.iterdir()] == [f"step-{STEPS - 1:09d}.ckpt"]
+
+
+def test_more_steps_go_on_from_where_a_run_ended(data, tmp_path, trained):
+    longer = run(configure(data, tmp_path, load_dir=trained.checkpoint_dir, steps=STEPS + 8))
+    assert longer.pipeline.coordinator.state.step == STEPS + 8
+
+
+@pytest.mark.parametrize("method", [methods.abcd_ablated, methods.abcd_monolithic])
+def test_the_other_methods_train_and_load(data, tmp_path, method):
+    trainer = run(configure(data, tmp_path, method, steps=12))
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    assert pipeline.model.tree.num_blocks == (1 if method is methods.abcd_monolithic else 3)
+    assert np.isfinite(pipeline.get_average_eval_image_metrics()["psnr"])
+
+
+def test_while_training_only_the_live_block_is_registered(data, tmp_path):
+    config = configure(data, tmp_path, steps=3)
+    trainer = run(config)
+    assert trainer.pipeline.coordinator.count() == 300
+    sizes = []
+    stopped = run(configure(data, tmp_path / "b"), stop_after=2)
+    sizes.append(sum(p.shape[0] for n, p in stopped.pipeline.model.named_parameters() if n.endswith("means")))
+    assert 0 < max(sizes) < 300
+
+
+def test_seconds_end_a_run(data, tmp_path):
+    config = configure(data, tmp_path, steps=100_000)
+    config.pipeline.max_seconds = 2.0
+    trainer = run(config)
+    assert trainer.pipeline.coordinator.finished
+    assert trainer.pipeline.coordinator.state.step < 100_000
+    assert trainer.pipeline.coordinator.state.active is None
+
+
+def test_the_saved_config_is_the_config(trained):
+    loaded = yaml.load((trained.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
+    assert isinstance(loaded, AbcdTrainerConfig)
+    assert loaded.pipeline.training == trained.config.pipeline.training
+    assert loaded.machine.device_type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda c: setattr(c.pipeline.model, "warmup_length", 7), "--pipeline.model.warmup-length"),
+        (lambda c: setattr(c.machine, "num_devices", 2), "one device"),
+        (lambda c: setattr(c, "mixed_precision", True), "float32"),
+        (lambda c: setattr(c.pipeline, "blocks", 0), "--pipeline.blocks"),
+        (lambda c: setattr(c.pipeline.datamanager, "data", Path("nowhere")), "nowhere"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_is_written(data, tmp_path, capsys, spoil, expected):
+    config = configure(data, tmp_path)
+    spoil(config)
+    config.set_timestamp()
+    with pytest.raises(SystemExit) as stopped:
+        config.save_config()
+    assert stopped.value.code == 2
+    assert expected in capsys.readouterr().out
+    assert not any(tmp_path.iterdir())
