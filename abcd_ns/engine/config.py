@@ -18,9 +18,9 @@ class TrainingConfig:
     paper). `auto` takes fragments where the rasterizer can mask by depth."""
     window_percentile: float = 0.9
     """Share of the active Gaussians' extents that the window of sorted-in fragments must hold."""
-    first_passes: int = 1
+    first_passes: int = 2
     """Uses of each view in a visit of the first sweep."""
-    last_passes: int = 4
+    last_passes: int = 8
     """Uses of each view in a visit of late sweeps."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
