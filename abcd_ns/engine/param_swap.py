@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
+from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.block_state import MOMENTS, BlockState, Clocks
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
-Params = MutableMapping[str, Parameter]
-"""The live parameters by name; a dict or a torch ParameterDict."""
+Params = MutableMapping[str, Parameter] | ParameterDict
+"""The live parameters by name."""
 Optimizers = Mapping[str, torch.optim.Optimizer]
 """One Adam per parameter, under the parameter's name; each with one parameter group."""
 

@@ -19,10 +19,6 @@ from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
 
 STEPS = 36
 
-# nerfstudio 1.1.5 calls torch's GradScaler and torch.load by names that newer versions of torch deprecate.
-pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::UserWarning:nerfstudio")
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     return write_scene(tmp_path_factory.mktemp("data") / "wall")
