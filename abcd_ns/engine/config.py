@@ -18,10 +18,12 @@ class TrainingConfig:
     paper). `auto` takes fragments where the rasterizer can mask by depth."""
     window_percentile: float = 0.9
     """Share of the active Gaussians' extents that the window of sorted-in fragments must hold."""
+    visit_views: int = 32
+    """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
     first_passes: int = 2
-    """Uses of each view in a visit of the first sweep."""
+    """Uses of each of these views in a visit of the first sweep."""
     last_passes: int = 8
-    """Uses of each view in a visit of late sweeps."""
+    """Uses of each of these views in a visit of late sweeps; one more with each sweep until then."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
     sh_degree: int = 3

@@ -32,6 +32,8 @@ from abcd_ns.engine.schedule import (
     plan_sweep,
     sh_degree_at,
     view_order,
+    views_per_visit,
+    visit_views,
 )
 from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -236,11 +238,14 @@ class Coordinator:
     def _begin_visit(self) -> None:
         began = self.stopwatch.seconds
         plan, geometry = self._next_visit()
+        earlier = BlockState.from_tensors(*self.scene.store.load(plan.block)).clocks.visits
+        used = self._views_used(len(geometry.views))
         self.state.active = ActiveVisit(
             number=self.state.visit,
             geometry=geometry,
             sh_degree=self.sh_degree,
             steps=plan.steps,
+            views=visit_views(geometry.views, used, earlier, self.config.seed),
             began=began,
         )
         self.state.visit += 1
@@ -256,13 +261,14 @@ class Coordinator:
                 return plan, geometry
 
     def _attach(self, active: ActiveVisit) -> None:
-        block, views = active.geometry.block, active.geometry.views
+        block = active.geometry.block
         rest = BlockState.from_tensors(*self.scene.store.load(block)).to(self.device)
         attach(rest, self.params, self.optimizers)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
         self.scene.lay_over(block, lambda: live_gaussians(self.params))
-        self._order = view_order(views, active.steps, active.number, self.config.seed)
-        self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, len(views), len(rest)))
+        self._order = view_order(active.views, active.steps, active.number, self.config.seed)
+        seen = len(active.geometry.views)
+        self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
         self._layers = self._draw_layers(active)
         active.layer_seconds += self.stopwatch.seconds - before
@@ -324,10 +330,16 @@ class Coordinator:
                 state.sweep += 1
             remaining = None if self.budget.steps is None else self.budget.steps - state.step
             passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
-            state.queue = list(plan_sweep(state.sweep, state.views, passes, remaining, config.seed))
+            used = {block: self._views_used(seen) for block, seen in state.views.items()}
+            state.queue = list(plan_sweep(state.sweep, used, passes, remaining, config.seed))
             if not state.queue:
                 raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
         return state.queue.pop(0)
+
+    def _views_used(self, seen: int) -> int:
+        """Of the views that see a block, how many a visit uses."""
+        most = max(self.state.views.values())
+        return views_per_visit(seen, most, self.config.visit_views) if most else 0
 
     @property
     def _uses_windows(self) -> bool:

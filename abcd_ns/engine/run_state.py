@@ -37,6 +37,8 @@ class ActiveVisit:
     sh_degree: int
     """In use from the visit's first step to its last, so that its layers stay right."""
     steps: int
+    views: tuple[int, ...]
+    """Indices of the views in use, of those that see the block."""
     done: int = 0
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
@@ -63,7 +65,11 @@ class RunState:
 
     def to_json(self) -> dict[str, Any]:
         """As JSON; `from_json` gives an equal state."""
-        active = self.active and {**vars(self.active), "geometry": self.active.geometry.to_json()}
+        active = self.active and {
+            **vars(self.active),
+            "geometry": self.active.geometry.to_json(),
+            "views": list(self.active.views),
+        }
         queue = [[plan.block, plan.steps] for plan in self.queue]
         views = {str(block): count for block, count in self.views.items()}
         return {**vars(self), "queue": queue, "active": active, "views": views}
@@ -73,7 +79,8 @@ class RunState:
         """The inverse of `to_json`."""
         active = data["active"]
         if active is not None:
-            active = ActiveVisit(**{**active, "geometry": VisitGeometry.from_json(active["geometry"])})
+            geometry = VisitGeometry.from_json(active["geometry"])
+            active = ActiveVisit(**{**active, "geometry": geometry, "views": tuple(active["views"])})
         queue = [VisitPlan(*plan) for plan in data["queue"]]
         views = {int(block): count for block, count in data["views"].items()}
         return RunState(**{**data, "queue": queue, "active": active, "views": views})

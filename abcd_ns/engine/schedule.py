@@ -30,7 +30,7 @@ def plan_sweep(
     """The visits of one sweep, in a random order that depends on `seed` and `sweep` alone.
 
     Args:
-        views: by block, the number of views that see it; blocks seen by none are left out.
+        views: by block, the number of views that a visit uses; blocks with none are left out.
         passes: steps a visit = passes x views.
         remaining: steps left in the budget, or None without one. Where they do not suffice for the sweep,
             or would leave less than half a sweep behind, all visits are scaled to use up exactly these.
@@ -45,6 +45,26 @@ def plan_sweep(
         return ()
     shares = _apportion(remaining, [seen[block] for block in order])
     return tuple(VisitPlan(block, share) for block, share in zip(order, shares, strict=True) if share > 0)
+
+
+def views_per_visit(seen: int, most_seen: int, limit: int) -> int:
+    """How many of the `seen` views of a block a visit uses.
+
+    The same share of every block's views, so that steps stay in proportion, and `limit` for the block that
+    `most_seen` views see: a visit draws F and B for each view it uses, and stays short where there are many.
+    """
+    return -(-seen * min(limit, most_seen) // most_seen)  # rounded up
+
+
+def visit_views(views: tuple[int, ...], count: int, visits: int, seed: int) -> tuple[int, ...]:
+    """The views of a block's visit after `visits` earlier ones: in turn, all are used equally often."""
+    start, cycles = visits * count, []
+    for cycle in range(start // len(views), (start + count - 1) // len(views) + 1):
+        shuffled = list(views)
+        random.Random(f"cycle {seed} {cycle}").shuffle(shuffled)
+        cycles += shuffled
+    offset = start % len(views)
+    return tuple(dict.fromkeys(cycles[offset : offset + count]))
 
 
 def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tuple[int, ...]:

@@ -12,6 +12,8 @@ from abcd_ns.engine.schedule import (
     plan_sweep,
     sh_degree_at,
     view_order,
+    views_per_visit,
+    visit_views,
 )
 
 VIEWS = st.dictionaries(st.integers(0, 30), st.integers(0, 200), min_size=1, max_size=12)
@@ -78,3 +80,28 @@ def test_degree_of_30000_steps_is_splatfactos():
 def test_degree_without_a_ramp_is_the_highest():
     assert sh_degree_at(0.0, 0.0, 3) == 3
     assert sh_degree_at(1.0, 0.1, 0) == 0
+
+
+@given(most=st.integers(1, 400), limit=st.integers(1, 64), data=st.data())
+def test_every_block_uses_the_same_share_of_its_views(most, limit, data):
+    seen = data.draw(st.integers(0, most))
+    used = views_per_visit(seen, most, limit)
+    assert (used == 0) == (seen == 0)
+    assert used <= seen
+    assert abs(used - seen * min(1, limit / most)) < 1
+    assert views_per_visit(most, most, limit) == min(most, limit)
+
+
+@given(count=st.integers(1, 30), data=st.data())
+def test_visits_use_all_views_of_a_block_in_turn(count, data):
+    used = data.draw(st.integers(1, count))
+    views = tuple(range(100, 100 + count))
+    uses = Counter()
+    for visits in range(3 * count):
+        chosen = visit_views(views, used, visits, seed=2)
+        assert set(chosen) <= set(views)
+        assert 1 <= len(chosen) <= used
+        uses.update(chosen)
+    # 3 count visits pass through the views 3 used times; a view that a visit meets twice is used once.
+    assert max(uses.values()) <= 3 * used
+    assert min(uses.values()) >= 2 * used

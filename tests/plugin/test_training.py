@@ -19,6 +19,7 @@ from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
 
 STEPS = 36
 
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     return write_scene(tmp_path_factory.mktemp("data") / "wall")
