@@ -36,10 +36,8 @@ class TrainingConfig:
     """Scale opacities by gsplat's compensation for its low-pass filter."""
     background: Literal["random", "black", "white"] = "random"
     """What lies behind the scene while training."""
-    means_lr: float = 1.6e-4
-    """Learning rate of the means at the start."""
-    means_lr_final: float = 1.6e-6
-    """Learning rate of the means at the end; exponential between the two over the run."""
+    means_lr_decay: float = 0.01
+    """Learning rate of the means at the end, as a share of the start's; exponential over the run."""
     seed: int = 0
     """Of the order of blocks and views, backgrounds and splits."""
     density: DensityConfig = field(default_factory=DensityConfig)

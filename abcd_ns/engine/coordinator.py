@@ -69,7 +69,8 @@ class Coordinator:
 
     Args:
         views: the training views; `View.index` names them.
-        params, optimizers: as `param_swap` wants them. Their present content is dropped.
+        params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
+            learning rates; that of the means is the one to decay from.
         scene_key: fingerprint of the capture, part of every layer's key.
     """
 
@@ -98,6 +99,7 @@ class Coordinator:
         self._scene_key = scene_key
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
+        self._means_lr: float = optimizers["means"].param_groups[0]["lr"]
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
         self._layers: VisitLayers | None = None
@@ -125,7 +127,7 @@ class Coordinator:
         if self.state.active is None:
             self._begin_visit()
         active = self._active
-        rate = exponential_decay(self.progress, self.config.means_lr, self.config.means_lr_final)
+        rate = exponential_decay(self.progress, self._means_lr, self._means_lr * self.config.means_lr_decay)
         self.optimizers["means"].param_groups[0]["lr"] = rate
         view = self._order[active.done]
         around = self._layers.around(view) if self._layers else None

@@ -20,10 +20,10 @@ from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.pipeline import AbcdPipeline
 from abcd_ns.plugin.trainer import AbcdTrainer
 
-HONOURED = {"random_init", "num_random", "random_scale", "loss_coefficients", "prompt", "enable_collider"}
-"""Splatfacto's model options that ABCD obeys as they are."""
 MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
-"""Those which `AbcdModelConfig.mirror` sets from the training options, since nerfstudio's tools read them."""
+"""Splatfacto's model options that nerfstudio's tools read; `AbcdModelConfig.mirror` sets them."""
+HONOURED = {"random_init", "num_random", "random_scale", "loss_coefficients", "prompt", "enable_collider"}
+"""Those that ABCD obeys as they are."""
 
 
 @dataclass
@@ -66,11 +66,18 @@ class AbcdModelConfig(SplatfactoModelConfig):
                     f"--pipeline.model.{flag} is splatfacto's and has no effect here; see the options under "
                     "--pipeline.training in `ns-train abcd --help`."
                 )
-        self.sh_degree = training.sh_degree
-        self.ssim_lambda = training.ssim_lambda
-        self.rasterize_mode = "antialiased" if training.antialiased else "classic"
-        self.background_color = training.background
-        self.ownership = training.ownership
+        mirrored = {
+            "sh_degree": ("sh_degree", training.sh_degree),
+            "ssim_lambda": ("ssim_lambda", training.ssim_lambda),
+            "rasterize_mode": ("antialiased", "antialiased" if training.antialiased else "classic"),
+            "background_color": ("background", training.background),
+            "ownership": ("ownership", training.ownership),
+        }
+        for name, (source, value) in mirrored.items():
+            if getattr(self, name) not in (value, getattr(type(self)(), name)):
+                flags = (f"--pipeline.model.{name}".replace("_", "-"), source.replace("_", "-"))
+                raise UserError(f"{flags[0]} has no effect here; set --pipeline.training.{flags[1]} instead.")
+            setattr(self, name, value)
 
 
 @dataclass
@@ -97,6 +104,14 @@ class AbcdTrainerConfig(TrainerConfig):
     """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""
 
     _target: type = field(default_factory=lambda: AbcdTrainer)
+
+    def print_to_terminal(self) -> None:
+        """A few lines instead of nerfstudio's some hundred; all of it is in config.yml."""
+        pipeline = self.pipeline
+        what = f"{self.method_name} on {pipeline.datamanager.data}"
+        seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
+        blocks = "1 block" if pipeline.blocks == 1 else f"{pipeline.blocks} blocks"
+        CONSOLE.print(f"{what}: {blocks}, {self.max_num_iterations:,} steps{seconds}", highlight=False)
 
     def save_config(self) -> None:
         """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""

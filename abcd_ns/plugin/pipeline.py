@@ -1,6 +1,5 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
-import dataclasses
 import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -91,7 +90,7 @@ class AbcdPipeline(VanillaPipeline):
         store, resumed = self._open_store(folder / STORE, trainer)
         tree = BlockTree.from_json(store.header["tree"])
         coordinator = Coordinator(
-            dataclasses.replace(config.training, means_lr=optimizers["means"].param_groups[0]["lr"]),
+            config.training,
             Budget(trainer.total_steps, config.max_seconds),
             StoredScene(tree, store),
             views,

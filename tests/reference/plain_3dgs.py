@@ -30,7 +30,7 @@ def train_plain(
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
         adam["means"].param_groups[0]["lr"] = exponential_decay(
-            taken / steps, config.means_lr, config.means_lr_final
+            taken / steps, RATES["means"], RATES["means"] * config.means_lr_decay
         )
         raster = draw(
             Gaussians(**{name: params[name] for name in PARAM_NAMES}),
