@@ -64,15 +64,6 @@ def cell_windows(tree: BlockTree, view: View, crop: Crop, nodes: Sequence[int]) 
     return tuple(_interval(tree.box(node), center, directions) for node in nodes)
 
 
-def front_and_behind(window: ZWindow) -> tuple[ZWindow, ZWindow]:
-    """What a window of ray_interval leaves over: (z in front of it, z behind it).
-
-    Where the window is empty because the ray misses its box, all of z counts as in front.
-    """
-    infinite = torch.full_like(window.near, math.inf)
-    return ZWindow(-infinite, window.near), ZWindow(window.far, infinite)
-
-
 def _interval(box: Box, center: list[float], directions: Float[Tensor, "3 h w"]) -> ZWindow:
     near = torch.full_like(directions[0], -math.inf)
     far = torch.full_like(directions[0], math.inf)

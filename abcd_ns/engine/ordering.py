@@ -49,18 +49,3 @@ def split_around(
     order = front_to_back(tree, center)
     place = order.index(block)
     return order[:place], order[place + 1 :]
-
-
-def siblings_around(
-    tree: BlockTree, center: Float[Tensor, "3"], block: int
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """As split_around, with whole subtrees: (nodes in front of `block`, nodes behind it), nearest first.
-
-    As few nodes as there can be: one for each split above the block.
-    """
-    front, behind = [], []
-    for sibling in tree.siblings_to_root(block):
-        near, _ = node_children_in_order(tree, int(tree.parent[sibling]), center)
-        (front if sibling == near else behind).append(sibling)
-    # Lowest first is also nearest first behind the block, and nearest last in front of it.
-    return tuple(reversed(front)), tuple(behind)

@@ -1,9 +1,9 @@
-"""What of a block can be seen where: footprints in the image, views to train on, and reach into cells."""
+"""What of a block can be seen where: footprints in the image, and reach into cells."""
 
 import math
 
 import torch
-from jaxtyping import Bool, Float, Int64, Integer, Real
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from abcd_ns.engine.blocks import Box
@@ -44,11 +44,6 @@ def footprint(
     x, width = _aligned_span(x0, x1, view.width, margin, align)
     y, height = _aligned_span(y0, y1, view.height, margin, align)
     return Crop(x, y, width, height)
-
-
-def select_views(visible_counts: Integer[Tensor, "v"], min_visible: int = 1) -> Int64[Tensor, "m"]:
-    """The views that train a block, ascending: those that see at least `min_visible` of its Gaussians."""
-    return (visible_counts >= min_visible).nonzero()[:, 0]
 
 
 def fragment_box_intersects(

@@ -1,11 +1,11 @@
-"""A layer is found only where every pixel of it would be drawn the same, and used only while it is fresh."""
+"""A layer is found only where every pixel of it would be drawn the same."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from abcd_ns.engine.storage import LayerKey, StaleLayerError, require_fresh, view_fingerprint
+from abcd_ns.engine.storage import LayerKey, view_fingerprint
 from abcd_ns.engine.types import Crop, View
 
 
@@ -62,13 +62,3 @@ def test_a_view_is_known_by_pose_k_and_size():
 def test_a_prefix_is_short_and_printable(prefix):
     with pytest.raises(ValueError, match="prefix"):
         key(prefix=prefix)
-
-
-def test_a_stale_layer_raises():
-    content = ((1, 2), "far", (3, 4))
-    require_fresh(content, {1: 2, 3: 4, 9: 9})
-    require_fresh((), {})
-    with pytest.raises(StaleLayerError, match="block 3: drawn at version 4, now 5"):
-        require_fresh(content, {1: 2, 3: 5})
-    with pytest.raises(StaleLayerError, match="block 1"):
-        require_fresh(content, {3: 4})

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.ordering import front_to_back, node_children_in_order, siblings_around, split_around
+from abcd_ns.engine.ordering import front_to_back, node_children_in_order, split_around
 from abcd_ns.engine.partition import build_grid
 from tests.engine.test_blocks import SEEDS, lattice_points, random_tree
 
@@ -98,19 +98,6 @@ def test_split_around_cuts_the_order_at_the_block(seed, num_blocks):
     for block in range(num_blocks):
         front, behind = split_around(tree, center, block)
         assert (*front, block, *behind) == front_to_back(tree, center)
-
-
-@given(SEEDS, st.integers(1, 12))
-def test_siblings_around_groups_the_order_into_subtrees(seed, num_blocks):
-    tree, center = random_tree(seed, num_blocks), lattice_points(seed, 1)[0]
-    order = front_to_back(tree, center)
-
-    def spread(nodes: tuple[int, ...]) -> list[int]:
-        return [b for node in nodes for b in sorted(tree.leaves(node), key=order.index)]
-
-    for block in range(num_blocks):
-        front, behind = siblings_around(tree, center, block)
-        assert (spread(front), spread(behind)) == tuple(map(list, split_around(tree, center, block)))
 
 
 def test_a_grid_is_ordered_by_manhattan_distance_of_cells():

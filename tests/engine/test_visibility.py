@@ -17,7 +17,6 @@ from abcd_ns.engine.visibility import (
     fragment_box_intersects,
     reach_radius,
     reaches,
-    select_views,
     widest_slant,
 )
 from tests.engine.test_blocks import SEEDS
@@ -76,13 +75,6 @@ def test_footprint_ignores_what_is_culled_whatever_its_place():
 def test_footprint_refuses_a_bad_margin():
     with pytest.raises(ValueError, match="margin >= 0 and align >= 1"):
         footprint(torch.zeros(1, 2), torch.ones(1), small_view(), margin=-1)
-
-
-def test_views_that_see_enough_are_selected():
-    counts = torch.tensor([0, 3, 1, 0, 9])
-    assert select_views(counts).tolist() == [1, 2, 4]
-    assert select_views(counts, min_visible=3).tolist() == [1, 4]
-    assert select_views(counts[:1]).tolist() == []
 
 
 def random_gaussians(seed: int, n: int) -> Gaussians:

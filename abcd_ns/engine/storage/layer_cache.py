@@ -5,7 +5,7 @@ import json
 import os
 import re
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,18 +20,6 @@ Content = tuple[tuple[int, int] | str, ...]
 
 class StaleLayerError(RuntimeError):
     """A layer was drawn from an older version of its block than the store's."""
-
-
-def require_fresh(content: Content, versions: Mapping[int, int]) -> None:
-    """Check that every (block, version) of a layer's content is the store's present version.
-
-    Raises:
-        StaleLayerError: one is not, or its block is unknown.
-    """
-    stale = [part for part in content if not isinstance(part, str) and versions.get(part[0]) != part[1]]
-    if stale:
-        listed = ", ".join(f"block {b}: drawn at version {v}, now {versions.get(b)}" for b, v in stale)
-        raise StaleLayerError(f"The layer is stale ({listed}); draw it again before it is used.")
 
 
 def view_fingerprint(view: View) -> str:
