@@ -6,11 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from abcd_ns.tools.compare.warm_up import warm_up
 from rich.console import Console
 
-from abcd_ns.engine.rasterizer import TorchRasterizer
 from abcd_ns.tools.compare.command import carry_out
 from abcd_ns.tools.compare.protocol import Options, make_plan
 from abcd_ns.tools.compare.results import read_results
@@ -104,31 +101,3 @@ def test_nothing_in_the_results_names_a_folder_of_this_machine(compared):
     assert json.loads(text)["protocol"]["scene"] == "scene"
     assert str(plan.out.parent) not in text
     assert f"{Path.home()}/" not in text
-
-
-@pytest.mark.parametrize("windows", [False, True])
-@pytest.mark.parametrize("absgrad", [False, True])
-def test_warm_up_compiles_the_kernels_that_training_will_use(monkeypatch, absgrad, windows):
-    used = set()
-    rasterizer = TorchRasterizer()
-
-    def note(kernel, *args):
-        assert rasterizer.kernels.policy == "always"
-        if kernel.__name__ == "forward_chunk":
-            used.add(("forward", args[3] is not None))
-        else:
-            used.add(("backward", args[4] is not None, args[6]))
-        return kernel(*args)
-
-    monkeypatch.setattr(rasterizer.kernels, "_run", note)
-    monkeypatch.setattr("abcd_ns.tools.compare.warm_up.has_cpp_compiler", lambda: True)
-    warm_up(rasterizer, torch.device("cpu"), absgrad=absgrad, windows=windows)
-    shapes = (False, True) if windows else (False,)
-    assert used == {("forward", w) for w in shapes} | {("backward", w, absgrad) for w in shapes}
-
-
-def test_nothing_is_warmed_up_where_nothing_is_compiled(monkeypatch):
-    rasterizer = TorchRasterizer()
-    monkeypatch.setattr("abcd_ns.tools.compare.warm_up.has_cpp_compiler", lambda: False)
-    warm_up(rasterizer, torch.device("cpu"), absgrad=True, windows=True)
-    assert rasterizer.kernels.policy == "auto"

@@ -83,7 +83,8 @@ def load_kernels(side: int, chunk: int) -> BuiltKernels | None:
         return None
     try:
         return BuiltKernels(*map(_load, paths))
-    except (RuntimeError, OSError, ValueError) as error:
+    # TypeError, AttributeError: the loader is torch's own, and other versions may call it otherwise.
+    except (RuntimeError, OSError, ValueError, TypeError, AttributeError) as error:
         warnings.warn(f"built kernels in {kernels_folder()} cannot be loaded: {error}", stacklevel=2)
         return None
 
