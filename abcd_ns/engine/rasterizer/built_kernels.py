@@ -98,7 +98,7 @@ def build_kernels(side: int, chunk: int) -> BuiltKernels | None:
     if loaded is not None or not can_build():
         return loaded
     command = [sys.executable, "-m", "abcd_ns.engine.rasterizer.built_kernels", str(side), str(chunk)]
-    # The compiler would cost this process 10 s of imports and half a GB that it never gives back.
+    # In this process the compiler would cost seconds of imports, and memory that is never given back.
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     if run.returncode != 0:
         reason = (run.stderr.strip().splitlines() or ["no output"])[-1]
@@ -108,7 +108,7 @@ def build_kernels(side: int, chunk: int) -> BuiltKernels | None:
 
 
 def _load(path: Path) -> Callable[..., Tensor]:
-    # torch._inductor.aoti_load_package makes the same loader, after 10 s of importing the compiler.
+    # torch._inductor.aoti_load_package makes the same loader, but imports the compiler first.
     loader = torch._C._aoti.AOTIModelPackageLoader(str(path), "model", False, 1, -1)
     return lambda *tensors: loader.run(list(tensors))[0]
 
