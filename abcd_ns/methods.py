@@ -1,11 +1,10 @@
 """The methods that `ns-train` offers. Imports nothing that can fail on a machine with nerfstudio."""
 
 from nerfstudio.configs.base_config import ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig
+from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig, FusedAdamConfig
 
 LEARNING_RATES = {
     "means": 1.6e-4,
@@ -29,7 +28,7 @@ def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
         mixed_precision=False,
         pipeline=AbcdPipelineConfig(**pipeline),
         optimizers={
-            name: {"optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15), "scheduler": None}
+            name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
             for name, rate in LEARNING_RATES.items()
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),

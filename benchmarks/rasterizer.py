@@ -17,10 +17,10 @@ import torch
 import tyro
 from torch import Tensor
 
+from abcd_ns.engine.kernels import can_build
 from abcd_ns.engine.rasterizer import TorchRasterizer
 from abcd_ns.engine.rasterizer import torch_backend as backend
 from abcd_ns.engine.rasterizer.binning import bin_splats
-from abcd_ns.engine.rasterizer.built_kernels import can_build
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels
 from abcd_ns.engine.rasterizer.projection import project
 from abcd_ns.engine.rasterizer.spherical_harmonics import sh_colors
@@ -32,6 +32,7 @@ from abcd_ns.engine.rasterizer.torch_kernels import (
     CONIC_XY,
     CONIC_YY,
     DEPTH,
+    GREEN,
     OPACITY,
     RED,
     X,
@@ -111,7 +112,10 @@ def cumprod_chunk(params: Tensor, origins: Tensor, state: Tensor, side: int) -> 
     after = state[0] * torch.cumprod(1 - alpha, dim=0)
     before = torch.cat((state[:1], after[:-1]))
     weights = torch.where(after > 1e-4, alpha * before, 0.0)
-    channels = [state[1 + c] + (weights * params[RED + c, :, None]).sum(0) for c in range(DEPTH - RED + 1)]
+    channels = [
+        state[plane] + (weights * params[row, :, None]).sum(0)
+        for plane, row in enumerate((RED, GREEN, BLUE, DEPTH), start=1)
+    ]
     return torch.stack([after[-1], *channels])
 
 
@@ -124,7 +128,6 @@ def kernel_inputs(args: Args) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     params[[CONIC_XX, CONIC_YY]] += 0.2
     params[CONIC_XY] *= 0.1
     params[OPACITY] *= 0.2
-    assert BLUE + 1 == DEPTH
     state = torch.zeros(5, args.tile_side**2, TILES)
     state[0] = 1
     return params, torch.zeros(2, TILES), state, torch.rand(5, args.tile_side**2, TILES, generator=generator)
@@ -132,7 +135,7 @@ def kernel_inputs(args: Args) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def measure_kernels(args: Args) -> None:
     params, origins, state, upstream = kernel_inputs(args)
-    leaf, side = params.clone().requires_grad_(), args.tile_side
+    leaf, side, window = params.clone().requires_grad_(), args.tile_side, state[:2]
     forward: dict[str, Callable[[], object]] = {
         "eager cumprod": lambda: cumprod_chunk(params, origins, state, side)
     }
@@ -147,11 +150,11 @@ def measure_kernels(args: Args) -> None:
         kernels = ChunkKernels(policy, side, args.chunk)
 
         def run_forward(kernels: ChunkKernels = kernels) -> None:
-            kernels.forward(params, origins, state, None)
+            kernels.forward(params, origins, state, window)
 
         def run_both(kernels: ChunkKernels = kernels, forward: Callable[[], None] = run_forward) -> None:
             forward()
-            kernels.backward(params, origins, state, upstream, None, False)
+            kernels.backward(params, origins, state, upstream, window)
 
         forward[name], both[name] = run_forward, run_both
     pairs = TILES * side**2 * args.chunk
@@ -185,7 +188,7 @@ def step_sides(
 
 
 def part_sides(args: Args, gaussians: Gaussians, view: View) -> dict[str, Callable[[], object]]:
-    """The parts of a step that the kernels do not touch."""
+    """The parts of a step around the chunk kernels."""
     leaves, grid = as_leaves(gaussians), TileGrid(view.full, args.tile_side)
     with torch.no_grad():
         splats = project(gaussians, view)
@@ -195,7 +198,7 @@ def part_sides(args: Args, gaussians: Gaussians, view: View) -> dict[str, Callab
         (projected.means2d.sum() + projected.conics.sum() + projected.opacities.sum()).backward()
 
     def colours() -> None:
-        sh_colors(leaves.features_dc, leaves.features_rest, leaves.means, view.center, 3).sum().backward()
+        sh_colors(leaves.features_dc, leaves.features_rest, splats.bases, 3).sum().backward()
 
     return {
         "projection, both ways": projection,

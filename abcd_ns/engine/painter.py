@@ -121,10 +121,18 @@ class Painter:
             )
         before = ZWindow(span.near, torch.minimum(span.far, window.near))
         behind = ZWindow(torch.maximum(span.near, window.far), span.far)
-        return Parts(
-            self._draw(gaussians, view, crop, settings, before),
-            self._draw(gaussians, view, crop, settings, behind),
+        if len(gaussians) == 0:
+            nothing = empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
+            return Parts(nothing, nothing)
+        layers = self.rasterizer.layers(
+            gaussians,
+            view,
+            (before, behind),
+            sh_degree=settings.sh_degree,
+            crop=crop,
+            antialiased=settings.antialiased,
         )
+        return Parts(*layers)
 
     def order(self, units: tuple[int, ...], view: View) -> tuple[int, ...]:
         """The units front to back, as `view` sees them."""

@@ -67,7 +67,10 @@ def live_gaussians(params: Params) -> Gaussians:
 
 def make_adam(params: Params, learning_rates: Mapping[str, float], eps: float = 1e-15) -> Optimizers:
     """One Adam for each parameter, as 3DGS uses it."""
-    return {name: torch.optim.Adam([params[name]], lr=learning_rates[name], eps=eps) for name in PARAM_NAMES}
+    return {
+        name: torch.optim.Adam([params[name]], lr=learning_rates[name], eps=eps, fused=True)
+        for name in PARAM_NAMES
+    }
 
 
 def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:

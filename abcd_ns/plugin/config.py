@@ -6,6 +6,7 @@ from typing import Literal
 
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
@@ -78,6 +79,14 @@ class AbcdModelConfig(SplatfactoModelConfig):
                 flags = (f"--pipeline.model.{name}".replace("_", "-"), source.replace("_", "-"))
                 raise UserError(f"{flags[0]} has no effect here; set --pipeline.training.{flags[1]} instead.")
             setattr(self, name, value)
+
+
+@dataclass
+class FusedAdamConfig(AdamOptimizerConfig):
+    """Adam as 3DGS uses it, one pass over memory for each parameter."""
+
+    fused: bool = True
+    """Update a parameter and its moments in one kernel."""
 
 
 @dataclass

@@ -25,7 +25,9 @@ def train_plain(
 ) -> Gaussians:
     """Train for `steps` on the views in the order that a run of one block takes, and return the result."""
     params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
-    adam = {name: torch.optim.Adam([params[name]], lr=RATES[name], eps=1e-15) for name in PARAM_NAMES}
+    adam = {
+        name: torch.optim.Adam([params[name]], lr=RATES[name], eps=1e-15, fused=True) for name in PARAM_NAMES
+    }
     draw, density, growth = TorchRasterizer(compile="never"), DensityControl(config.density), {}
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]

@@ -1,5 +1,6 @@
 """What every rasterizer takes and gives."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -80,5 +81,22 @@ class Rasterizer(Protocol):
 
         Raises:
             ValueError: `z_window` given to a backend whose `supports_z_window` is False.
+        """
+        ...
+
+    def layers(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        windows: Sequence[ZWindow],
+        *,
+        sh_degree: int,
+        crop: Crop,
+        antialiased: bool = False,
+    ) -> list[Layer]:
+        """The Gaussians through each of several windows, as that many calls would draw them; no gradients.
+
+        Raises:
+            ValueError: for a backend whose `supports_z_window` is False.
         """
         ...

@@ -7,24 +7,28 @@ fragment is lost by that, and none is added.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.base import ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
+from abcd_ns.engine.rasterizer.splat_kernels import (
+    DEPTH,
+    GSPLAT_TILE,
+    MIN_ALPHA,
+    OPACITY,
+    RADIUS,
+    TILE_COLUMNS,
+    TILE_ROWS,
+    X,
+    Y,
+)
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 
-GSPLAT_TILE = 16
-"""gsplat's tile size in pixels; decides which pixels a Gaussian may touch."""
-MIN_ALPHA = 1.0 / 255.0
-"""Fragments with less alpha are not drawn."""
-REACH_MARGIN = 0.01
-"""Added to the squared Mahalanobis radius of the bounds, so that rounding never loses a fragment."""
 SHRINK = 0.875
 """A level is narrowed once fewer than this share of its tiles still have Gaussians to draw."""
 
@@ -77,83 +81,44 @@ def _exclusive_cumsum(counts: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     return counts.cumsum(0) - counts
 
 
-def _gsplat_bounds(
-    mean: Float[Tensor, "n"], radius: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """First and last pixel, along one axis, of the 16 px tiles that the square of the radius touches."""
-    first = (mean / GSPLAT_TILE - radius / GSPLAT_TILE).floor() * GSPLAT_TILE
-    last = (mean / GSPLAT_TILE + radius / GSPLAT_TILE).ceil() * GSPLAT_TILE - 1
-    return first, last
-
-
-def _tile_span(
-    low: Float[Tensor, "n"],
-    high: Float[Tensor, "n"],
-    bounds: Sequence[Tensor],
-    crop_start: int,
-    crop_size: int,
-    side: int,
-) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """The tiles along one axis with a pixel centre in [low, high], in the crop and in `bounds`.
-
-    Returns (first tile, counted from the image's edge; number of tiles). `bounds` are first and last pixel.
-    """
-    first = torch.maximum((low - 0.5).ceil(), bounds[0]).clamp(crop_start, crop_start + crop_size)
-    last = torch.minimum((high - 0.5).floor(), bounds[1]).clamp(crop_start - 1, crop_start + crop_size - 1)
-    first_tile, last_tile = (first / side).floor(), (last / side).floor()
-    count = torch.where(first <= last, last_tile - first_tile + 1, 0)
-    return first_tile.long(), count.long()
-
-
-def _candidates(
-    splats: Splats, grid: TileGrid, windowed: Tensor | None, window: ZWindow | None
-) -> Int[Tensor, "m"]:
+def _candidates(splats: Splats, grid: TileGrid, inside: Tensor | None) -> Int[Tensor, "m"]:
     """Splats that can leave a fragment in the crop, by increasing depth; ties by index, as in gsplat."""
-    crop, x, y, radii = grid.crop, splats.means2d[:, 0], splats.means2d[:, 1], splats.radii.to(splats.means2d)
-    reach = radii + GSPLAT_TILE
-    keep = (splats.radii > 0) & (splats.opacities >= MIN_ALPHA)
+    crop, planes = grid.crop, splats.planes
+    x, y, depth, radius = planes[X], planes[Y], planes[DEPTH], planes[RADIUS]
+    reach = radius + GSPLAT_TILE
+    keep = (radius > 0) & (planes[OPACITY] >= MIN_ALPHA)
     keep &= (x + reach > crop.x) & (x - reach < crop.x + crop.width)
     keep &= (y + reach > crop.y) & (y - reach < crop.y + crop.height)
-    if window is not None:
-        inside = (splats.depths >= window.near.amin()) & (splats.depths < window.far.amax())
-        keep &= inside | ~windowed
+    if inside is not None:
+        keep &= inside
     rows = keep.nonzero()[:, 0]
-    return rows[splats.depths.index_select(0, rows).sort(stable=True).indices]
+    return rows.index_select(0, depth.index_select(0, rows).sort(stable=True).indices)
 
 
-def _pairs(splats: Splats, grid: TileGrid) -> _Pairs:
+def _pairs(splats: Splats, grid: TileGrid, built: bool) -> _Pairs:
     """All pairs of `splats`, whose order is their rank: per row of tiles, those that the ellipse reaches."""
-    crop, side = grid.crop, grid.side
-    (x, y), radii = splats.means2d.unbind(-1), splats.radii.to(splats.means2d)
-    xx, xy, yy = splats.covs2d.unbind(-1)
-    # The squared Mahalanobis radius at which alpha falls to 1/255.
-    reach = 2.0 * (splats.opacities / MIN_ALPHA).log() + REACH_MARGIN
-    half_height = (reach * yy).sqrt()
-    y_bounds = _gsplat_bounds(y, radii)
-    first_row, n_rows = _tile_span(y - half_height, y + half_height, y_bounds, crop.y, crop.height, side)
-
+    crop = grid.crop
+    numbers = splats.planes.new_tensor([crop.x, crop.y, crop.width, crop.height, grid.side])
+    spans, bands = TILE_ROWS(splats.planes, numbers, built=built)
+    first_row, n_rows = spans.long().unbind(0)
     band_start = _exclusive_cumsum(n_rows)
-    owner = torch.repeat_interleave(torch.arange(len(splats), device=x.device), n_rows)
-    row = torch.arange(owner.numel(), device=x.device) + (first_row - band_start).index_select(0, owner)
-    # Within the band's pixel centres, at height v over the mean, the ellipse spans v xy / yy -+ half; its
-    # right end is furthest out at v = top of the right flank, its left end at minus that.
-    columns = torch.stack((x, y, reach, yy, xy / yy, splats.conics[:, 0], xy * (reach / xx).sqrt()))
-    bx, by, breach, byy, slope, precision, flank = columns.index_select(1, owner).unbind(0)
-    v_first = row * side + 0.5 - by
-    v_last = v_first + (side - 1)
-    v_right, v_left = torch.clamp(flank, v_first, v_last), torch.clamp(-flank, v_first, v_last)
-    right = bx + v_right * slope + ((breach - v_right * v_right / byy).clamp_min(0) / precision).sqrt()
-    left = bx + v_left * slope - ((breach - v_left * v_left / byy).clamp_min(0) / precision).sqrt()
-    bounds = [bound.index_select(0, owner) for bound in _gsplat_bounds(x, radii)]
-    first_col, n_cols = _tile_span(left, right, bounds, crop.x, crop.width, side)
+    owner = torch.repeat_interleave(n_rows)
+    row = _count(owner) + (first_row - band_start).index_select(0, owner)
+    columns = bands.index_select(1, owner)
+    (spans,) = TILE_COLUMNS(columns, row.to(columns), numbers, built=built)
+    first_col, n_cols = spans.long().unbind(0)
 
     pair_start = _exclusive_cumsum(n_cols)
     first_tile = (row - grid.first_row) * grid.cols + (first_col - grid.first_col)
-    band = torch.repeat_interleave(torch.arange(owner.numel(), device=x.device), n_cols)
-    tile = torch.arange(band.numel(), device=x.device) + (first_tile - pair_start).index_select(0, band)
+    band = torch.repeat_interleave(n_cols)
+    tile = _count(band) + (first_tile - pair_start).index_select(0, band)
     # Ranks without a band or without a pair get an empty bag, at the start of the next one.
     bag_of_band = torch.cat((pair_start, pair_start.new_tensor([band.numel()])))
     return _Pairs(owner.index_select(0, band), tile, bag_of_band.index_select(0, band_start))
+
+
+def _count(items: Tensor) -> Int[Tensor, "n"]:
+    return torch.arange(items.numel(), device=items.device)
 
 
 def _within_window(
@@ -166,7 +131,9 @@ def _within_window(
     keep = (z >= near.index_select(0, pairs.tile)) & (z < far.index_select(0, pairs.tile))
     keep |= ~windowed.index_select(0, pairs.rank)
     kept_before = torch.cat((keep.new_zeros(1, dtype=torch.long), keep.cumsum(0)))
-    return _Pairs(pairs.rank[keep], pairs.tile[keep], kept_before[pairs.bags])
+    kept = keep.nonzero()[:, 0]
+    rank, tile = pairs.rank.index_select(0, kept), pairs.tile.index_select(0, kept)
+    return _Pairs(rank, tile, kept_before.index_select(0, pairs.bags))
 
 
 def _levels(n_chunks: list[int], chunk: int) -> tuple[Level, ...]:
@@ -212,6 +179,42 @@ def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], grid: TileGrid, chunk: int) 
     return TileLists(grid, chunk, rows, ranks, tiles[:used], levels, slots, pairs.bags)
 
 
+@dataclass(frozen=True)
+class Candidates:
+    """All (Gaussian, tile) pairs of a drawing, before any window."""
+
+    grid: TileGrid
+    rows: Int[Tensor, "m"]
+    """Which splats may be drawn, by increasing depth."""
+    ranked: Splats
+    """These, in this order."""
+    pairs: _Pairs
+
+    def lists(
+        self, chunk: int, windowed: Bool[Tensor, "n"] | None = None, window: ZWindow | None = None
+    ) -> TileLists:
+        """As drawn through a window: see bin_splats."""
+        pairs = self.pairs
+        if window is not None:
+            pairs = _within_window(pairs, self.ranked, self.grid, windowed[self.rows], window)
+        return _lay_out(pairs, self.rows, self.grid, chunk)
+
+
+@torch.no_grad()
+def find_candidates(
+    splats: Splats, grid: TileGrid, *, inside: Bool[Tensor, "n"] | None = None, built: bool = True
+) -> Candidates:
+    """What the tiles of the grid may have to draw.
+
+    Args:
+        inside: leave out the others.
+        built: use machine code where it is there.
+    """
+    rows = _candidates(splats, grid, inside)
+    ranked = splats[rows]
+    return Candidates(grid, rows, ranked, _pairs(ranked, grid, built))
+
+
 @torch.no_grad()
 def bin_splats(
     splats: Splats,
@@ -220,16 +223,17 @@ def bin_splats(
     *,
     windowed: Bool[Tensor, "n"] | None = None,
     window: ZWindow | None = None,
+    built: bool = True,
 ) -> TileLists:
     """Lists of the Gaussians that each tile of the grid draws.
 
     Args:
         chunk: Gaussians per chunk; lists are padded to multiples of it.
         windowed: which splats `window` masks. Given together with `window` or not at all.
+        built: use machine code where it is there.
     """
-    rows = _candidates(splats, grid, windowed, window)
-    ranked = Splats(*(getattr(splats, name).index_select(0, rows) for name in Splats.__dataclass_fields__))
-    pairs = _pairs(ranked, grid)
+    inside = None
     if window is not None:
-        pairs = _within_window(pairs, ranked, grid, windowed[rows], window)
-    return _lay_out(pairs, rows, grid, chunk)
+        depths = splats.depths
+        inside = (depths >= window.near.amin()) & (depths < window.far.amax()) | ~windowed
+    return find_candidates(splats, grid, inside=inside, built=built).lists(chunk, windowed, window)

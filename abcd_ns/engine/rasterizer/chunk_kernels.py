@@ -1,20 +1,38 @@
-"""Chooses between the eager chunk kernels and the built ones."""
+"""The two chunk kernels of one size, and the choice between eager and built ones."""
 
+import functools
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer import torch_kernels
-from abcd_ns.engine.rasterizer.built_kernels import BuiltKernels, build_kernels, load_kernels
+from abcd_ns.engine.kernels import Kernel
+from abcd_ns.engine.kernels.build import build_kernels
+from abcd_ns.engine.rasterizer import splat_kernels, torch_kernels
+from abcd_ns.engine.rasterizer.splat_kernels import SPLAT_KERNELS
+from abcd_ns.engine.rasterizer.torch_kernels import STATE_PLANES, backward_chunk, forward_chunk
 
 CompilePolicy = Literal["auto", "always", "never"]
 
 
-class ChunkKernels:
-    """`forward_chunk` and `backward_chunk`, eager or built ahead of time.
+@functools.cache
+def chunk_kernels(side: int, chunk: int) -> tuple[Kernel, Kernel]:
+    """`forward_chunk` and `backward_chunk` for tiles of `side` pixels and `chunk` Gaussians a call."""
+    pixels = side * side
+    state, planes = f"{STATE_PLANES} {pixels} a", f"2 {pixels} a"
+    given = (f"{torch_kernels.PARAMETERS} {chunk} a", "2 a", state)
+    depends = (splat_kernels.__file__,)
+    forward = functools.partial(forward_chunk, side)
+    backward = functools.partial(backward_chunk, side)
+    return (
+        Kernel(f"forward-{side}-{chunk}", forward, (*given, planes), depends),
+        Kernel(f"backward-{side}-{chunk}", backward, (*given, state, planes), depends),
+    )
 
-    Built kernels serve float32 on the CPU; everything else runs eagerly.
+
+class ChunkKernels:
+    """The chunk kernels of a rasterizer.
 
     Args:
         policy: "auto" takes built kernels where they are found and builds them when `warm_up` is called;
@@ -23,60 +41,48 @@ class ChunkKernels:
 
     def __init__(self, policy: CompilePolicy, side: int, chunk: int) -> None:
         self._policy, self._size = policy, (side, chunk)
-        self._built: BuiltKernels | None = None
-        if policy == "auto":
-            self._built = load_kernels(side, chunk)
-        elif policy == "always":
-            self._built = build_kernels(side, chunk)
-
-    @property
-    def are_built(self) -> bool:
+        self._forward, self._backward = chunk_kernels(side, chunk)
+        self.built = policy != "never" and all(kernel.is_built for kernel in self._all)
         """Whether float32 on the CPU runs fast."""
-        return self._built is not None
+        if policy == "always":
+            self.warm_up()
 
     def warm_up(self) -> None:
-        """Build the kernels, about a minute once per machine, unless the policy is "never"."""
-        if self._policy != "never" and self._built is None:
-            self._built = build_kernels(*self._size)
+        """Build the kernels, a few minutes once per machine, unless the policy is "never"."""
+        if self._policy != "never" and not self.built:
+            build_kernels(self._all, *self._size)
+            self.built = all(kernel.is_built for kernel in self._all)
 
-    def forward(self, params: Tensor, origins: Tensor, state: Tensor, window: Tensor | None) -> Tensor:
+    @property
+    def _all(self) -> tuple[Kernel, ...]:
+        return (*SPLAT_KERNELS, self._forward, self._backward)
+
+    def forward(
+        self,
+        params: Float[Tensor, "c k a"],
+        origins: Float[Tensor, "2 a"],
+        state: Float[Tensor, "s p a"],
+        window: Float[Tensor, "2 p a"],
+    ) -> Float[Tensor, "s p a"]:
         """See torch_kernels.forward_chunk."""
-        side = self._size[0]
-        if not self._suits(params):
-            return torch_kernels.forward_chunk(params, origins, state, window, side)
-        width = params.shape[-1]
-        args = _two_wide(params, origins, state, _window(window, state))
-        return self._built.forward(*args)[..., :width]
+        wide = _two_wide(params, origins, state, window)
+        return self._forward(*wide, built=self.built)[0][..., : params.shape[-1]]
 
     def backward(
         self,
-        params: Tensor,
-        origins: Tensor,
-        state: Tensor,
-        upstream: Tensor,
-        window: Tensor | None,
-        absgrad: bool,
-    ) -> Tensor:
-        """See torch_kernels.backward_chunk. Built kernels give the absolute gradients unasked."""
-        side = self._size[0]
-        if not self._suits(params):
-            return torch_kernels.backward_chunk(params, origins, state, upstream, window, side, absgrad)
-        width = params.shape[-1]
-        args = _two_wide(params, origins, state, upstream, _window(window, state))
-        sums = self._built.backward(*args)[..., :width]
-        return sums if absgrad else sums[: torch_kernels.GRADIENTS]
-
-    def _suits(self, params: Tensor) -> bool:
-        return self._built is not None and params.device.type == "cpu" and params.dtype == torch.float32
-
-
-def _window(window: Tensor | None, state: Tensor) -> Tensor:
-    """Any window will do where there is none: every Gaussian's ALWAYS is 1."""
-    return state.new_zeros((2, *state.shape[1:])) if window is None else window
+        params: Float[Tensor, "c k a"],
+        origins: Float[Tensor, "2 a"],
+        state: Float[Tensor, "s p a"],
+        upstream: Float[Tensor, "s p a"],
+        window: Float[Tensor, "2 p a"],
+    ) -> Float[Tensor, "g k a"]:
+        """See torch_kernels.backward_chunk."""
+        wide = _two_wide(params, origins, state, upstream, window)
+        return self._backward(*wide, built=self.built)[0][..., : params.shape[-1]]
 
 
 def _two_wide(*tensors: Tensor) -> tuple[Tensor, ...]:
     """Built kernels take two tiles or more: a single one is drawn twice."""
-    if tensors[0].shape[-1] > 1:
+    if tensors[0].shape[-1] != 1:
         return tensors
     return tuple(torch.cat((tensor, tensor), dim=-1) for tensor in tensors)

@@ -11,7 +11,14 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.rasterizer.binning import TileLists
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels
-from abcd_ns.engine.rasterizer.torch_kernels import GRADIENTS, MOMENTS, STATE_PLANES, gather_params
+from abcd_ns.engine.rasterizer.torch_kernels import (
+    ALL_GRADIENTS,
+    CONIC_XX,
+    GRADIENTS,
+    OPACITY,
+    STATE_PLANES,
+    gather_params,
+)
 
 COMPACT = 0.75
 """Tiles whose pixels are all finished are dropped once fewer than this share is left."""
@@ -22,9 +29,11 @@ class Job:
     """All that a drawing needs besides tensors that take gradients."""
 
     lists: TileLists
+    splats: int
+    """How many there are in all, drawn or not."""
     kernels: ChunkKernels
     windows: Float[Tensor, "2 p a"] | None
-    """near and far, in the columns of `lists.tiles`."""
+    """near and far, in the columns of `lists.tiles`; None where every `always` is 1."""
     always: Float[Tensor, "m"]
     """By rank: 1 where no window applies."""
     absgrad_target: Tensor | None
@@ -39,15 +48,6 @@ class _Trace:
     """Per level, which of its columns were drawn; None means all."""
     states: list[Tensor] = field(default_factory=list)
     """Per level, the state before it."""
-
-
-def _parameter_table(job: Job, means2d, conics, colors, opacities, depths) -> Float[Tensor, "c columns"]:
-    """One column per rank, in the order of torch_kernels; the last, for empty slots, has opacity 0."""
-    rows = job.lists.rows
-    columns = (means2d, conics, opacities[:, None], depths[:, None])
-    means2d, conics, opacities, depths = (x.index_select(0, rows).T for x in columns)
-    parts = (means2d, conics, opacities, colors.T, depths, job.always[None])
-    return F.pad(torch.cat(parts), (0, 1))
 
 
 def _initial_state(lists: TileLists, dtype: torch.dtype) -> Float[Tensor, "5 p a"]:
@@ -70,11 +70,16 @@ def _level_ranks(lists: TileLists, index: int, columns: Tensor | None) -> Int[Te
     return ranks if columns is None else ranks.index_select(1, columns)
 
 
-def _take(planes: Tensor | None, width: int, columns: Tensor | None) -> Tensor | None:
+def _take(planes: Tensor, width: int, columns: Tensor | None) -> Tensor:
     """The columns of a level from planes [..., a] that hold all tiles' columns."""
-    if planes is None:
-        return None
     return planes[..., :width].contiguous() if columns is None else planes.index_select(-1, columns)
+
+
+def _take_window(job: Job, like: Float[Tensor, "s p a"], width: int, columns: Tensor | None) -> Tensor:
+    """Any window will do where there is none: every Gaussian's ALWAYS is 1."""
+    if job.windows is None:
+        return like[:2]
+    return _take(job.windows, width, columns)
 
 
 def _composite(
@@ -107,7 +112,7 @@ def _composite(
             params,
             _take(origins, level.width, columns),
             state,
-            _take(job.windows, level.width, columns),
+            _take_window(job, state, level.width, columns),
         )
     if columns is None:
         final[..., : state.shape[2]] = state
@@ -117,36 +122,30 @@ def _composite(
 
 
 class Composite(torch.autograd.Function):
-    """(means2d, conics, colors, opacities, depths) -> planes [5, h, w]: transmittance, colour, depth.
+    """Drawn Gaussians by rank [10, m] -> planes [5, h, w]: transmittance, colour, depth.
 
-    Memory for the backward pass: five planes per tile and chunk of K Gaussians, that is 5/K floats per
-    fragment instead of the dozens that autograd would keep; everything else is computed again.
+    Rows are those of torch_kernels up to ALWAYS. Memory for the backward pass: five planes per tile and chunk
+    of K Gaussians, that is 5/K floats per fragment instead of the dozens that autograd would keep; everything
+    else is computed again.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        means2d: Float[Tensor, "n 2"],
-        conics: Float[Tensor, "n 3"],
-        colors: Float[Tensor, "m 3"],
-        opacities: Float[Tensor, "n"],
-        depths: Float[Tensor, "n"],
-        job: Job,
-    ) -> Float[Tensor, "5 h w"]:
+    def forward(ctx: Any, drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "5 h w"]:
         lists, grid = job.lists, job.lists.grid
-        table = _parameter_table(job, means2d, conics, colors, opacities, depths)
+        # The last column, for empty slots, has opacity 0.
+        table = F.pad(torch.cat((drawn, job.always[None])), (0, 1))
         origins = torch.stack(grid.origins(lists.tiles, table.dtype))
         final, trace = _composite(job, table, origins, keep_states=any(ctx.needs_input_grad))
         planes = final.new_zeros((STATE_PLANES, grid.pixels_per_tile, grid.rows * grid.cols))
         planes[0] = 1.0
-        planes[:, :, lists.tiles] = torch.cat((final[:1].abs(), final[1:]))
-        ctx.job, ctx.columns, ctx.n = job, trace.columns, means2d.shape[0]
+        planes.index_copy_(2, lists.tiles, torch.cat((final[:1].abs(), final[1:])))
+        ctx.job, ctx.columns = job, trace.columns
         ctx.save_for_backward(table, origins, final, *trace.states)
         return grid.to_image(planes)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Float[Tensor, "5 h w"]) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, grad: Float[Tensor, "5 h w"]) -> tuple[Float[Tensor, "d m"], None]:
         job, lists = ctx.job, ctx.job.lists
         table, origins, final, *states = ctx.saved_tensors
         tiled = lists.grid.to_tiles(grad).index_select(2, lists.tiles)
@@ -154,26 +153,25 @@ class Composite(torch.autograd.Function):
         upstream = torch.cat((tiled[1:], total[None]))
         per_slot = _slot_gradients(job, table, origins, upstream, ctx.columns, states)
         sums = sum_bags(per_slot, lists.slots, lists.bags)
-        means, conics, colors, opacities, depths = _to_parameters(table[:, :-1], sums)
         if job.absgrad_target is not None:
             target = job.absgrad_target
-            target.absgrad = _spread(sums[:, GRADIENTS:], lists.rows, ctx.n)[None, : target.shape[1]]
-        spread = (_spread(x, lists.rows, ctx.n) for x in (means, conics, opacities, depths))
-        grad_means, grad_conics, grad_opacities, grad_depths = spread
-        return grad_means, grad_conics, colors, grad_opacities, grad_depths, None
+            absolute = sums.new_zeros((job.splats, 2)).index_copy_(0, lists.rows, sums[:, GRADIENTS:])
+            target.absgrad = absolute[None, : target.shape[1]]
+        return _to_parameters(table[:, :-1], sums), None
 
 
 def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> Float[Tensor, "s g"]:
     """The backward kernel's sums for every slot; 0 for slots that early stopping left out."""
-    lists, absgrad = job.lists, job.absgrad_target is not None
-    per_slot = table.new_zeros((lists.ranks.numel(), GRADIENTS + (2 if absgrad else 0)))
+    lists = job.lists
+    kept = GRADIENTS if job.absgrad_target is None else ALL_GRADIENTS
+    per_slot = table.new_zeros((lists.ranks.numel(), kept))
     for index, (columns, state) in enumerate(zip(all_columns, states, strict=True)):
         level = lists.levels[index]
         params = gather_params(table, _level_ranks(lists, index, columns))
-        planes = (_take(x, level.width, columns) for x in (origins, upstream, job.windows))
-        level_origins, level_upstream, level_window = planes
-        sums = job.kernels.backward(params, level_origins, state, level_upstream, level_window, absgrad)
-        by_slot = sums.view(sums.shape[0], -1).T
+        level_origins, level_upstream = (_take(x, level.width, columns) for x in (origins, upstream))
+        window = _take_window(job, state, level.width, columns)
+        sums = job.kernels.backward(params, level_origins, state, level_upstream, window)
+        by_slot = sums[:kept].reshape(kept, -1).T
         if columns is None:
             per_slot[level.start : level.start + by_slot.shape[0]] = by_slot
         else:
@@ -195,18 +193,13 @@ def sum_bags(
     return values.new_zeros((starts.numel(), values.shape[1])).index_add_(0, owner, values[members])
 
 
-def _to_parameters(table: Float[Tensor, "c m"], sums: Float[Tensor, "m g"]) -> tuple[Tensor, ...]:
-    """Gradients of (means2d, conics, colors, opacities, depths) by rank, from the backward kernel's sums.
+def _to_parameters(table: Float[Tensor, "c m"], sums: Float[Tensor, "m g"]) -> Float[Tensor, "d m"]:
+    """Gradients of the drawn rows, from the backward kernel's sums.
 
     sigma = (xx dx^2 + yy dy^2) / 2 + xy dx dy and alpha = opacity exp(-sigma), with d = mean - pixel.
     """
-    _, _, xx, xy, yy, opacity = table[:MOMENTS]
-    s, s_dx, s_dy, s_xx, s_xy, s_yy = sums[:, :MOMENTS].unbind(-1)
-    means = torch.stack((xx * s_dx + xy * s_dy, xy * s_dx + yy * s_dy), dim=-1)
-    conics = torch.stack((0.5 * s_xx, s_xy, 0.5 * s_yy), dim=-1)
-    return means, conics, sums[:, MOMENTS : MOMENTS + 3], -s / opacity, sums[:, MOMENTS + 3]
-
-
-def _spread(values: Tensor, rows: Int[Tensor, "m"], n: int) -> Tensor:
-    """`values` by rank as [n, ...] by row, 0 for rows that were not drawn."""
-    return values.new_zeros((n, *values.shape[1:])).index_copy_(0, rows, values)
+    xx, xy, yy, opacity = table[CONIC_XX : OPACITY + 1]
+    s, s_dx, s_dy, s_xx, s_xy, s_yy, red, green, blue, depth = sums.T[:GRADIENTS]
+    means = (xx * s_dx + xy * s_dy, xy * s_dx + yy * s_dy)
+    conics = (0.5 * s_xx, s_xy, 0.5 * s_yy)
+    return torch.stack((*means, depth, *conics, -s / opacity, red, green, blue))

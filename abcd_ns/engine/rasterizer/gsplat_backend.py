@@ -20,10 +20,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.base import Raster, ZWindow
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 TILE = 16
 """gsplat's tile size, pixels."""
+NO_WINDOW = 'The gsplat rasterizer has no z window; use ownership by means or the rasterizer "torch".'
 
 
 @dataclass(frozen=True)
@@ -131,9 +132,7 @@ class GsplatRasterizer:
     ) -> Raster:
         """See Rasterizer.__call__."""
         if z_window is not None:
-            raise ValueError(
-                'The gsplat rasterizer has no z window; use ownership by means or the rasterizer "torch".'
-            )
+            raise ValueError(NO_WINDOW)
         crop = crop or view.full
         if len(gaussians) + (0 if frozen is None else len(frozen)) == 0:
             return _nothing(gaussians, view, crop)
@@ -148,6 +147,10 @@ class GsplatRasterizer:
         rows, cols = Crop(crop.x - drawn.x, crop.y - drawn.y, crop.width, crop.height).slices
         features, alphas = features[rows, cols], alphas[rows, cols]
         return Raster(features[..., :3], 1.0 - alphas[..., 0], features[..., 3], _info(own, view))
+
+    def layers(self, *_args: Any, **_options: Any) -> list[Layer]:
+        """See Rasterizer.layers: stock gsplat cannot."""
+        raise ValueError(NO_WINDOW)
 
 
 def _draw(

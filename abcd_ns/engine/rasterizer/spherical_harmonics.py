@@ -3,11 +3,12 @@
 import math
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 MAX_SH_DEGREE = 3
+BASES = (MAX_SH_DEGREE + 1) ** 2 - 1
+"""Basis functions of degrees 1 and up."""
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
 _C1 = math.sqrt(3 / (4 * math.pi))
@@ -19,43 +20,32 @@ _C3_C = math.sqrt(21 / (2 * math.pi)) / 4
 _C3_ZZZ = math.sqrt(7 / math.pi) / 4
 
 
-def sh_bases(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
-    """Real spherical harmonics of degrees 1 to `degree` at unit vectors; k = (degree + 1)^2 - 1.
+def sh_basis_rows(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    """Real spherical harmonics of degrees 1 to 3 at unit vectors: BASES tensors.
 
     The polynomials of Sloan, "Efficient Spherical Harmonic Evaluation" (JCGT 2013), with the
     Condon-Shortley sign. Degree 0 is the constant SH_C0 and left out.
     """
-    x, y, z = directions.unbind(-1)
-    bases = []
-    if degree >= 1:
-        bases += [-_C1 * y, _C1 * z, -_C1 * x]
-    if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
-        bases += [_C2 * x * y, -_C2 * y * z, _C2_ZZ * (3 * zz - 1), -_C2 * x * z, 0.5 * _C2 * (xx - yy)]
-    if degree >= 3:
-        ring = _C3_C * (5 * zz - 1)
-        bases += [
-            -_C3_A * y * (3 * xx - yy),
-            _C3_B * x * y * z,
-            -ring * y,
-            _C3_ZZZ * z * (5 * zz - 3),
-            -ring * x,
-            0.5 * _C3_B * z * (xx - yy),
-            -_C3_A * x * (xx - 3 * yy),
-        ]
-    return torch.stack(bases, dim=-1) if bases else directions.new_zeros((directions.shape[0], 0))
+    xx, yy, zz = x * x, y * y, z * z
+    ring = _C3_C * (5 * zz - 1)
+    return [
+        *(-_C1 * y, _C1 * z, -_C1 * x),
+        *(_C2 * x * y, -_C2 * y * z, _C2_ZZ * (3 * zz - 1), -_C2 * x * z, 0.5 * _C2 * (xx - yy)),
+        *(-_C3_A * y * (3 * xx - yy), _C3_B * x * y * z, -ring * y, _C3_ZZZ * z * (5 * zz - 3), -ring * x),
+        *(0.5 * _C3_B * z * (xx - yy), -_C3_A * x * (xx - 3 * yy)),
+    ]
 
 
 def sh_colors(
     features_dc: Float[Tensor, "n 3"],
     features_rest: Float[Tensor, "n k 3"],
-    means: Float[Tensor, "n 3"],
-    camera_center: Float[Tensor, "3"],
+    bases: Float[Tensor, "b n"],
     degree: int,
 ) -> Float[Tensor, "n 3"]:
-    """Colours as seen from a camera: max(0, SH(direction) + 0.5), linear, not clamped from above.
+    """Colours in the directions that `bases` were taken at: max(0, SH + 0.5), linear, not clamped from above.
 
     Args:
+        bases: from `sh_basis_rows`.
         degree: the degree in use; coefficients of higher degrees are ignored.
 
     Raises:
@@ -67,8 +57,7 @@ def sh_colors(
             f"sh_degree is {degree}, but the Gaussians hold {features_rest.shape[1]} coefficients above "
             f"degree 0, and degrees above {MAX_SH_DEGREE} are not supported; lower sh_degree."
         )
-    bases = sh_bases(F.normalize(means - camera_center, dim=-1), degree)
     # With degree 0 this adds nothing, yet gives `features_rest` a gradient of zeros, as gsplat does: Adam
     # counts such steps.
-    directional = torch.bmm(bases[:, None], features_rest[:, :used])[:, 0]
+    directional = torch.bmm(bases[:used].T[:, None], features_rest[:, :used])[:, 0]
     return (SH_C0 * features_dc + directional + 0.5).clamp_min(0.0)

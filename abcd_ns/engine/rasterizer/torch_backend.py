@@ -1,6 +1,6 @@
 """The torch rasterizer: gsplat's drawing in plain torch, for any device, with a z window per pixel."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -8,13 +8,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.base import Raster, ZWindow
-from abcd_ns.engine.rasterizer.binning import TileLists, bin_splats
+from abcd_ns.engine.rasterizer.binning import TileLists, bin_splats, find_candidates
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.rasterizer.compositing_function import Composite, Job
 from abcd_ns.engine.rasterizer.projection import Splats, project
 from abcd_ns.engine.rasterizer.spherical_harmonics import sh_colors
+from abcd_ns.engine.rasterizer.splat_kernels import DEPTH, OPACITY
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 TILE_SIDE = 4
 """Pixels along a tile's side; small, since Gaussians of low-resolution views are a few pixels wide."""
@@ -23,41 +24,51 @@ CHUNK = 16
 
 
 class _TakeRows(torch.autograd.Function):
-    """x[rows] for distinct rows. Autograd's own backward would accumulate, row by row."""
+    """x[rows] along a dimension, for distinct rows. Autograd's own backward would accumulate, row by row."""
 
     @staticmethod
-    def forward(ctx: Any, x: Float[Tensor, "n ..."], rows: Int[Tensor, "m"]) -> Float[Tensor, "m ..."]:
+    def forward(ctx: Any, x: Tensor, rows: Int[Tensor, "m"], dim: int) -> Tensor:
         ctx.save_for_backward(rows)
-        ctx.n = x.shape[0]
-        return x.index_select(0, rows)
+        ctx.shape, ctx.dim = x.shape, dim
+        return x.index_select(dim, rows)
 
     @staticmethod
-    def backward(ctx: Any, grad: Float[Tensor, "m ..."]) -> tuple[Tensor, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         (rows,) = ctx.saved_tensors
-        return grad.new_zeros((ctx.n, *grad.shape[1:])).index_copy_(0, rows, grad), None
+        return grad.new_zeros(ctx.shape).index_copy_(ctx.dim, rows, grad), None, None
 
 
-def _colors(gaussians: Gaussians, rows: Int[Tensor, "m"], view: View, sh_degree: int) -> Float[Tensor, "m 3"]:
-    """Colours of the Gaussians at `rows`. Where these are few, only theirs are computed."""
-    features = (gaussians.features_dc, gaussians.features_rest, gaussians.means)
-    center = view.center.to(gaussians.means)
-    if 2 * rows.numel() > len(gaussians):  # copying the coefficients out would cost more than it saves
-        return _TakeRows.apply(sh_colors(*features, center, sh_degree), rows)
-    return sh_colors(*(_TakeRows.apply(x, rows) for x in features), center, sh_degree)
-
-
-def _ranked_colors(
-    gaussians: Gaussians, frozen: Gaussians | None, rows: Int[Tensor, "m"], view: View, sh_degree: int
+def _colors(
+    gaussians: Gaussians, splats: Splats, rows: Int[Tensor, "m"], sh_degree: int
 ) -> Float[Tensor, "m 3"]:
-    if frozen is None:
-        return _colors(gaussians, rows, view, sh_degree)
-    mine = rows < len(gaussians)
-    own = _colors(gaussians, rows[mine], view, sh_degree)
+    """Colours of the Gaussians at `rows`. Where these are few, only theirs are computed."""
+    features = (gaussians.features_dc, gaussians.features_rest)
+    if 2 * rows.numel() > len(gaussians):  # copying the coefficients out would cost more than it saves
+        return _TakeRows.apply(sh_colors(*features, splats.bases, sh_degree), rows, 0)
+    dc, rest = (_TakeRows.apply(x, rows, 0) for x in features)
+    return sh_colors(dc, rest, _TakeRows.apply(splats.bases, rows, 1), sh_degree)
+
+
+def _colors_by_rank(
+    gaussians: Gaussians,
+    own: Splats,
+    frozen: Gaussians | None,
+    others: Splats | None,
+    rows: Int[Tensor, "m"],
+    sh_degree: int,
+) -> Float[Tensor, "m 3"]:
+    """Colours of the drawn ones among the active Gaussians followed by the frozen ones."""
+    if frozen is None or others is None:
+        return _colors(gaussians, own, rows, sh_degree)
+    mine, theirs = (rows < len(gaussians)).nonzero()[:, 0], (rows >= len(gaussians)).nonzero()[:, 0]
+    own_colors = _colors(gaussians, own, rows.index_select(0, mine), sh_degree)
     with torch.no_grad():
-        others = _colors(frozen, rows[~mine] - len(gaussians), view, sh_degree)
-    # Back into the order of `rows`, from the order (own, others).
-    back = torch.cat((mine.nonzero()[:, 0], (~mine).nonzero()[:, 0])).argsort()
-    return _TakeRows.apply(torch.cat((own, others)), back)
+        their_colors = _colors(frozen, others, rows.index_select(0, theirs) - len(gaussians), sh_degree)
+    # Back into the order of `rows`, from the order (mine, theirs).
+    back = torch.empty_like(rows).index_copy_(
+        0, torch.cat((mine, theirs)), torch.arange(len(rows), device=rows.device)
+    )
+    return _TakeRows.apply(torch.cat((own_colors, their_colors)), back, 0)
 
 
 class TorchRasterizer:
@@ -66,7 +77,7 @@ class TorchRasterizer:
     Works in float32 and float64 and on any device; made to be fast on a CPU. Deterministic.
 
     Args:
-        compile: whether float32 on the CPU runs on kernels built ahead of time (see built_kernels): "auto"
+        compile: whether float32 on the CPU runs on kernels built ahead of time (see kernels): "auto"
             if they are found, "always" building them now if need be, "never" not at all. Built and eager
             kernels agree to rounding only: use "never" where last bits must not depend on the machine.
         tile_side: pixels along a tile's side; a divisor of 16. Speed only.
@@ -107,39 +118,70 @@ class TorchRasterizer:
         """See Rasterizer.__call__."""
         crop = crop or view.full
         _check_window(z_window, crop)
-        splats = project(gaussians, view, antialiased=antialiased)
-        info = _info(splats, view)
-        splats = replace(splats, means2d=info["means2d"][0])  # so that info's tensor is in the graph
+        built = self.kernels.built
+        own = project(gaussians, view, antialiased=antialiased, built=built)
+        info = _info(own, view)
+        # Through info's tensor, so that it is in the graph.
+        graded = torch.cat((info["means2d"][0].T, own.planes[DEPTH : OPACITY + 1]))
+        splats, others = own, None
         if frozen is not None:
             with torch.no_grad():
-                others = project(frozen, view, antialiased=antialiased)
-            splats = Splats.cat(splats, others)
+                others = project(frozen, view, antialiased=antialiased, built=built)
+            splats = Splats(torch.cat((own.planes.detach(), others.planes), dim=1))
+            graded = torch.cat((graded, others.planes[: OPACITY + 1]), dim=1)
         windowed = None
         if z_window is not None:
             is_frozen = torch.arange(len(splats), device=gaussians.device) >= len(gaussians)
             windowed = is_frozen if frozen is not None else ~is_frozen
-        lists = bin_splats(
-            splats, TileGrid(crop, self.tile_side), self.chunk, windowed=windowed, window=z_window
-        )
-        colors = _ranked_colors(gaussians, frozen, lists.rows, view, sh_degree)
-        job = self._job(lists, colors, windowed, z_window, info["means2d"] if absgrad else None)
-        planes = Composite.apply(splats.means2d, splats.conics, colors, splats.opacities, splats.depths, job)
+        grid = TileGrid(crop, self.tile_side)
+        lists = bin_splats(splats, grid, self.chunk, windowed=windowed, window=z_window, built=built)
+        colors = _colors_by_rank(gaussians, own, frozen, others, lists.rows, sh_degree)
+        drawn = torch.cat((_TakeRows.apply(graded, lists.rows, 1), colors.T))
+        job = self._job(lists, len(splats), colors, windowed, z_window, info["means2d"] if absgrad else None)
+        planes = Composite.apply(drawn, job)
         return Raster(planes[1:4].permute(1, 2, 0), planes[0], planes[4], info)
+
+    @torch.no_grad()
+    def layers(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        windows: Sequence[ZWindow],
+        *,
+        sh_degree: int,
+        crop: Crop,
+        antialiased: bool = False,
+    ) -> list[Layer]:
+        """See Rasterizer.layers."""
+        built = self.kernels.built
+        splats = project(gaussians, view, antialiased=antialiased, built=built)
+        candidates = find_candidates(splats, TileGrid(crop, self.tile_side), built=built)
+        colors = _colors(gaussians, splats, candidates.rows, sh_degree)
+        drawn = torch.cat((candidates.ranked.planes[: OPACITY + 1], colors.T))
+        all_windowed = torch.ones(len(splats), dtype=torch.bool, device=gaussians.device)
+        drawings = []
+        for window in windows:
+            _check_window(window, crop)
+            lists = candidates.lists(self.chunk, all_windowed, window)
+            planes = Composite.apply(drawn, self._job(lists, len(splats), colors, all_windowed, window, None))
+            drawings.append(Layer(planes[1:4].permute(1, 2, 0), planes[0]))
+        return drawings
 
     def _job(
         self,
         lists: TileLists,
+        splats: int,
         colors: Tensor,
         windowed: Tensor | None,
         window: ZWindow | None,
         target: Tensor | None,
     ) -> Job:
         if window is None:
-            return Job(lists, self.kernels, None, torch.ones_like(colors[:, 0]), target)
+            return Job(lists, splats, self.kernels, None, torch.ones_like(colors[:, 0]), target)
         planes = lists.grid.to_tiles(torch.stack((window.near, window.far)).to(colors)).index_select(
             2, lists.tiles
         )
-        return Job(lists, self.kernels, planes, (~windowed[lists.rows]).to(colors), target)
+        return Job(lists, splats, self.kernels, planes, (~windowed[lists.rows]).to(colors), target)
 
 
 def _check_window(window: ZWindow | None, crop: Crop) -> None:

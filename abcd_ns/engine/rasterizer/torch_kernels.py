@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.binning import MIN_ALPHA
+from abcd_ns.engine.rasterizer.splat_kernels import MIN_ALPHA
 
 MAX_ALPHA = 0.999
 """Alphas are clamped to this."""
@@ -20,13 +20,17 @@ MIN_TRANSMITTANCE = 1e-4
 """The fragment after which T would be at most this, and all behind it, are not drawn."""
 STATE_PLANES = 5
 
-X, Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, DEPTH, ALWAYS = range(11)
-"""Rows of the parameter table. ALWAYS is 1 where the z window does not apply."""
+X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, ALWAYS = range(11)
+"""Rows of the parameter table: splat_kernels' first, a colour, and 1 where the z window does not apply."""
+PARAMETERS = ALWAYS + 1
+DRAWN = ALWAYS
+"""Rows that take gradients."""
 
 MOMENTS = 6
 GRADIENTS = MOMENTS + 4
 """What the backward kernel sums per Gaussian and tile: with s = dL/dsigma and d = mean - pixel, the moments
-s, s dx, s dy, s dx^2, s dx dy, s dy^2; then dL/d(red, green, blue, depth). With absgrad, |dL/d(x, y)| too."""
+s, s dx, s dy, s dx^2, s dx dy, s dy^2; then dL/d(red, green, blue, depth); then |dL/d(x, y)|."""
+ALL_GRADIENTS = GRADIENTS + 2
 
 Params = Float[Tensor, "c k a"]
 
@@ -46,17 +50,14 @@ def _offsets(params: Params, origins: Float[Tensor, "2 a"], side: int) -> tuple[
     return dx, dy
 
 
-def _alphas(
-    params: Params, dx: Tensor, dy: Tensor, window: Float[Tensor, "2 p a"] | None
-) -> Float[Tensor, "k p a"]:
+def _alphas(params: Params, dx: Tensor, dy: Tensor, window: Float[Tensor, "2 p a"]) -> Float[Tensor, "k p a"]:
     """min(0.999, opacity exp(-sigma)) of each fragment, 0 where it is not drawn."""
     half_xx, xy, half_yy = 0.5 * params[CONIC_XX], params[CONIC_XY], 0.5 * params[CONIC_YY]
     sigma = dx * (half_xx[:, None] * dx + xy[:, None] * dy) + half_yy[:, None] * dy * dy
     alphas = (params[OPACITY][:, None] * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
-    drawn = (sigma >= 0) & (alphas >= MIN_ALPHA)
-    if window is not None:
-        z = params[DEPTH][:, None]
-        drawn = drawn & ((params[ALWAYS][:, None] > 0) | ((z >= window[0]) & (z < window[1])))
+    z = params[DEPTH][:, None]
+    inside = (params[ALWAYS][:, None] > 0) | ((z >= window[0]) & (z < window[1]))
+    drawn = inside & (sigma >= 0) & (alphas >= MIN_ALPHA)
     return torch.where(drawn, alphas, 0.0)
 
 
@@ -68,12 +69,12 @@ def _advance(T: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def forward_chunk(
+    side: int,
     params: Params,
     origins: Float[Tensor, "2 a"],
     state: Float[Tensor, "5 p a"],
-    window: Float[Tensor, "2 p a"] | None,
-    side: int,
-) -> Float[Tensor, "5 p a"]:
+    window: Float[Tensor, "2 p a"],
+) -> tuple[Float[Tensor, "5 p a"]]:
     """Composite one chunk behind what `state` holds."""
     alphas = _alphas(params, *_offsets(params, origins, side), window)
     T, red, green, blue, depth = state.unbind(0)
@@ -83,18 +84,17 @@ def forward_chunk(
         green = green + weight * params[GREEN, k]
         blue = blue + weight * params[BLUE, k]
         depth = depth + weight * params[DEPTH, k]
-    return torch.stack((T, red, green, blue, depth))
+    return (torch.stack((T, red, green, blue, depth)),)
 
 
 def backward_chunk(
+    side: int,
     params: Params,
     origins: Float[Tensor, "2 a"],
     state: Float[Tensor, "5 p a"],
     upstream: Float[Tensor, "5 p a"],
-    window: Float[Tensor, "2 p a"] | None,
-    side: int,
-    absgrad: bool,
-) -> Float[Tensor, "g k a"]:
+    window: Float[Tensor, "2 p a"],
+) -> tuple[Float[Tensor, "g k a"]]:
     """Gradients of one chunk's Gaussians, summed over each tile's pixels.
 
     With e_k = dL/dC . (c_k, z_k), w_k = alpha_k T_k and total = sum of all w_k e_k + T_final dL/dT:
@@ -127,7 +127,8 @@ def backward_chunk(
         sigma_grads.append(torch.where(drawn & (alpha < MAX_ALPHA), -alpha * alpha_grad, 0.0))
         weights.append(weight)
         T = next_T
-    return _sum_pixels(params, dx, dy, torch.stack(weights), torch.stack(sigma_grads), upstream, absgrad)
+    sums = _sum_pixels(params, dx, dy, torch.stack(weights), torch.stack(sigma_grads), upstream)
+    return (sums,)
 
 
 def _sum_pixels(
@@ -137,12 +138,10 @@ def _sum_pixels(
     weights: Tensor,
     sigma_grads: Tensor,
     upstream: Tensor,
-    absgrad: bool,
 ) -> Float[Tensor, "g k a"]:
     s_dx, s_dy = sigma_grads * dx, sigma_grads * dy
     planes = [sigma_grads, s_dx, s_dy, s_dx * dx, s_dx * dy, s_dy * dy]
     planes += [weights * upstream[channel] for channel in range(4)]
-    if absgrad:
-        xx, xy, yy = params[CONIC_XX][:, None], params[CONIC_XY][:, None], params[CONIC_YY][:, None]
-        planes += [(xx * s_dx + xy * s_dy).abs(), (xy * s_dx + yy * s_dy).abs()]
+    xx, xy, yy = params[CONIC_XX][:, None], params[CONIC_XY][:, None], params[CONIC_YY][:, None]
+    planes += [(xx * s_dx + xy * s_dy).abs(), (xy * s_dx + yy * s_dy).abs()]
     return torch.stack([plane.sum(dim=1) for plane in planes])

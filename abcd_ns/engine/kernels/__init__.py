@@ -1,0 +1,5 @@
+"""Inner loops: plain torch functions that also run as machine code, built once per machine."""
+
+from abcd_ns.engine.kernels.kernel import Kernel, can_build, kernels_folder
+
+__all__ = ["Kernel", "can_build", "kernels_folder"]
