@@ -18,7 +18,13 @@ from pathlib import Path
 
 import torch
 
-from abcd_ns.engine.kernels.kernel import Kernel, can_build, forget_loaded, kernels_folder
+from abcd_ns.engine.kernels.kernel import (
+    COMPILER_OPTIONS,
+    Kernel,
+    can_build,
+    forget_loaded,
+    kernels_folder,
+)
 
 BUILDER = "abcd_ns.engine.build_kernels"
 """The module that knows all kernels. By name, as it imports the kernels' owners, and they import this."""
@@ -73,7 +79,7 @@ def compile_kernel(kernel: Kernel) -> None:
     exported = torch.export.export(traced, examples, dynamic_shapes=dynamic)
     with tempfile.TemporaryDirectory(dir=kernel.path.parent) as folder:
         package = torch._inductor.aoti_compile_and_package(
-            exported, package_path=str(Path(folder) / "kernel.pt2")
+            exported, package_path=str(Path(folder) / "kernel.pt2"), inductor_configs=dict(COMPILER_OPTIONS)
         )
         os.replace(package, kernel.path)
 

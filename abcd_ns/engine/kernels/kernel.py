@@ -22,6 +22,10 @@ from torch import Tensor
 FOLDER_VARIABLE = "ABCD_KERNELS"
 """Environment variable that names another folder for built kernels."""
 
+COMPILER_OPTIONS = {"cpp.dynamic_threads": True}
+"""Inductor's. Its default fixes the number of threads when the kernel is built; a process that was told to
+use one would still wait for others, and two processes on a machine would wait for each other."""
+
 Run = Callable[..., tuple[Tensor, ...]]
 
 
@@ -117,7 +121,13 @@ def _load(kernel: Kernel) -> Run | None:
 @functools.cache
 def _digest(kernel: Kernel) -> str:
     digest = hashlib.blake2b(digest_size=10)
-    for part in (torch.__version__, platform.machine(), _processor(), repr(kernel.shapes)):
+    for part in (
+        torch.__version__,
+        platform.machine(),
+        _processor(),
+        repr(kernel.shapes),
+        repr(COMPILER_OPTIONS),
+    ):
         digest.update(part.encode() + b"\0")
     function = kernel.function
     while isinstance(function, functools.partial):
