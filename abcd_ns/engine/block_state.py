@@ -17,7 +17,7 @@ class Clocks:
     """How far a block has come; integers, so that schedules built on them are exact."""
 
     steps: int = 0
-    """Optimisation steps spent on the block."""
+    """Views that were drawn to train the block."""
     adam_steps: int = 0
     """Adam's own step count, which corrects its bias."""
     visits: int = 0

@@ -4,7 +4,7 @@ import sys
 
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.kernels.build import compile_all
-from abcd_ns.engine.loss import PHOTOMETRIC
+from abcd_ns.engine.photometric_kernel import PHOTOMETRIC
 from abcd_ns.engine.rasterizer.chunk_kernels import chunk_kernels
 from abcd_ns.engine.rasterizer.splat_kernels import SPLAT_KERNELS
 

@@ -6,6 +6,7 @@ everything else at rest in the store, and tells its listeners what happens.
 """
 
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,8 +22,16 @@ from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, Parts
-from abcd_ns.engine.param_swap import Optimizers, Params, attach, detach, live_gaussians
-from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
+from abcd_ns.engine.param_swap import (
+    Optimizers,
+    Params,
+    attach,
+    detach,
+    live_gaussians,
+    scale_to_batch,
+)
+from abcd_ns.engine.rasterizer import Rasterizer, Shot, ZWindow
+from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
@@ -39,29 +48,39 @@ from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
 
+DEFAULT_BATCH = 4
+"""Views in a step where there are several blocks."""
+
 
 @dataclass(frozen=True)
 class Sample:
-    """What one step trains on."""
+    """One view that a step trains on."""
 
-    step: int
     view: View
     crop: Crop
     layers: Parts | None
-    near: Gaussians | None
+    near: Splats | None
     window: ZWindow | None
     background: Float[Tensor, "3"]
 
 
 @dataclass(frozen=True)
-class Rendered:
-    """The active block within its surroundings."""
+class Batch:
+    """What one step trains on."""
 
-    rgb: Float[Tensor, "h w 3"]
-    """Of the sample's crop, background included, 0..1."""
-    transmittance: Float[Tensor, "h w"]
+    step: int
+    samples: tuple[Sample, ...]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """The active block within its surroundings, as a batch shows it."""
+
+    pictures: tuple[Float[Tensor, "_h _w 3"], ...]
+    """Of each sample's crop, background included, 0..1."""
+    transmittances: tuple[Float[Tensor, "_h _w"], ...]
     """Of the active block and what was sorted in with it."""
-    info: dict[str, Any]
+    infos: tuple[dict[str, Any], ...]
 
 
 class Coordinator:
@@ -99,6 +118,8 @@ class Coordinator:
         self._scene_key = scene_key
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
+        self.batch = config.batch or (1 if scene.tree.num_blocks == 1 else DEFAULT_BATCH)
+        scale_to_batch(optimizers, self.batch)
         self._means_lr: float = optimizers["means"].param_groups[0]["lr"]
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
@@ -117,7 +138,7 @@ class Coordinator:
         """Whether the budget is used up."""
         return self.progress >= 1.0
 
-    def next_sample(self) -> Sample:
+    def next_batch(self) -> Batch:
         """Begin a visit if none is under way, set the learning rate, and say what to train on next.
 
         Raises:
@@ -129,69 +150,83 @@ class Coordinator:
         active = self._active
         rate = exponential_decay(self.progress, self._means_lr, self._means_lr * self.config.means_lr_decay)
         self.optimizers["means"].param_groups[0]["lr"] = rate
-        view = self._order[active.done]
+        views = self._order[active.done * self.batch : (active.done + 1) * self.batch]
+        return Batch(self.state.step, tuple(self._sample(view, place) for place, view in enumerate(views)))
+
+    def _sample(self, view: int, place: int) -> Sample:
         around = self._layers.around(view) if self._layers else None
         return Sample(
-            step=self.state.step,
             view=self.views[view],
-            crop=active.geometry.crops[view],
+            crop=self._active.geometry.crops[view],
             layers=around and around.layers,
             near=around and around.near,
             window=around and around.window,
-            background=self._background(),
+            background=self._background(place),
         )
 
-    def render(self, sample: Sample) -> Rendered:
+    def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
-        raster = self._rasterizer(
+        rasters = self._rasterizer.draw(
             live_gaussians(self.params),
-            sample.view,
+            [
+                Shot(sample.view, sample.crop, sample.near, None if sample.near is None else sample.window)
+                for sample in batch.samples
+            ],
             sh_degree=self._active.sh_degree,
-            crop=sample.crop,
-            frozen=sample.near,
-            z_window=sample.window if sample.near is not None else None,
             antialiased=self.config.antialiased,
             absgrad=self.density.absgrad,
         )
-        self.density.before_backward(raster.info)
-        if sample.layers is None:
-            rgb = raster.color + raster.transmittance[..., None] * sample.background
-        else:
-            rgb = sandwich(sample.layers.front, raster.layer, sample.layers.back, sample.background)
-        return Rendered(rgb.clamp(0, 1), raster.transmittance, raster.info)
+        infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
+        self.density.before_backward(infos)
+        pictures = []
+        for sample, raster in zip(batch.samples, rasters, strict=True):
+            if sample.layers is None:
+                rgb = raster.color + raster.transmittance[..., None] * sample.background
+            else:
+                rgb = sandwich(sample.layers.front, raster.layer, sample.layers.back, sample.background)
+            pictures.append(rgb.clamp(0, 1))
+        return Rendered(tuple(pictures), tuple(raster.transmittance for raster in rasters), infos)
 
     def loss(
-        self, sample: Sample, rgb: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]
+        self,
+        batch: Batch,
+        pictures: Sequence[Float[Tensor, "_h _w 3"]],
+        photos: Sequence[Float[Tensor, "_h _w 3"]],
     ) -> Float[Tensor, ""]:
-        """The loss of a step: photometric over the crop, plus what the density strategy asks for."""
-        view = sample.view
-        photometric = photometric_loss(
-            rgb,
-            photo,
-            full_pixels=view.width * view.height,
-            full_windows=ssim_windows(view.height, view.width),
-            ssim_lambda=self.config.ssim_lambda,
-        )
+        """The loss of a step: photometric over the crops, the mean of the samples', plus what the density
+        strategy asks for."""
+        total = torch.zeros((), device=self.device)
+        for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
+            view = sample.view
+            total = total + photometric_loss(
+                picture,
+                photo,
+                full_pixels=view.width * view.height,
+                full_windows=ssim_windows(view.height, view.width),
+                ssim_lambda=self.config.ssim_lambda,
+            )
+        photometric = total / len(batch.samples)
         if self.config.density.strategy != "mcmc":
             return photometric
         return photometric + self.density.regularisation(self.params, self.count())
 
     def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
         """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done."""
-        active = self._active
+        active, taken = self._active, len(rendered.pictures)
         self.state.step += 1
         active.done += 1
-        self._clocks = replace(self._clocks, steps=self._clocks.steps + 1)
+        self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)
         limit = self.config.density.limit
         clock = DensityClock(
             progress=self.progress,
             steps=self._clocks.steps,
+            taken=taken,
             views=len(active.geometry.views),
             room=None if limit is None else limit - self.count(),
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
         )
         self._growth = self.density.after_step(
-            self.params, self.optimizers, self._growth, rendered.info, clock
+            self.params, self.optimizers, self._growth, rendered.infos, clock
         )
         self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
         if active.done >= active.steps or self.finished:
@@ -234,7 +269,7 @@ class Coordinator:
     @property
     def _active(self) -> ActiveVisit:
         if self.state.active is None:
-            raise RuntimeError("no visit is under way: call next_sample first")
+            raise RuntimeError("no visit is under way: call next_batch first")
         return self.state.active
 
     def _begin_visit(self) -> None:
@@ -268,7 +303,7 @@ class Coordinator:
         attach(rest, self.params, self.optimizers)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
         self.scene.lay_over(block, lambda: live_gaussians(self.params))
-        self._order = view_order(active.views, active.steps, active.number, self.config.seed)
+        self._order = view_order(active.views, active.steps * self.batch, active.number, self.config.seed)
         seen = len(active.geometry.views)
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
@@ -288,7 +323,7 @@ class Coordinator:
         )
         settings = PaintSettings(active.sh_degree, self.config.antialiased)
         layers = VisitLayers(painter, self.cache, active.geometry, self.views, settings, self._scene_key)
-        wanted = dict.fromkeys(self._order[active.done :])
+        wanted = dict.fromkeys(self._order[active.done * self.batch :])
         for done, _ in enumerate(layers.draw(wanted), start=1):
             self.announce(LayersDrawn(active.number, done, len(wanted)))
         return layers
@@ -333,7 +368,7 @@ class Coordinator:
             remaining = None if self.budget.steps is None else self.budget.steps - state.step
             passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
             used = {block: self._views_used(seen) for block, seen in state.views.items()}
-            state.queue = list(plan_sweep(state.sweep, used, passes, remaining, config.seed))
+            state.queue = list(plan_sweep(state.sweep, used, passes / self.batch, remaining, config.seed))
             if not state.queue:
                 raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
         return state.queue.pop(0)
@@ -364,11 +399,10 @@ class Coordinator:
         counts = [self.scene.count(block) for block in range(self.scene.tree.num_blocks)]
         return max(2 * max(counts), 200_000)
 
-    def _background(self) -> Tensor:
+    def _background(self, place: int) -> Tensor:
         if self.config.background == "random":
-            generator = torch.Generator().manual_seed(
-                random.Random(f"background {self.config.seed} {self.state.step}").getrandbits(62)
-            )
+            drawn = random.Random(f"background {self.config.seed} {self.state.step} {place}").getrandbits(62)
+            generator = torch.Generator().manual_seed(drawn)
             return torch.rand(3, generator=generator).to(self.device)
         return torch.full((3,), float(self.config.background == "white"), device=self.device)
 

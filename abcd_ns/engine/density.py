@@ -27,6 +27,10 @@ MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 
 
+Infos = tuple[dict[str, Any], ...]
+"""gsplat's `info` of one or more drawings."""
+
+
 @dataclass
 class DensityConfig:
     """When and how the number of Gaussians changes. Thresholds are splatfacto's, times are relative."""
@@ -77,13 +81,19 @@ class DensityClock:
     progress: float
     """Share of the whole run that is done, 0..1."""
     steps: int
-    """The block's own steps, this one included."""
+    """Views that were drawn to train the block so far, this step's included."""
+    taken: int
+    """This step's."""
     views: int
     """Views that see the block."""
     room: int | None
     """Gaussians that may still be added to the scene; None for no limit."""
     seed: int
     """Of the random numbers drawn in this step."""
+
+    def reached(self, every: int) -> bool:
+        """Whether `steps` has come to a multiple of `every` in this step."""
+        return self.steps // every > (self.steps - self.taken) // every
 
 
 class DensityControl:
@@ -97,10 +107,11 @@ class DensityControl:
         """Whether the rasterizer must leave `absgrad` on `means2d`."""
         return self.config.strategy == "default" and self.config.use_absgrad
 
-    def before_backward(self, info: dict[str, Any]) -> None:
+    def before_backward(self, infos: Infos) -> None:
         """Keep the gradient of the projected means, by which the default strategy judges."""
-        if self.config.strategy == "default" and info["means2d"].requires_grad:
-            info["means2d"].retain_grad()
+        for info in infos:
+            if self.config.strategy == "default" and info["means2d"].requires_grad:
+                info["means2d"].retain_grad()
 
     def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
         """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
@@ -115,21 +126,21 @@ class DensityControl:
         """Whether this step refines."""
         warm = clock.steps >= self.config.warmup_passes * clock.views
         running = self.config.refine_start <= clock.progress < self.config.refine_stop
-        return warm and running and clock.steps % max(self.config.refine_every, clock.views, 1) == 0
+        return warm and running and clock.reached(max(self.config.refine_every, clock.views, 1))
 
     def after_step(
         self,
         params: Params,
         optimizers: Optimizers,
         growth: dict[str, Tensor],
-        info: dict[str, Any],
+        infos: Infos,
         clock: DensityClock,
     ) -> dict[str, Tensor]:
         """Gather statistics and, when it is time, refine. Call after Adam's step.
 
         Args:
             growth: the block's statistics so far, each [n].
-            info: of the step's drawing, after backward.
+            infos: of the step's drawings, after backward.
 
         Returns:
             The block's statistics from now on. The global random generator is left as it was.
@@ -143,18 +154,19 @@ class DensityControl:
             if self.config.strategy == "mcmc":
                 self._step_mcmc(params, optimizers, clock)
                 return {}
-            return self._step_default(params, optimizers, growth, info, clock)
+            return self._step_default(params, optimizers, growth, infos, clock)
 
     def _step_default(
         self,
         params: Params,
         optimizers: Optimizers,
         growth: dict[str, Tensor],
-        info: dict[str, Any],
+        infos: Infos,
         clock: DensityClock,
     ) -> dict[str, Tensor]:
         config = self.config
-        if clock.progress >= config.refine_stop or info["means2d"].grad is None:
+        infos = tuple(info for info in infos if info["means2d"].grad is not None)
+        if clock.progress >= config.refine_stop or not infos:
             return growth
         has_reset = 0 < config.reset_every < clock.steps
         strategy = DefaultStrategy(
@@ -168,13 +180,14 @@ class DensityControl:
             absgrad=config.use_absgrad,
         )
         state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": 1.0, **growth}
-        strategy.step_post_backward(params, optimizers, state, GATHER, info)
+        for info in infos:
+            strategy.step_post_backward(params, optimizers, state, GATHER, info)
         if self.is_due(clock):
             strategy.grow_grad2d = _threshold_within(state, config.densify_grad_thresh, clock.room)
             # Nothing is visible in this info, so the statistics are not gathered twice.
-            unseen = {**info, "radii": torch.zeros_like(info["radii"])}
+            unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
             strategy.step_post_backward(params, optimizers, state, REFINE, unseen)
-        if config.reset_every > 0 and clock.steps % config.reset_every == 0:
+        if config.reset_every > 0 and clock.reached(config.reset_every):
             gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
         return {name: value for name, value in state.items() if isinstance(value, Tensor)}
 

@@ -1,5 +1,6 @@
 """Puts a block into live parameters and Adam optimizers, and takes it out again, moments included."""
 
+import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import replace
 
@@ -71,6 +72,21 @@ def make_adam(params: Params, learning_rates: Mapping[str, float], eps: float = 
         name: torch.optim.Adam([params[name]], lr=learning_rates[name], eps=eps, fused=True)
         for name in PARAM_NAMES
     }
+
+
+def scale_to_batch(optimizers: Optimizers, batch: int) -> None:
+    """Set learning rates and memories, those of one view a step so far, for steps of `batch` views.
+
+    Rates grow with the square root, and moments forget as many views' worth a step: for Adam this follows the
+    same path as single views do, as far as gradients are noise (Malladi et al. 2022, "On the SDEs and scaling
+    rules for adaptive gradient algorithms"; Zhao et al. 2024 use it for Gaussian Splatting).
+    """
+    if batch == 1:
+        return
+    for optimizer in optimizers.values():
+        for group in optimizer.param_groups:
+            group["lr"] *= math.sqrt(batch)
+            group["betas"] = tuple(beta**batch for beta in group["betas"])
 
 
 def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:

@@ -6,6 +6,7 @@ few views see overfit otherwise). Visits are short at first, while the neighbour
 grow longer, so that drawing the frozen layers is paid for by more steps.
 """
 
+import math
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,22 +26,23 @@ def passes_of_sweep(sweep: int, first: int, last: int) -> int:
 
 
 def plan_sweep(
-    sweep: int, views: Mapping[int, int], passes: int, remaining: int | None, seed: int
+    sweep: int, views: Mapping[int, int], passes: int | float, remaining: int | None, seed: int
 ) -> tuple[VisitPlan, ...]:
     """The visits of one sweep, in a random order that depends on `seed` and `sweep` alone.
 
     Args:
         views: by block, the number of views that a visit uses; blocks with none are left out.
-        passes: steps a visit = passes x views.
+        passes: steps of a visit = passes x views, rounded up; less than 1 where a step draws several views.
         remaining: steps left in the budget, or None without one. Where they do not suffice for the sweep,
             or would leave less than half a sweep behind, all visits are scaled to use up exactly these.
     """
     seen = {block: count for block, count in sorted(views.items()) if count > 0}
     order = list(seen)
     random.Random(f"sweep {seed} {sweep}").shuffle(order)
-    full = passes * sum(seen.values())
+    steps = {block: math.ceil(passes * count) for block, count in seen.items()}
+    full = sum(steps.values())
     if remaining is None or remaining >= full + full // 2:
-        return tuple(VisitPlan(block, passes * seen[block]) for block in order)
+        return tuple(VisitPlan(block, steps[block]) for block in order)
     if not seen:
         return ()
     shares = _apportion(remaining, [seen[block] for block in order])

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.loss import psnr
+from abcd_ns.engine.loss import mean_psnr
 from abcd_ns.engine.types import Crop
 
 PhotoReader = Callable[[int, Crop], Float[Tensor, "h w 3"]]
@@ -23,17 +22,15 @@ def train(coordinator: Coordinator, photo: PhotoReader, steps: int | None = None
 
 
 def train_step(coordinator: Coordinator, photo: PhotoReader) -> None:
-    """Render a sample, take its loss' gradient, step every optimizer, report back."""
-    sample = coordinator.next_sample()
-    target = photo(sample.view.index, sample.crop).to(coordinator.device)
-    rendered = coordinator.render(sample)
-    loss = coordinator.loss(sample, rendered.rgb, target)
+    """Render a batch, take its loss' gradient, step every optimizer, report back."""
+    batch = coordinator.next_batch()
+    photos = [photo(sample.view.index, sample.crop).to(coordinator.device) for sample in batch.samples]
+    rendered = coordinator.render(batch)
+    loss = coordinator.loss(batch, rendered.pictures, photos)
     for optimizer in coordinator.optimizers.values():
         optimizer.zero_grad(set_to_none=True)
     if loss.requires_grad:
         loss.backward()
     for optimizer in coordinator.optimizers.values():
         optimizer.step()
-    with torch.no_grad():
-        quality = float(psnr(rendered.rgb, target))
-    coordinator.after_step(rendered, quality)
+    coordinator.after_step(rendered, mean_psnr(rendered.pictures, photos))

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.compositing import empty_layer
 from abcd_ns.engine.intervals import ray_interval
-from abcd_ns.engine.loss import SSIM_WINDOW
 from abcd_ns.engine.painter import Painter, PaintSettings, Parts
+from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import ZWindow
-from abcd_ns.engine.rasterizer.projection import project
+from abcd_ns.engine.rasterizer.projection import Splats, pack, project_packed
 from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 from abcd_ns.engine.visibility import footprint, fragment_box_intersects, reach_radius
@@ -73,8 +72,9 @@ def survey(
     """
     crops = {}
     with torch.no_grad():
+        packed = pack(gaussians)
         for view in views:
-            seen = project(gaussians, view)
+            seen = project_packed(packed, view)
             crop = footprint(seen.means2d, seen.radii, view, margin=CROP_MARGIN, align=align)
             if crop is not None:
                 crops[view.index] = crop
@@ -98,8 +98,8 @@ class Surroundings:
 
     layers: Parts
     """F (front) and B (back), for the view's crop."""
-    near: Gaussians | None
-    """Frozen Gaussians to be sorted in with the active ones."""
+    near: Splats | None
+    """Frozen Gaussians to be sorted in with the active ones, as this view sees them."""
     window: ZWindow | None
     """Where the fragments of `near` count."""
 
@@ -128,7 +128,7 @@ class VisitLayers:
         self._versions = self._frozen_versions()
         self._units = painter.units(exclude=geometry.block)
         self._near = self._load_near()
-        self._near_rows: dict[int, Tensor] = {}
+        self._near_seen: dict[int, Splats] = {}
 
     def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Parts]]:
         """Draw what the cache lacks for these views; yields each view with its layers when they are ready.
@@ -227,18 +227,19 @@ class VisitLayers:
         near = [self._painter.reaching(block, window) for block in self._versions if scene.count(block) > 0]
         return Gaussians.cat(near).to(self._painter.device) if near else None
 
-    def _near_of(self, view: int) -> Gaussians | None:
+    def _near_of(self, view: int) -> Splats | None:
         """Of the frozen Gaussians that reach into the window, those that this view sees there."""
         if self._near is None or self._geometry.window is None:
             return None
-        if view not in self._near_rows:
-            camera = self._views[view]
-            with torch.no_grad():
-                seen = project(self._near, camera)
-                crop = self._geometry.crops[view]
-                hit = fragment_box_intersects(
-                    seen.depths, seen.means2d, seen.radii, camera, self._geometry.window, crop
-                )
-            self._near_rows[view] = torch.where(hit)[0]
-        rows = self._near_rows[view]
-        return self._near[rows] if len(rows) else None
+        if view not in self._near_seen:
+            camera, crop = self._views[view], self._geometry.crops[view]
+            settings = self._settings
+            seen = self._painter.rasterizer.project(
+                self._near, camera, sh_degree=settings.sh_degree, antialiased=settings.antialiased
+            )
+            hit = fragment_box_intersects(
+                seen.depths, seen.means2d, seen.radii, camera, self._geometry.window, crop
+            )
+            self._near_seen[view] = seen[torch.where(hit)[0]]
+        seen = self._near_seen[view]
+        return seen if len(seen) else None

@@ -15,8 +15,8 @@ from abcd_ns.plugin.data.dataset import AbcdDataset
 if TYPE_CHECKING:
     from abcd_ns.plugin.config import AbcdDataManagerConfig
 
-SAMPLE = "abcd_sample"
-"""The key of a camera's metadata under which a training sample travels from here to the model."""
+BATCH = "abcd_batch"
+"""The key of a camera's metadata under which what to train on travels from here to the model."""
 
 
 class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
@@ -57,17 +57,22 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return self.train_dataset.photos.crop(row, crop).to(self.device).float() / 255
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
-        """The camera of the next sample, the sample in its metadata, and the photo's crop."""
+        """The next batch: its first camera with all of it in the metadata, and the crops of the photos."""
         if self._coordinator is None:
             raise RuntimeError("training samples come from a coordinator: call follow() first")
-        sample = self._coordinator.next_sample()
-        row = sample.view.index
-        camera = self.train_dataset.cameras[row : row + 1].to(self.device)
-        camera.metadata = {"cam_idx": row, SAMPLE: sample}
-        batch: dict[str, Any] = {"image": self.photo(row, sample.crop), "image_idx": row}
-        mask = self.train_dataset.photos.mask(row)
-        if mask is not None:
-            batch["mask"] = mask[sample.crop.slices].to(self.device)
+        samples = self._coordinator.next_batch()
+        rows = [sample.view.index for sample in samples.samples]
+        camera = self.train_dataset.cameras[rows[0] : rows[0] + 1].to(self.device)
+        camera.metadata = {"cam_idx": rows[0], BATCH: samples}
+        crops = [sample.crop for sample in samples.samples]
+        photos = [self.photo(row, crop) for row, crop in zip(rows, crops, strict=True)]
+        batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
+        masks = [self.train_dataset.photos.mask(row) for row in rows]
+        if any(mask is not None for mask in masks):
+            batch["mask"] = [
+                mask if mask is None else mask[crop.slices].to(self.device)
+                for mask, crop in zip(masks, crops, strict=True)
+            ]
         return camera, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002

@@ -13,16 +13,16 @@ from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import resolve_ownership
-from abcd_ns.engine.coordinator import Coordinator, Sample
+from abcd_ns.engine.coordinator import Batch, Coordinator
 from abcd_ns.engine.initialize import gaussians_from_points, random_points
-from abcd_ns.engine.loss import photometric_loss, psnr, ssim_windows
+from abcd_ns.engine.loss import mean_psnr, photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings
 from abcd_ns.engine.param_swap import live_gaussians
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.scene import BlockScene, MemoryScene
 from abcd_ns.engine.types import Gaussians, Layer, View
-from abcd_ns.plugin.datamanager import SAMPLE
+from abcd_ns.plugin.datamanager import BATCH
 from abcd_ns.plugin.metrics import image_metrics
 from abcd_ns.plugin.views import view_of
 
@@ -34,7 +34,7 @@ VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
 class AbcdModel(SplatfactoModel):
-    """Draws samples for training and whole pictures for evaluation, viewer and export.
+    """Draws batches for training and whole pictures for evaluation, viewer and export.
 
     While training, the registered parameters are the live block alone and the rest of the scene is reached
     through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene.
@@ -116,23 +116,23 @@ class AbcdModel(SplatfactoModel):
     # -- pictures ------------------------------------------------------------------------------------
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
-        """A training sample's crop where the camera carries one, else the whole picture."""
-        sample = (camera.metadata or {}).get(SAMPLE)
-        if self.training and sample is not None:
-            return self._sample_outputs(sample)
+        """The crops of a training batch where the camera carries one, else the whole picture."""
+        batch = (camera.metadata or {}).get(BATCH)
+        if self.training and batch is not None:
+            return self._batch_outputs(batch)
         return self._whole_outputs(view_of(camera.to(self.device)))
 
-    def _sample_outputs(self, sample: Sample) -> dict[str, Any]:
+    def _batch_outputs(self, batch: Batch) -> dict[str, Any]:
         if self._coordinator is None:
             raise RuntimeError(
-                "a training sample needs the coordinator that it came from: call follow() first"
+                "a training batch needs the coordinator that it came from: call follow() first"
             )
-        rendered = self._coordinator.render(sample)
+        rendered = self._coordinator.render(batch)
         return {
-            "rgb": rendered.rgb,
-            "accumulation": 1 - rendered.transmittance[..., None],
-            "background": sample.background,
-            "sample": sample,
+            "rgb": list(rendered.pictures),
+            "accumulation": [1 - transmittance[..., None] for transmittance in rendered.transmittances],
+            "background": [sample.background for sample in batch.samples],
+            "batch": batch,
             "rendered": rendered,
         }
 
@@ -182,27 +182,35 @@ class AbcdModel(SplatfactoModel):
     # -- loss and metrics ----------------------------------------------------------------------------
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
-        """PSNR of what was drawn and the number of Gaussians in the scene."""
-        photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        with torch.no_grad():
-            quality = psnr(outputs["rgb"], photo)
-        return {"psnr": quality, "gaussian_count": self._count()}
+        """PSNR of what was drawn, a batch's mean, and the number of Gaussians in the scene."""
+        pictures, photos = self._pairs(outputs, batch)
+        return {"psnr": mean_psnr(pictures, photos), "gaussian_count": self._count()}
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
-        """The coordinator's loss of a sample; of a whole picture the photometric loss."""
+        """The coordinator's loss of a training batch; of a whole picture the photometric loss."""
         del metrics_dict
-        photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        rgb = outputs["rgb"]
+        pictures, photos = self._pairs(outputs, batch)
         if "mask" in batch:
-            mask = batch["mask"].to(self.device)
-            photo, rgb = photo * mask, rgb * mask
-        if "sample" in outputs and self._coordinator is not None:
-            return {"main_loss": self._coordinator.loss(outputs["sample"], rgb, photo)}
-        height, width = rgb.shape[:2]
+            masks = _as_list(batch["mask"])
+            pictures, photos = _masked(pictures, masks), _masked(photos, masks)
+        if "batch" in outputs and self._coordinator is not None:
+            return {"main_loss": self._coordinator.loss(outputs["batch"], pictures, photos)}
+        height, width = pictures[0].shape[:2]
         whole = {"full_pixels": height * width, "full_windows": ssim_windows(height, width)}
-        return {"main_loss": photometric_loss(rgb, photo, ssim_lambda=self.config.ssim_lambda, **whole)}
+        loss = photometric_loss(pictures[0], photos[0], ssim_lambda=self.config.ssim_lambda, **whole)
+        return {"main_loss": loss}
+
+    def _pairs(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
+        """Pictures and their photos, on the same background."""
+        photos = [
+            self.composite_with_background(self.get_gt_img(image), background)
+            for image, background in zip(
+                _as_list(batch["image"]), _as_list(outputs["background"]), strict=True
+            )
+        ]
+        return _as_list(outputs["rgb"]), photos
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
@@ -224,3 +232,12 @@ class AbcdModel(SplatfactoModel):
 
     def _count(self) -> int:
         return len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
+
+
+def _as_list(values: Tensor | list[Tensor]) -> list[Tensor]:
+    return values if isinstance(values, list) else [values]
+
+
+def _masked(pictures: list[Tensor], masks: list[Tensor | None]) -> list[Tensor]:
+    pairs = zip(pictures, masks, strict=True)
+    return [picture if mask is None else picture * mask.to(picture.device) for picture, mask in pairs]

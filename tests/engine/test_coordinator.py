@@ -87,14 +87,22 @@ def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership):
     views = ring_of_views(3, dtype=torch.float64)
     still = DensityConfig(strategy="off")
     coordinator = make_coordinator(
-        tmp_path, gaussians, views, blocks=4, ownership=ownership, window_percentile=1.0, density=still
+        tmp_path,
+        gaussians,
+        views,
+        blocks=4,
+        ownership=ownership,
+        window_percentile=1.0,
+        density=still,
+        batch=1,
     )
     for _ in range(3):
-        sample = coordinator.next_sample()
+        batch = coordinator.next_batch()
+        (sample,) = batch.samples
         weights = torch.rand(sample.crop.height, sample.crop.width, 3, dtype=torch.float64)
         sample = dataclasses.replace(sample, background=torch.rand(3, dtype=torch.float64))
-        rendered = coordinator.render(sample)
-        (weights * rendered.rgb).sum().backward()
+        rendered = coordinator.render(dataclasses.replace(batch, samples=(sample,)))
+        (weights * rendered.pictures[0]).sum().backward()
         block = coordinator.state.active.geometry.block
         found = {name: p.grad.clone() for name, p in coordinator.params.items()}
         expected = _gradient_of_whole_picture(coordinator, sample, weights, block, ownership)
@@ -161,7 +169,7 @@ def test_nothing_is_lost_when_gaussians_migrate(tmp_path, views, photos, start, 
 
 def test_migrants_take_their_moments_along(tmp_path, views, photos, start):
     coordinator = make_coordinator(
-        tmp_path, start, views, blocks=2, steps=30, density=DensityConfig(strategy="off")
+        tmp_path, start, views, blocks=2, steps=30, density=DensityConfig(strategy="off"), batch=2
     )
     while coordinator.state.active is None or coordinator._active.done < coordinator._active.steps - 1:
         train_step(coordinator, photos)
@@ -251,7 +259,7 @@ def test_events_tell_the_whole_story(tmp_path, views, photos, start):
     for visit in begun:
         drawn = [e for e in events if isinstance(e, LayersDrawn) and e.visit == visit.visit]
         assert [e.done for e in drawn] == list(range(1, len(drawn) + 1))
-        assert len(drawn) == min(visit.views, visit.steps)
+        assert len(drawn) == min(visit.views, visit.steps * coordinator.batch)
 
 
 def test_a_limit_on_gaussians_is_kept_at_every_step(tmp_path, views, photos, start):
@@ -275,7 +283,7 @@ def test_a_scene_that_no_view_sees_is_an_error_that_says_so(tmp_path, views, pho
 
 def test_the_state_of_a_run_survives_json(tmp_path, views, photos, start):
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=50)
-    train(coordinator, photos, steps=9)
+    train(coordinator, photos, steps=7)
     state = coordinator.state
     again = RunState.from_json(state.to_json())
     assert again.to_json() == state.to_json()
@@ -298,11 +306,14 @@ def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start):
     draw = TorchRasterizer(compile="never")
     scene = whole_scene(coordinator)
     for _ in range(4):
-        sample = coordinator.next_sample()
+        batch = coordinator.next_batch()
+        assert 1 < len(batch.samples) <= coordinator.batch
         with torch.no_grad():
-            rendered = coordinator.render(sample)
-            layer = draw(scene, sample.view, sh_degree=0, crop=sample.crop).layer
-        expected = composite(layer, sample.background).clamp(0, 1)
-        assert float((rendered.rgb - expected).abs().max()) < 1e-5
-        assert sample.layers is not None
+            rendered = coordinator.render(batch)
+        for sample, picture in zip(batch.samples, rendered.pictures, strict=True):
+            with torch.no_grad():
+                layer = draw(scene, sample.view, sh_degree=0, crop=sample.crop).layer
+            expected = composite(layer, sample.background).clamp(0, 1)
+            assert float((picture - expected).abs().max()) < 1e-5
+            assert sample.layers is not None
         coordinator.after_step(rendered)

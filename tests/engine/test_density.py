@@ -31,7 +31,9 @@ def fake_info(count: int, gradient: float) -> dict:
 
 
 def clock(**changes) -> DensityClock:
-    return DensityClock(**{"progress": 0.2, "steps": 100, "views": 5, "room": None, "seed": 1, **changes})
+    return DensityClock(
+        **{"progress": 0.2, "steps": 100, "taken": 1, "views": 5, "room": None, "seed": 1, **changes}
+    )
 
 
 @pytest.mark.parametrize("views", [1, 3, 30, 300, 3000, 15_000])
@@ -52,7 +54,7 @@ def test_refinement_keeps_to_its_share_of_the_run(progress, expected):
 def test_the_default_strategy_clones_where_gradients_are_high():
     params, optimizers = live(random_gaussians(8, size=0.001))
     control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
-    growth = control.after_step(params, optimizers, {}, fake_info(8, gradient=1.0), clock())
+    growth = control.after_step(params, optimizers, {}, (fake_info(8, gradient=1.0),), clock())
     assert len(params["means"]) == 16
     assert {name: len(value) for name, value in growth.items()} == {"grad2d": 16, "count": 16}
     assert all(len(optimizers[n].param_groups[0]["params"][0]) == 16 for n in PARAM_NAMES)
@@ -63,7 +65,7 @@ def test_between_refinements_statistics_add_up():
     control = DensityControl(DensityConfig())
     growth: dict = {}
     for _ in range(3):
-        growth = control.after_step(params, optimizers, growth, fake_info(8, 1.0), clock(steps=7))
+        growth = control.after_step(params, optimizers, growth, (fake_info(8, 1.0),), clock(steps=7))
     assert growth["count"].tolist() == [3.0] * 8
     assert growth["grad2d"].tolist() == pytest.approx([3 * math.sqrt(2)] * 8)
     assert len(params["means"]) == 8
@@ -75,7 +77,7 @@ def test_without_room_nothing_is_added_but_the_transparent_go():
     gaussians.opacities[:3] = -8.0
     params, optimizers = live(gaussians)
     control = DensityControl(DensityConfig(densify_grad_thresh=0.5))
-    control.after_step(params, optimizers, {}, fake_info(8, 1.0), clock(room=0))
+    control.after_step(params, optimizers, {}, (fake_info(8, 1.0),), clock(room=0))
     assert torch.equal(params["means"], gaussians.means[3:])
 
 
@@ -85,7 +87,7 @@ def test_opacities_are_reset_on_the_blocks_own_clock_alone():
     control = DensityControl(DensityConfig(reset_every=500))
     for steps, reset in ((499, False), (500, True), (501, False), (1000, True)):
         params, optimizers = live(gaussians)
-        control.after_step(params, optimizers, {}, fake_info(8, 0.0), clock(steps=steps))
+        control.after_step(params, optimizers, {}, (fake_info(8, 0.0),), clock(steps=steps))
         assert bool((torch.sigmoid(params["opacities"]) < 0.02).all()) is reset, steps
 
 
@@ -96,14 +98,14 @@ def test_giants_are_pruned_only_once_opacities_were_reset():
     control = DensityControl(DensityConfig(reset_every=500, refine_every=10))
     for steps, left in ((490, 8), (510, 7)):
         params, optimizers = live(gaussians)
-        control.after_step(params, optimizers, {}, fake_info(8, 0.0), clock(steps=steps))
+        control.after_step(params, optimizers, {}, (fake_info(8, 0.0),), clock(steps=steps))
         assert len(params["means"]) == left
 
 
 def test_after_the_last_refinement_nothing_changes():
     params, optimizers = live(random_gaussians(8))
     control = DensityControl(DensityConfig())
-    assert control.after_step(params, optimizers, {}, fake_info(8, 9.0), clock(progress=0.6)) == {}
+    assert control.after_step(params, optimizers, {}, (fake_info(8, 9.0),), clock(progress=0.6)) == {}
     assert len(params["means"]) == 8
 
 
@@ -113,10 +115,10 @@ def test_mcmc_relocates_the_dead_and_grows_up_to_the_limit():
     gaussians.opacities[:10] = -9.0
     params, optimizers = live(gaussians)
     control = DensityControl(DensityConfig(strategy="mcmc", noise_lr=0.0))
-    control.after_step(params, optimizers, {}, {}, clock(room=3))
+    control.after_step(params, optimizers, {}, (), clock(room=3))
     assert len(params["means"]) == 103
     assert float(torch.sigmoid(params["opacities"].detach()).min()) > 0.005
-    control.after_step(params, optimizers, {}, {}, clock(room=0))
+    control.after_step(params, optimizers, {}, (), clock(room=0))
     assert len(params["means"]) == 103
 
 
@@ -128,7 +130,7 @@ def test_mcmc_noise_moves_the_transparent_and_depends_on_the_seed():
     for seed in (1, 1, 2):
         params, optimizers = live(gaussians)
         before = torch.get_rng_state()
-        control.after_step(params, optimizers, {}, {}, clock(steps=7, seed=seed))
+        control.after_step(params, optimizers, {}, (), clock(steps=7, seed=seed))
         assert torch.equal(torch.get_rng_state(), before)
         moved.append(live_gaussians(params).means.detach() - gaussians.means)
     assert torch.equal(moved[0], moved[1])

@@ -9,7 +9,8 @@ import torch
 from abcd_ns.engine.build_kernels import all_kernels
 from abcd_ns.engine.kernels import Kernel, build, can_build
 from abcd_ns.engine.kernels.kernel import FOLDER_VARIABLE, forget_loaded
-from abcd_ns.engine.loss import SSIM_WINDOW, photometric_loss
+from abcd_ns.engine.loss import photometric_loss
+from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import TorchRasterizer
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, chunk_kernels
 from abcd_ns.engine.types import Crop

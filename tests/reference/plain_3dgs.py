@@ -40,8 +40,8 @@ def train_plain(
             sh_degree=degree,
             absgrad=density.absgrad,
         )
-        density.before_backward(raster.info)
-        seed = random.Random(f"background {config.seed} {taken}").getrandbits(62)
+        density.before_backward((raster.info,))
+        seed = random.Random(f"background {config.seed} {taken} 0").getrandbits(62)
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed))
         picture = (raster.color + raster.transmittance[..., None] * background).clamp(0, 1)
         loss = photometric_loss(
@@ -56,8 +56,8 @@ def train_plain(
         for optimizer in adam.values():
             optimizer.step()
         seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
-        clock = DensityClock((taken + 1) / steps, taken + 1, len(views), None, seed)
-        growth = density.after_step(params, adam, growth, raster.info, clock)
+        clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed)
+        growth = density.after_step(params, adam, growth, (raster.info,), clock)
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 
 

@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 
@@ -32,12 +33,26 @@ class Raster:
     depth: Float[Tensor, "h w"]
     """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
     info: dict[str, Any]
-    """gsplat 1.4.0's `info` for the Gaussians that take gradients: means2d [1, n, 2], radii [1, n],
-    depths, conics, opacities, width, height, n_cameras, gaussian_ids. Of the full image, not the crop."""
+    """gsplat 1.4.0's `info` for the Gaussians that take gradients, from v cameras: means2d [v, n, 2], radii
+    [v, n], depths, conics, opacities, width, height, n_cameras, gaussian_ids. Of the full image, not the
+    crop."""
 
     @property
     def layer(self) -> Layer:
         return Layer(self.color, self.transmittance)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture to draw."""
+
+    view: View
+    crop: Crop
+    """Draw only these pixels of the image. The result equals the crop of the full drawing exactly."""
+    frozen: Splats | None = None
+    """What occludes and is occluded, without gradients: projected into `view` by the same rasterizer."""
+    z_window: ZWindow | None = None
+    """Masks the fragments of `frozen` where it is given, else those of the Gaussians; of the crop's size."""
 
 
 @runtime_checkable
@@ -55,6 +70,40 @@ class Rasterizer(Protocol):
         """Do now, before a clock runs, what would otherwise be done on first use or not at all: compile."""
         ...
 
+    def project(
+        self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
+    ) -> Splats:
+        """What a view sees of Gaussians that take no gradients, to be looked at or given to shots as frozen.
+
+        Raises:
+            ValueError: `sh_degree` is above what the Gaussians hold.
+        """
+        ...
+
+    def draw(
+        self,
+        gaussians: Gaussians,
+        shots: Sequence[Shot],
+        *,
+        sh_degree: int,
+        antialiased: bool = False,
+        absgrad: bool = False,
+    ) -> tuple[Raster, ...]:
+        """Draw `gaussians` for each shot, sorted by depth with what is frozen there.
+
+        Args:
+            gaussians: take gradients where their tensors require them; `info` is about these alone. Several
+                rasters may share one `info`, of that many cameras.
+            sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
+            antialiased: scale opacities by gsplat's compensation factor.
+            absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward.
+
+        Raises:
+            ValueError: a window for a backend whose `supports_z_window` is False, or of another size than its
+                crop; or `sh_degree` is above what the Gaussians hold.
+        """
+        ...
+
     def __call__(
         self,
         gaussians: Gaussians,
@@ -67,22 +116,14 @@ class Rasterizer(Protocol):
         antialiased: bool = False,
         absgrad: bool = False,
     ) -> Raster:
-        """Draw `gaussians` (and, sorted in with them by depth, `frozen`) as seen by `view`.
-
-        Args:
-            gaussians: take gradients where their tensors require them; `info` is about these alone.
-            sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
-            crop: draw only these pixels of the image; None means all. The result equals the crop of
-                the full drawing exactly.
-            frozen: Gaussians that occlude and are occluded, without gradients.
-            z_window: masks the fragments of `frozen` where it is given, else those of `gaussians`.
-            antialiased: scale opacities by gsplat's compensation factor.
-            absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward.
-
-        Raises:
-            ValueError: `z_window` given to a backend whose `supports_z_window` is False.
-        """
-        ...
+        """`draw` for a single view and, without `crop`, all of its image."""
+        crop = crop or view.full
+        seen = None
+        if frozen is not None:
+            seen = self.project(frozen, view, sh_degree=sh_degree, antialiased=antialiased)
+        shot = Shot(view, crop, seen, z_window)
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "absgrad": absgrad}
+        return self.draw(gaussians, [shot], **options)[0]
 
     def layers(
         self,

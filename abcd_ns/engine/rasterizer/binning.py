@@ -7,27 +7,18 @@ fragment is lost by that, and none is added.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.base import ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
-from abcd_ns.engine.rasterizer.splat_kernels import (
-    DEPTH,
-    GSPLAT_TILE,
-    MIN_ALPHA,
-    OPACITY,
-    RADIUS,
-    TILE_COLUMNS,
-    TILE_ROWS,
-    X,
-    Y,
-)
-from abcd_ns.engine.rasterizer.tile_grid import TileGrid
+from abcd_ns.engine.rasterizer.splat_kernels import DEPTH, TILE_COLUMNS, TILE_ROWS
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid, TileSheet
 
 SHRINK = 0.875
 """A level is narrowed once fewer than this share of its tiles still have Gaussians to draw."""
@@ -48,7 +39,7 @@ class Level:
 class TileLists:
     """For each tile its Gaussians, front to back, cut into chunks and laid out level by level."""
 
-    grid: TileGrid
+    sheet: TileSheet
     chunk: int
     rows: Int[Tensor, "m"]
     """Which splats are drawn at all, by increasing depth. Their position in here is their rank."""
@@ -65,7 +56,7 @@ class TileLists:
     @cached_property
     def fragments(self) -> int:
         """Pixel-Gaussian pairs that the lists hold: an upper bound of what is computed."""
-        return self.slots.numel() * self.grid.pixels_per_tile
+        return self.slots.numel() * self.sheet.pixels_per_tile
 
 
 @dataclass(frozen=True)
@@ -81,35 +72,29 @@ def _exclusive_cumsum(counts: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     return counts.cumsum(0) - counts
 
 
-def _candidates(splats: Splats, grid: TileGrid, inside: Tensor | None) -> Int[Tensor, "m"]:
-    """Splats that can leave a fragment in the crop, by increasing depth; ties by index, as in gsplat."""
-    crop, planes = grid.crop, splats.planes
-    x, y, depth, radius = planes[X], planes[Y], planes[DEPTH], planes[RADIUS]
-    reach = radius + GSPLAT_TILE
-    keep = (radius > 0) & (planes[OPACITY] >= MIN_ALPHA)
-    keep &= (x + reach > crop.x) & (x - reach < crop.x + crop.width)
-    keep &= (y + reach > crop.y) & (y - reach < crop.y + crop.height)
-    if inside is not None:
-        keep &= inside
-    rows = keep.nonzero()[:, 0]
-    return rows.index_select(0, depth.index_select(0, rows).sort(stable=True).indices)
+def _pairs(
+    spans: Int[Tensor, "2 m"],
+    bands: Float[Tensor, "b m"],
+    places: Int[Tensor, "2 m"],
+    built: bool,
+) -> _Pairs:
+    """All pairs of ranked Gaussians: per row of tiles, those that the ellipse reaches.
 
-
-def _pairs(splats: Splats, grid: TileGrid, built: bool) -> _Pairs:
-    """All pairs of `splats`, whose order is their rank: per row of tiles, those that the ellipse reaches."""
-    crop = grid.crop
-    numbers = splats.planes.new_tensor([crop.x, crop.y, crop.width, crop.height, grid.side])
-    spans, bands = TILE_ROWS(splats.planes, numbers, built=built)
-    first_row, n_rows = spans.long().unbind(0)
+    Args:
+        spans: first row and number of rows of tiles.
+        bands: see splat_kernels.
+        places: of each Gaussian's grid, see TileSheet.
+    """
+    first_row, n_rows = spans.unbind(0)
     band_start = _exclusive_cumsum(n_rows)
     owner = torch.repeat_interleave(n_rows)
     row = _count(owner) + (first_row - band_start).index_select(0, owner)
-    columns = bands.index_select(1, owner)
-    (spans,) = TILE_COLUMNS(columns, row.to(columns), numbers, built=built)
+    (spans,) = TILE_COLUMNS(bands.index_select(1, owner), row.to(bands), built=built)
     first_col, n_cols = spans.long().unbind(0)
 
     pair_start = _exclusive_cumsum(n_cols)
-    first_tile = (row - grid.first_row) * grid.cols + (first_col - grid.first_col)
+    base, cols = places.index_select(1, owner).unbind(0)
+    first_tile = base + cols * row + first_col
     band = torch.repeat_interleave(n_cols)
     tile = _count(band) + (first_tile - pair_start).index_select(0, band)
     # Ranks without a band or without a pair get an empty bag, at the start of the next one.
@@ -122,12 +107,14 @@ def _count(items: Tensor) -> Int[Tensor, "n"]:
 
 
 def _within_window(
-    pairs: _Pairs, splats: Splats, grid: TileGrid, windowed: Bool[Tensor, "m"], window: ZWindow
+    pairs: _Pairs,
+    depths: Float[Tensor, "m"],
+    windowed: Bool[Tensor, "m"],
+    window: Float[Tensor, "2 p t"],
 ) -> _Pairs:
     """Without the pairs of windowed Gaussians that no pixel of their tile lets through."""
-    near = grid.to_tiles(window.near[None], fill=math.inf)[0].amin(dim=0)
-    far = grid.to_tiles(window.far[None], fill=-math.inf)[0].amax(dim=0)
-    z = splats.depths.index_select(0, pairs.rank)
+    near, far = window[0].amin(dim=0), window[1].amax(dim=0)
+    z = depths.index_select(0, pairs.rank)
     keep = (z >= near.index_select(0, pairs.tile)) & (z < far.index_select(0, pairs.tile))
     keep |= ~windowed.index_select(0, pairs.rank)
     kept_before = torch.cat((keep.new_zeros(1, dtype=torch.long), keep.cumsum(0)))
@@ -151,8 +138,8 @@ def _levels(n_chunks: list[int], chunk: int) -> tuple[Level, ...]:
     return tuple(levels)
 
 
-def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], grid: TileGrid, chunk: int) -> TileLists:
-    n_tiles, n_pairs, device = grid.rows * grid.cols, pairs.tile.numel(), rows.device
+def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], sheet: TileSheet, chunk: int) -> TileLists:
+    n_tiles, n_pairs, device = sheet.tiles, pairs.tile.numel(), rows.device
     # int32 keys take torch's radix sort, several times faster than comparing int64.
     sorted_tile, order = pairs.tile.int().sort(stable=True)
     counts = torch.bincount(pairs.tile, minlength=n_tiles)
@@ -176,46 +163,67 @@ def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], grid: TileGrid, chunk: int) 
     ranks = torch.full((n_slots,), len(rows), dtype=torch.long, device=device)
     ranks.index_copy_(0, slot, pairs.rank.index_select(0, order))
     slots = torch.empty_like(slot).index_copy_(0, order, slot)
-    return TileLists(grid, chunk, rows, ranks, tiles[:used], levels, slots, pairs.bags)
+    return TileLists(sheet, chunk, rows, ranks, tiles[:used], levels, slots, pairs.bags)
 
 
 @dataclass(frozen=True)
 class Candidates:
     """All (Gaussian, tile) pairs of a drawing, before any window."""
 
-    grid: TileGrid
+    sheet: TileSheet
     rows: Int[Tensor, "m"]
-    """Which splats may be drawn, by increasing depth."""
-    ranked: Splats
-    """These, in this order."""
+    """Which splats may be drawn, by increasing depth; ties by index, as in gsplat."""
+    depths: Float[Tensor, "m"]
+    """Theirs."""
     pairs: _Pairs
 
     def lists(
-        self, chunk: int, windowed: Bool[Tensor, "n"] | None = None, window: ZWindow | None = None
+        self,
+        chunk: int,
+        windowed: Bool[Tensor, "n"] | None = None,
+        window: Float[Tensor, "2 p t"] | None = None,
     ) -> TileLists:
-        """As drawn through a window: see bin_splats."""
+        """The lists of the Gaussians that each tile draws.
+
+        Args:
+            chunk: Gaussians per chunk; lists are padded to multiples of it.
+            windowed: which splats `window` masks. Given together with `window` or not at all.
+            window: near and far of each pixel; +inf and -inf outside the crop.
+        """
         pairs = self.pairs
-        if window is not None:
-            pairs = _within_window(pairs, self.ranked, self.grid, windowed[self.rows], window)
-        return _lay_out(pairs, self.rows, self.grid, chunk)
+        if windowed is not None and window is not None:
+            pairs = _within_window(pairs, self.depths, windowed.index_select(0, self.rows), window)
+        return _lay_out(pairs, self.rows, self.sheet, chunk)
 
 
 @torch.no_grad()
 def find_candidates(
-    splats: Splats, grid: TileGrid, *, inside: Bool[Tensor, "n"] | None = None, built: bool = True
+    splats: Splats, grid_of: Int[Tensor, "n"], sheet: TileSheet, *, built: bool = True
 ) -> Candidates:
-    """What the tiles of the grid may have to draw.
+    """What the tiles may have to draw.
 
     Args:
-        inside: leave out the others.
+        grid_of: which of the sheet's grids each splat belongs to.
         built: use machine code where it is there.
     """
-    rows = _candidates(splats, grid, inside)
-    ranked = splats[rows]
-    return Candidates(grid, rows, ranked, _pairs(ranked, grid, built))
+    planes = splats.planes.detach()
+    spans, bands = TILE_ROWS(planes, sheet.numbers(planes).index_select(1, grid_of), built=built)
+    rows = (spans[1] > 0).nonzero()[:, 0]
+    depths = planes[DEPTH].index_select(0, rows).sort(stable=True)
+    rows = rows.index_select(0, depths.indices)
+    spans, bands = spans.index_select(1, rows).long(), bands.index_select(1, rows)
+    places = sheet.places(planes.device).index_select(1, grid_of.index_select(0, rows))
+    return Candidates(sheet, rows, depths.values, _pairs(spans, bands, places, built))
 
 
 @torch.no_grad()
+def window_planes(sheet: TileSheet, windows: Sequence[ZWindow]) -> Float[Tensor, "2 p t"]:
+    """near and far of every pixel of the sheet; an empty interval outside the crops."""
+    near = sheet.to_tiles([window.near[None] for window in windows], fill=math.inf)
+    far = sheet.to_tiles([window.far[None] for window in windows], fill=-math.inf)
+    return torch.cat((near, far))
+
+
 def bin_splats(
     splats: Splats,
     grid: TileGrid,
@@ -225,15 +233,7 @@ def bin_splats(
     window: ZWindow | None = None,
     built: bool = True,
 ) -> TileLists:
-    """Lists of the Gaussians that each tile of the grid draws.
-
-    Args:
-        chunk: Gaussians per chunk; lists are padded to multiples of it.
-        windowed: which splats `window` masks. Given together with `window` or not at all.
-        built: use machine code where it is there.
-    """
-    inside = None
-    if window is not None:
-        depths = splats.depths
-        inside = (depths >= window.near.amin()) & (depths < window.far.amax()) | ~windowed
-    return find_candidates(splats, grid, inside=inside, built=built).lists(chunk, windowed, window)
+    """The lists of a single view: see Candidates.lists."""
+    sheet = TileSheet((grid,))
+    candidates = find_candidates(splats, torch.zeros(len(splats), dtype=torch.long), sheet, built=built)
+    return candidates.lists(chunk, windowed, window and window_planes(sheet, [window]))

@@ -11,14 +11,8 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.rasterizer.binning import TileLists
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels
-from abcd_ns.engine.rasterizer.torch_kernels import (
-    ALL_GRADIENTS,
-    CONIC_XX,
-    GRADIENTS,
-    OPACITY,
-    STATE_PLANES,
-    gather_params,
-)
+from abcd_ns.engine.rasterizer.splat_kernels import CONIC_XX, OPACITY
+from abcd_ns.engine.rasterizer.torch_kernels import ALL_GRADIENTS, GRADIENTS, STATE_PLANES, gather_params
 
 COMPACT = 0.75
 """Tiles whose pixels are all finished are dropped once fewer than this share is left."""
@@ -37,7 +31,7 @@ class Job:
     always: Float[Tensor, "m"]
     """By rank: 1 where no window applies."""
     absgrad_target: Tensor | None
-    """Gets an attribute `absgrad` in the backward pass: means2d [1, n, 2] of the first n splats."""
+    """Gets an attribute `absgrad` in the backward pass: means2d [v, n, 2] of the first v n splats."""
 
 
 @dataclass
@@ -51,10 +45,11 @@ class _Trace:
 
 
 def _initial_state(lists: TileLists, dtype: torch.dtype) -> Float[Tensor, "5 p a"]:
-    grid = lists.grid
-    inside = torch.ones((1, grid.crop.height, grid.crop.width), device=lists.tiles.device, dtype=dtype)
-    state = inside.new_zeros((STATE_PLANES, grid.pixels_per_tile, lists.tiles.numel()))
-    state[0] = grid.to_tiles(inside, fill=-1.0)[0].index_select(1, lists.tiles)
+    sheet, device = lists.sheet, lists.tiles.device
+    crops = [grid.crop for grid in sheet.grids]
+    inside = [torch.ones((1, crop.height, crop.width), device=device, dtype=dtype) for crop in crops]
+    state = inside[0].new_zeros((STATE_PLANES, sheet.pixels_per_tile, lists.tiles.numel()))
+    state[0] = sheet.to_tiles(inside, fill=-1.0)[0].index_select(1, lists.tiles)
     return state
 
 
@@ -122,7 +117,7 @@ def _composite(
 
 
 class Composite(torch.autograd.Function):
-    """Drawn Gaussians by rank [10, m] -> planes [5, h, w]: transmittance, colour, depth.
+    """Drawn Gaussians by rank [10, m] -> planes [5, p, t] of all tiles: transmittance, colour, depth.
 
     Rows are those of torch_kernels up to ALWAYS. Memory for the backward pass: five planes per tile and chunk
     of K Gaussians, that is 5/K floats per fragment instead of the dozens that autograd would keep; everything
@@ -130,25 +125,25 @@ class Composite(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "5 h w"]:
-        lists, grid = job.lists, job.lists.grid
+    def forward(ctx: Any, drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "5 p t"]:
+        lists, sheet = job.lists, job.lists.sheet
         # The last column, for empty slots, has opacity 0.
         table = F.pad(torch.cat((drawn, job.always[None])), (0, 1))
-        origins = torch.stack(grid.origins(lists.tiles, table.dtype))
+        origins = sheet.origins(table).index_select(1, lists.tiles)
         final, trace = _composite(job, table, origins, keep_states=any(ctx.needs_input_grad))
-        planes = final.new_zeros((STATE_PLANES, grid.pixels_per_tile, grid.rows * grid.cols))
+        planes = final.new_zeros((STATE_PLANES, sheet.pixels_per_tile, sheet.tiles))
         planes[0] = 1.0
         planes.index_copy_(2, lists.tiles, torch.cat((final[:1].abs(), final[1:])))
         ctx.job, ctx.columns = job, trace.columns
         ctx.save_for_backward(table, origins, final, *trace.states)
-        return grid.to_image(planes)
+        return planes
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Float[Tensor, "5 h w"]) -> tuple[Float[Tensor, "d m"], None]:
+    def backward(ctx: Any, grad: Float[Tensor, "5 p t"]) -> tuple[Float[Tensor, "d m"], None]:
         job, lists = ctx.job, ctx.job.lists
         table, origins, final, *states = ctx.saved_tensors
-        tiled = lists.grid.to_tiles(grad).index_select(2, lists.tiles)
+        tiled = grad.index_select(2, lists.tiles)
         total = (final[1:] * tiled[1:]).sum(dim=0) + final[0].abs() * tiled[0]
         upstream = torch.cat((tiled[1:], total[None]))
         per_slot = _slot_gradients(job, table, origins, upstream, ctx.columns, states)
@@ -156,7 +151,7 @@ class Composite(torch.autograd.Function):
         if job.absgrad_target is not None:
             target = job.absgrad_target
             absolute = sums.new_zeros((job.splats, 2)).index_copy_(0, lists.rows, sums[:, GRADIENTS:])
-            target.absgrad = absolute[None, : target.shape[1]]
+            target.absgrad = absolute[: target.shape[0] * target.shape[1]].view_as(target)
         return _to_parameters(table[:, :-1], sums), None
 
 

@@ -4,6 +4,7 @@ Importing this module imports gsplat, which compiles its CUDA extension at the f
 """
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +20,17 @@ from gsplat.cuda._wrapper import (
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Raster, ZWindow
+from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot
+from abcd_ns.engine.rasterizer.projection import Splats, check_degree
+from abcd_ns.engine.rasterizer.splat_kernels import (
+    CONIC_XX,
+    DEPTH,
+    GRADED,
+    OPACITY,
+    RADIUS,
+    RED,
+    SPLAT_ROWS,
+)
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 TILE = 16
@@ -107,7 +118,7 @@ def _forward_absgrad(means2d: Tensor, drawn: Tensor) -> None:
     means2d.register_hook(copy)
 
 
-class GsplatRasterizer:
+class GsplatRasterizer(Rasterizer):
     """gsplat 1.4.0 on CUDA, float32. Has no z window; the picture of a crop is that of the full image."""
 
     supports_z_window = False
@@ -118,39 +129,60 @@ class GsplatRasterizer:
     def warm_up(self) -> None:
         """Nothing: gsplat compiles when it is imported, at the latest for the self-check."""
 
-    def __call__(
+    @torch.no_grad()
+    def project(
+        self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
+    ) -> Splats:
+        """See Rasterizer.project."""
+        check_degree(gaussians, sh_degree)
+        seen = _project(gaussians, view, sh_degree, antialiased)
+        planes = gaussians.means.new_zeros((SPLAT_ROWS, len(gaussians)))  # covariances stay 0
+        planes[:DEPTH], planes[DEPTH] = seen.means2d[0].T, seen.depths[0]
+        planes[CONIC_XX:OPACITY], planes[OPACITY] = seen.conics[0].T, seen.opacities[0]
+        planes[RED:GRADED], planes[RADIUS] = seen.features[0, :, :3].T, seen.radii[0]
+        return Splats(planes)
+
+    def draw(
         self,
         gaussians: Gaussians,
-        view: View,
+        shots: Sequence[Shot],
         *,
         sh_degree: int,
-        crop: Crop | None = None,
-        frozen: Gaussians | None = None,
-        z_window: ZWindow | None = None,
         antialiased: bool = False,
         absgrad: bool = False,
-    ) -> Raster:
-        """See Rasterizer.__call__."""
-        if z_window is not None:
+    ) -> tuple[Raster, ...]:
+        """See Rasterizer.draw. One call of gsplat for each shot."""
+        check_degree(gaussians, sh_degree)
+        if any(shot.z_window is not None for shot in shots):
             raise ValueError(NO_WINDOW)
-        crop = crop or view.full
-        if len(gaussians) + (0 if frozen is None else len(frozen)) == 0:
-            return _nothing(gaussians, view, crop)
-        own = _project(gaussians, view, sh_degree, antialiased)
-        everyone = own
-        if frozen is not None and len(frozen) > 0:
-            with torch.no_grad():
-                others = _project(frozen, view, sh_degree, antialiased)
-            everyone = _join(own, others)
-        drawn = _aligned(crop)
-        features, alphas = _draw(own, everyone, drawn, view, absgrad)
-        rows, cols = Crop(crop.x - drawn.x, crop.y - drawn.y, crop.width, crop.height).slices
-        features, alphas = features[rows, cols], alphas[rows, cols]
-        return Raster(features[..., :3], 1.0 - alphas[..., 0], features[..., 3], _info(own, view))
+        rasters = [_draw_shot(gaussians, shot, sh_degree, antialiased, absgrad) for shot in shots]
+        for raster in rasters:
+            raster.info["n_cameras"] = len(shots)
+        return tuple(rasters)
 
     def layers(self, *_args: Any, **_options: Any) -> list[Layer]:
         """See Rasterizer.layers: stock gsplat cannot."""
         raise ValueError(NO_WINDOW)
+
+
+def _draw_shot(gaussians: Gaussians, shot: Shot, sh_degree: int, antialiased: bool, absgrad: bool) -> Raster:
+    view, crop, frozen = shot.view, shot.crop, shot.frozen
+    if len(gaussians) + (0 if frozen is None else len(frozen)) == 0:
+        return _nothing(gaussians, view, crop)
+    own = _project(gaussians, view, sh_degree, antialiased)
+    everyone = own if frozen is None or len(frozen) == 0 else _join(own, _projected(frozen))
+    drawn = _aligned(crop)
+    features, alphas = _draw(own, everyone, drawn, view, absgrad)
+    rows, cols = Crop(crop.x - drawn.x, crop.y - drawn.y, crop.width, crop.height).slices
+    features, alphas = features[rows, cols], alphas[rows, cols]
+    return Raster(features[..., :3], 1.0 - alphas[..., 0], features[..., 3], _info(own, view))
+
+
+def _projected(splats: Splats) -> _Projected:
+    """In gsplat's shapes."""
+    features = torch.cat((splats.colors, splats.depths[:, None]), dim=-1)
+    values = (splats.radii, splats.means2d, splats.depths, splats.conics, splats.opacities, features)
+    return _Projected(*(value[None].contiguous() for value in values))
 
 
 def _draw(

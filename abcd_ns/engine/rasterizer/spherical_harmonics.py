@@ -2,8 +2,6 @@
 
 import math
 
-import torch
-from jaxtyping import Float
 from torch import Tensor
 
 MAX_SH_DEGREE = 3
@@ -36,28 +34,6 @@ def sh_basis_rows(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     ]
 
 
-def sh_colors(
-    features_dc: Float[Tensor, "n 3"],
-    features_rest: Float[Tensor, "n k 3"],
-    bases: Float[Tensor, "b n"],
-    degree: int,
-) -> Float[Tensor, "n 3"]:
-    """Colours in the directions that `bases` were taken at: max(0, SH + 0.5), linear, not clamped from above.
-
-    Args:
-        bases: from `sh_basis_rows`.
-        degree: the degree in use; coefficients of higher degrees are ignored.
-
-    Raises:
-        ValueError: `degree` is above 3, or above what `features_rest` holds.
-    """
-    used = (degree + 1) ** 2 - 1
-    if not 0 <= degree <= MAX_SH_DEGREE or used > features_rest.shape[1]:
-        raise ValueError(
-            f"sh_degree is {degree}, but the Gaussians hold {features_rest.shape[1]} coefficients above "
-            f"degree 0, and degrees above {MAX_SH_DEGREE} are not supported; lower sh_degree."
-        )
-    # With degree 0 this adds nothing, yet gives `features_rest` a gradient of zeros, as gsplat does: Adam
-    # counts such steps.
-    directional = torch.bmm(bases[:used].T[:, None], features_rest[:, :used])[:, 0]
-    return (SH_C0 * features_dc + directional + 0.5).clamp_min(0.0)
+def sh_degree_of(basis: int) -> int:
+    """0 for the three functions of degree 1, 1 for the five of degree 2, 2 for the seven of degree 3."""
+    return math.isqrt(basis + 1) - 1

@@ -10,7 +10,13 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.rasterizer import spherical_harmonics
-from abcd_ns.engine.rasterizer.spherical_harmonics import BASES, sh_basis_rows
+from abcd_ns.engine.rasterizer.spherical_harmonics import (
+    BASES,
+    MAX_SH_DEGREE,
+    SH_C0,
+    sh_basis_rows,
+    sh_degree_of,
+)
 
 NEAR_PLANE = 0.01
 """Gaussians with a smaller camera z are not drawn; world units."""
@@ -29,27 +35,25 @@ MIN_ALPHA = 1.0 / 255.0
 REACH_MARGIN = 0.01
 """Added to the squared Mahalanobis radius of the bounds, so that rounding never loses a fragment."""
 
-PARAMETERS = 11
-"""Rows that `splat` takes: means x y z, log scales 3, quaternion w x y z, logit of the opacity."""
-CAMERA = 22
+PARAMETERS = 14 + 3 * BASES
+"""Rows that `splat` takes: means x y z, log scales 3, quaternion w x y z, logit of the opacity, spherical
+harmonics of degree 0 (red, green, blue), then of degrees 1 to 3 (red, green, blue of each)."""
+CAMERA = 22 + MAX_SH_DEGREE
 """Numbers of a camera: world-to-camera rotation 9 and translation 3, fx fy cx cy, width and height, 1 where
-opacities are compensated (antialiased) else 0, camera centre 3."""
-X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, *_REST = range(7 + BASES + 4)
-"""Rows that `splat` gives: what is drawn,"""
-FIRST_BASIS = OPACITY + 1
-"""then the spherical harmonics of degrees 1 to 3 in the direction from the camera,"""
-GRADED = FIRST_BASIS + BASES
-"""up to here with gradients,"""
+opacities are compensated (antialiased) else 0, camera centre 3, 1 for each degree of harmonics in use."""
+X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE = range(10)
+"""Rows that `splat` gives: what is drawn, with gradients,"""
+GRADED = BLUE + 1
 COV_XX, COV_XY, COV_YY, RADIUS = range(GRADED, GRADED + 4)
 """then bounds: the 2D covariance, blur included, and gsplat's radius."""
 SPLAT_ROWS = RADIUS + 1
 
 
 def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> tuple[Float[Tensor, "r n"]]:
-    """Project Gaussians: mathematically gsplat's `fully_fused_projection` with its defaults.
+    """Project and colour Gaussians: gsplat's `fully_fused_projection` with its defaults, and 3DGS's colours.
 
-    Covariances come as dot products of projected axes: never indefinite, and cheaper. Columns with radius 0
-    hold finite values that mean nothing.
+    Colours are max(0, SH(direction) + 0.5), linear, not clamped from above. Covariances come as dot products
+    of projected axes: never indefinite, and cheaper. Columns with radius 0 are finite and without meaning.
     """
     return (torch.stack(_graded_rows(parameters, camera, bounds=True)),)
 
@@ -63,7 +67,7 @@ def splat_backward(
 
 
 def _graded_rows(parameters: Tensor, camera: Tensor, bounds: bool) -> list[Tensor]:
-    x, y, z, *scales, qw, qx, qy, qz, logit = parameters.unbind(0)
+    x, y, z, *scales, qw, qx, qy, qz, logit = parameters[:11].unbind(0)
     number = camera.unbind(0)
     rotation, (tx, ty, tz) = number[:9], number[9:12]
     fx, fy, cx, cy, width, height, antialiased = number[12:19]
@@ -94,8 +98,8 @@ def _graded_rows(parameters: Tensor, camera: Tensor, bounds: bool) -> list[Tenso
     opacity = opacity * torch.where(antialiased > 0, _safe_sqrt(det_sharp / det), 1.0)
     away = [x - number[19], y - number[20], z - number[21]]
     per_length = torch.rsqrt(_dot(away, away).clamp_min(TINY))
-    bases = sh_basis_rows(*(value * per_length for value in away))
-    rows = [u, v, depth, yy / det, -xy / det, xx / det, opacity, *bases]
+    colors = _colors(parameters[11:], [value * per_length for value in away], number[22:])
+    rows = [u, v, depth, yy / det, -xy / det, xx / det, opacity, *colors]
     return [*rows, xx, xy, yy, _radius(u, v, depth, xx, yy, det, width, height)] if bounds else rows
 
 
@@ -115,6 +119,18 @@ def _camera_axes(
     return [
         [_dot(rotation[3 * i : 3 * i + 3], columns[k]) * deviations[k] for k in range(3)] for i in range(3)
     ]
+
+
+def _colors(harmonics: Tensor, direction: list[Tensor], in_use: tuple[Tensor, ...]) -> list[Tensor]:
+    bases = sh_basis_rows(*direction)
+    # Multiplied, not left out: coefficients of degrees not in use get a gradient of zeros, as gsplat gives
+    # them; Adam counts such steps.
+    bases = [basis * in_use[sh_degree_of(k)] for k, basis in enumerate(bases)]
+    sums = [
+        SH_C0 * harmonics[c] + sum(basis * harmonics[3 + 3 * k + c] for k, basis in enumerate(bases))
+        for c in range(3)
+    ]
+    return [(value + 0.5).clamp_min(0.0) for value in sums]
 
 
 def _dot(a: list[Tensor] | tuple[Tensor, ...], b: list[Tensor]) -> Tensor:
@@ -138,41 +154,44 @@ def _radius(u, v, depth, xx, yy, det, width, height) -> Tensor:
 
 # -- which tiles --------------------------------------------------------------------------------------------
 
-REACH, SLOPE, PRECISION, FLANK, LOW, HIGH = range(2, 8)
-"""Rows of a band, after x and y of the mean: the squared Mahalanobis radius at which alpha falls to 1/255;
-how the middle of the ellipse shifts with height; 1 over its variance at a given height; the height at which
-it is furthest to the right; the first and last column that gsplat would draw. Then VARIANCE and the row."""
-VARIANCE, ROW = 8, 9
-BAND_ROWS = 9
 GRID = 5
 """Numbers of a tile grid: the crop's x, y, width and height, and the side of a tile; pixels."""
+REACH, SLOPE, PRECISION, FLANK, LOW, HIGH, VARIANCE, LEFT, WIDTH, SIDE, BAND_ROWS = range(2, 13)
+"""Rows of a band, after x and y of the mean: the squared Mahalanobis radius at which alpha falls to 1/255;
+how the middle of the ellipse shifts with height; 1 over its variance at a given height; the height at which
+it is furthest to the right; the first and last column that gsplat would draw; the variance of the height;
+and of the grid the crop's first column, its width, and the side of a tile."""
 
 
 def tile_rows(
-    splats: Float[Tensor, "r n"], grid: Float[Tensor, "g"]
+    splats: Float[Tensor, "r n"], grid: Float[Tensor, "g n"]
 ) -> tuple[Float[Tensor, "2 n"], Float[Tensor, "b n"]]:
-    """(first row of tiles, number of rows) that each Gaussian reaches, and its band's quantities."""
-    _, top, _, height, side = grid.unbind(0)
+    """(first row of tiles, number of rows) that each Gaussian reaches, and its band's quantities.
+
+    The number is 0 for what leaves no fragment in the crop. Each Gaussian has its own grid, so that one call
+    serves several views.
+    """
+    left, top, width, height, side = grid.unbind(0)
     x, y, radius = splats[X], splats[Y], splats[RADIUS]
     xx, xy, yy = splats[COV_XX], splats[COV_XY], splats[COV_YY]
-    reach = 2.0 * (splats[OPACITY] / MIN_ALPHA).log() + REACH_MARGIN
+    seen = (radius > 0) & (splats[OPACITY] >= MIN_ALPHA)
+    seen = seen & (x + radius + GSPLAT_TILE > left) & (x - radius - GSPLAT_TILE < left + width)
+    reach = 2.0 * (splats[OPACITY] / MIN_ALPHA).log().clamp_min(0) + REACH_MARGIN
     half_height = (reach * yy).sqrt()
     first, count = _tile_span(y - half_height, y + half_height, *_gsplat_bounds(y, radius), top, height, side)
     flank = xy * (reach / xx).sqrt()
-    band = (x, y, reach, xy / yy, splats[CONIC_XX], flank, *_gsplat_bounds(x, radius), yy)
-    return torch.stack((first, count)), torch.stack(band)
+    low, high = _gsplat_bounds(x, radius)
+    band = (x, y, reach, xy / yy, splats[CONIC_XX], flank, low, high, yy, left, width, side)
+    return torch.stack((first, torch.where(seen, count, 0.0))), torch.stack(band)
 
 
-def tile_columns(
-    bands: Float[Tensor, "b q"], rows: Float[Tensor, "q"], grid: Float[Tensor, "g"]
-) -> tuple[Float[Tensor, "2 q"]]:
+def tile_columns(bands: Float[Tensor, "b q"], rows: Float[Tensor, "q"]) -> tuple[Float[Tensor, "2 q"]]:
     """(first tile, number of tiles) that the ellipse reaches in one row of tiles.
 
     Within the row's pixel centres, at height v over the mean, the ellipse spans v xy / yy -+ half; its right
     end is furthest out at v = the top of the right flank, its left end at minus that.
     """
-    left_edge, _, width, _, side = grid.unbind(0)
-    x, y, reach, variance = bands[X], bands[Y], bands[REACH], bands[VARIANCE]
+    x, y, reach, variance, side = bands[X], bands[Y], bands[REACH], bands[VARIANCE], bands[SIDE]
     first = rows * side + 0.5 - y
     last = first + (side - 1)
     right_v = bands[FLANK].maximum(first).minimum(last)
@@ -180,7 +199,7 @@ def tile_columns(
     right_half = ((reach - right_v * right_v / variance).clamp_min(0) / bands[PRECISION]).sqrt()
     left_half = ((reach - left_v * left_v / variance).clamp_min(0) / bands[PRECISION]).sqrt()
     low, high = x + left_v * bands[SLOPE] - left_half, x + right_v * bands[SLOPE] + right_half
-    return (torch.stack(_tile_span(low, high, bands[LOW], bands[HIGH], left_edge, width, side)),)
+    return (torch.stack(_tile_span(low, high, bands[LOW], bands[HIGH], bands[LEFT], bands[WIDTH], side)),)
 
 
 def _gsplat_bounds(mean: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
@@ -206,6 +225,6 @@ SPLAT = Kernel("splat", splat, (f"{PARAMETERS} n", f"{CAMERA}"), _SH)
 SPLAT_BACKWARD = Kernel(
     "splat-backward", splat_backward, (f"{PARAMETERS} n", f"{CAMERA}", f"{GRADED} n"), _SH
 )
-TILE_ROWS = Kernel("tile-rows", tile_rows, (f"{SPLAT_ROWS} n", f"{GRID}"), _SH)
-TILE_COLUMNS = Kernel("tile-columns", tile_columns, (f"{BAND_ROWS} q", "q", f"{GRID}"), _SH)
+TILE_ROWS = Kernel("tile-rows", tile_rows, (f"{SPLAT_ROWS} n", f"{GRID} n"), _SH)
+TILE_COLUMNS = Kernel("tile-columns", tile_columns, (f"{BAND_ROWS} q", "q"), _SH)
 SPLAT_KERNELS = (SPLAT, SPLAT_BACKWARD, TILE_ROWS, TILE_COLUMNS)

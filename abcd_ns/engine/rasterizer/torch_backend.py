@@ -1,20 +1,21 @@
 """The torch rasterizer: gsplat's drawing in plain torch, for any device, with a z window per pixel."""
 
+import math
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Raster, ZWindow
-from abcd_ns.engine.rasterizer.binning import TileLists, bin_splats, find_candidates
+from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot, ZWindow
+from abcd_ns.engine.rasterizer.binning import TileLists, find_candidates, window_planes
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.rasterizer.compositing_function import Composite, Job
-from abcd_ns.engine.rasterizer.projection import Splats, project
-from abcd_ns.engine.rasterizer.spherical_harmonics import sh_colors
-from abcd_ns.engine.rasterizer.splat_kernels import DEPTH, OPACITY
-from abcd_ns.engine.rasterizer.tile_grid import TileGrid
+from abcd_ns.engine.rasterizer.projection import Splats, check_degree, pack, project_packed
+from abcd_ns.engine.rasterizer.splat_kernels import CONIC_XX, DEPTH, GRADED, OPACITY, RADIUS
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid, TileSheet
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 TILE_SIDE = 4
@@ -23,63 +24,30 @@ CHUNK = 16
 """Gaussians per kernel call and tile."""
 
 
-class _TakeRows(torch.autograd.Function):
-    """x[rows] along a dimension, for distinct rows. Autograd's own backward would accumulate, row by row."""
+class _TakeColumns(torch.autograd.Function):
+    """x[:, columns] for distinct columns. Autograd's own backward would accumulate, one by one."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, rows: Int[Tensor, "m"], dim: int) -> Tensor:
-        ctx.save_for_backward(rows)
-        ctx.shape, ctx.dim = x.shape, dim
-        return x.index_select(dim, rows)
+    def forward(ctx: Any, x: Float[Tensor, "c n"], columns: Int[Tensor, "m"]) -> Float[Tensor, "c m"]:
+        ctx.save_for_backward(columns)
+        ctx.width = x.shape[1]
+        return x.index_select(1, columns)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        (rows,) = ctx.saved_tensors
-        return grad.new_zeros(ctx.shape).index_copy_(ctx.dim, rows, grad), None, None
+    def backward(ctx: Any, grad: Float[Tensor, "c m"]) -> tuple[Float[Tensor, "c n"], None]:
+        (columns,) = ctx.saved_tensors
+        return grad.new_zeros((grad.shape[0], ctx.width)).index_copy_(1, columns, grad), None
 
 
-def _colors(
-    gaussians: Gaussians, splats: Splats, rows: Int[Tensor, "m"], sh_degree: int
-) -> Float[Tensor, "m 3"]:
-    """Colours of the Gaussians at `rows`. Where these are few, only theirs are computed."""
-    features = (gaussians.features_dc, gaussians.features_rest)
-    if 2 * rows.numel() > len(gaussians):  # copying the coefficients out would cost more than it saves
-        return _TakeRows.apply(sh_colors(*features, splats.bases, sh_degree), rows, 0)
-    dc, rest = (_TakeRows.apply(x, rows, 0) for x in features)
-    return sh_colors(dc, rest, _TakeRows.apply(splats.bases, rows, 1), sh_degree)
-
-
-def _colors_by_rank(
-    gaussians: Gaussians,
-    own: Splats,
-    frozen: Gaussians | None,
-    others: Splats | None,
-    rows: Int[Tensor, "m"],
-    sh_degree: int,
-) -> Float[Tensor, "m 3"]:
-    """Colours of the drawn ones among the active Gaussians followed by the frozen ones."""
-    if frozen is None or others is None:
-        return _colors(gaussians, own, rows, sh_degree)
-    mine, theirs = (rows < len(gaussians)).nonzero()[:, 0], (rows >= len(gaussians)).nonzero()[:, 0]
-    own_colors = _colors(gaussians, own, rows.index_select(0, mine), sh_degree)
-    with torch.no_grad():
-        their_colors = _colors(frozen, others, rows.index_select(0, theirs) - len(gaussians), sh_degree)
-    # Back into the order of `rows`, from the order (mine, theirs).
-    back = torch.empty_like(rows).index_copy_(
-        0, torch.cat((mine, theirs)), torch.arange(len(rows), device=rows.device)
-    )
-    return _TakeRows.apply(torch.cat((own_colors, their_colors)), back, 0)
-
-
-class TorchRasterizer:
+class TorchRasterizer(Rasterizer):
     """gsplat 1.4.0's `rasterization(packed=False)` in plain torch: same picture, same gradient.
 
     Works in float32 and float64 and on any device; made to be fast on a CPU. Deterministic.
 
     Args:
-        compile: whether float32 on the CPU runs on kernels built ahead of time (see kernels): "auto"
-            if they are found, "always" building them now if need be, "never" not at all. Built and eager
-            kernels agree to rounding only: use "never" where last bits must not depend on the machine.
+        compile: whether float32 on the CPU runs on kernels built ahead of time (see kernels): "auto" if they
+            are found, "always" building them now if need be, "never" not at all. Built and eager kernels
+            agree to rounding only: use "never" where last bits must not depend on the machine.
         tile_side: pixels along a tile's side; a divisor of 16. Speed only.
         chunk: Gaussians per kernel call and tile. Speed and memory only.
 
@@ -87,7 +55,7 @@ class TorchRasterizer:
         ValueError: `tile_side` does not divide 16.
     """
 
-    name = "torch-1"
+    name = "torch-2"
     supports_z_window = True
 
     def __init__(
@@ -98,48 +66,54 @@ class TorchRasterizer:
         self.kernels = ChunkKernels(compile, tile_side, chunk)
         self.tile_side = tile_side
         self.chunk = chunk
+        self._packed: tuple[weakref.ref[Gaussians], Tensor] | None = None
 
     def warm_up(self) -> None:
         """See Rasterizer.warm_up."""
         self.kernels.warm_up()
 
-    def __call__(
+    @torch.no_grad()
+    def project(
+        self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
+    ) -> Splats:
+        """See Rasterizer.project."""
+        check_degree(gaussians, sh_degree)
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": self.kernels.built}
+        return project_packed(self._pack(gaussians), view, **options)
+
+    def draw(
         self,
         gaussians: Gaussians,
-        view: View,
+        shots: Sequence[Shot],
         *,
         sh_degree: int,
-        crop: Crop | None = None,
-        frozen: Gaussians | None = None,
-        z_window: ZWindow | None = None,
         antialiased: bool = False,
         absgrad: bool = False,
-    ) -> Raster:
-        """See Rasterizer.__call__."""
-        crop = crop or view.full
-        _check_window(z_window, crop)
-        built = self.kernels.built
-        own = project(gaussians, view, antialiased=antialiased, built=built)
-        info = _info(own, view)
+    ) -> tuple[Raster, ...]:
+        """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
+        check_degree(gaussians, sh_degree)
+        for shot in shots:
+            _check_window(shot.z_window, shot.crop)
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": self.kernels.built}
+        packed = pack(gaussians)
+        own = torch.stack([project_packed(packed, shot.view, **options).planes for shot in shots])
+        info = _info(own, shots)
         # Through info's tensor, so that it is in the graph.
-        graded = torch.cat((info["means2d"][0].T, own.planes[DEPTH : OPACITY + 1]))
-        splats, others = own, None
-        if frozen is not None:
-            with torch.no_grad():
-                others = project(frozen, view, antialiased=antialiased, built=built)
-            splats = Splats(torch.cat((own.planes.detach(), others.planes), dim=1))
-            graded = torch.cat((graded, others.planes[: OPACITY + 1]), dim=1)
-        windowed = None
-        if z_window is not None:
-            is_frozen = torch.arange(len(splats), device=gaussians.device) >= len(gaussians)
-            windowed = is_frozen if frozen is not None else ~is_frozen
-        grid = TileGrid(crop, self.tile_side)
-        lists = bin_splats(splats, grid, self.chunk, windowed=windowed, window=z_window, built=built)
-        colors = _colors_by_rank(gaussians, own, frozen, others, lists.rows, sh_degree)
-        drawn = torch.cat((_TakeRows.apply(graded, lists.rows, 1), colors.T))
-        job = self._job(lists, len(splats), colors, windowed, z_window, info["means2d"] if absgrad else None)
-        planes = Composite.apply(drawn, job)
-        return Raster(planes[1:4].permute(1, 2, 0), planes[0], planes[4], info)
+        graded = torch.cat((info["means2d"].transpose(1, 2), own[:, DEPTH:GRADED]), dim=1)
+        graded, bounds = _side_by_side(graded), _side_by_side(own.detach())
+        grid_of = torch.arange(len(shots), device=own.device).repeat_interleave(own.shape[2])
+        frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
+        if frozen:
+            graded = torch.cat((graded, *(planes[:GRADED] for _, planes in frozen)), dim=1)
+            bounds = torch.cat((bounds, *(planes for _, planes in frozen)), dim=1)
+            grid_of = torch.cat((grid_of, *(grid_of.new_full((p.shape[1],), k) for k, p in frozen)))
+        sheet = TileSheet(tuple(TileGrid(shot.crop, self.tile_side) for shot in shots))
+        candidates = find_candidates(Splats(bounds), grid_of, sheet, built=self.kernels.built)
+        windowed, window = _windows(shots, sheet, grid_of, own.shape[0] * own.shape[2])
+        lists = candidates.lists(self.chunk, windowed, window)
+        job = self._job(lists, bounds, windowed, window, info["means2d"] if absgrad else None)
+        images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, lists.rows), job))
+        return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
     @torch.no_grad()
     def layers(
@@ -153,35 +127,66 @@ class TorchRasterizer:
         antialiased: bool = False,
     ) -> list[Layer]:
         """See Rasterizer.layers."""
-        built = self.kernels.built
-        splats = project(gaussians, view, antialiased=antialiased, built=built)
-        candidates = find_candidates(splats, TileGrid(crop, self.tile_side), built=built)
-        colors = _colors(gaussians, splats, candidates.rows, sh_degree)
-        drawn = torch.cat((candidates.ranked.planes[: OPACITY + 1], colors.T))
-        all_windowed = torch.ones(len(splats), dtype=torch.bool, device=gaussians.device)
+        splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
+        sheet = TileSheet((TileGrid(crop, self.tile_side),))
+        every = torch.ones(len(splats), dtype=torch.bool, device=gaussians.device)
+        candidates = find_candidates(splats, torch.zeros_like(every).long(), sheet, built=self.kernels.built)
+        drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
         drawings = []
-        for window in windows:
-            _check_window(window, crop)
-            lists = candidates.lists(self.chunk, all_windowed, window)
-            planes = Composite.apply(drawn, self._job(lists, len(splats), colors, all_windowed, window, None))
-            drawings.append(Layer(planes[1:4].permute(1, 2, 0), planes[0]))
+        for z_window in windows:
+            _check_window(z_window, crop)
+            window = window_planes(sheet, [z_window])
+            lists = candidates.lists(self.chunk, every, window)
+            (image,) = sheet.to_images(
+                Composite.apply(drawn, self._job(lists, splats.planes, every, window, None))
+            )
+            drawings.append(Layer(image[1:4].permute(1, 2, 0), image[0]))
         return drawings
+
+    def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
+        """`pack`, kept for the next view of the same Gaussians."""
+        if self._packed is None or self._packed[0]() is not gaussians:
+            self._packed = (weakref.ref(gaussians), pack(gaussians))
+        return self._packed[1]
 
     def _job(
         self,
         lists: TileLists,
-        splats: int,
-        colors: Tensor,
-        windowed: Tensor | None,
-        window: ZWindow | None,
+        planes: Float[Tensor, "r n"],
+        windowed: Bool[Tensor, "n"] | None,
+        window: Float[Tensor, "2 p t"] | None,
         target: Tensor | None,
     ) -> Job:
-        if window is None:
-            return Job(lists, splats, self.kernels, None, torch.ones_like(colors[:, 0]), target)
-        planes = lists.grid.to_tiles(torch.stack((window.near, window.far)).to(colors)).index_select(
-            2, lists.tiles
-        )
-        return Job(lists, splats, self.kernels, planes, (~windowed[lists.rows]).to(colors), target)
+        count = planes.shape[1]
+        if windowed is None or window is None:
+            return Job(lists, count, self.kernels, None, planes.new_ones(len(lists.rows)), target)
+        always = (~windowed.index_select(0, lists.rows)).to(planes)
+        return Job(lists, count, self.kernels, window.index_select(2, lists.tiles), always, target)
+
+
+def _side_by_side(planes: Float[Tensor, "v r n"]) -> Float[Tensor, "r vn"]:
+    """The columns of all views in one row after the other."""
+    return planes.transpose(0, 1).reshape(planes.shape[1], -1)
+
+
+def _windows(
+    shots: Sequence[Shot], sheet: TileSheet, grid_of: Int[Tensor, "n"], own: int
+) -> tuple[Bool[Tensor, "n"] | None, Float[Tensor, "2 p t"] | None]:
+    """Which splats are masked, and the planes that mask them; the first `own` splats are not frozen."""
+    if all(shot.z_window is None for shot in shots):
+        return None, None
+    is_frozen = torch.arange(grid_of.numel(), device=grid_of.device) >= own
+    masks_frozen = [shot.frozen is not None for shot in shots]
+    has_window = [shot.z_window is not None for shot in shots]
+    masks_frozen, has_window = torch.tensor([masks_frozen, has_window], device=grid_of.device)
+    windowed = has_window[grid_of] & (is_frozen == masks_frozen[grid_of])
+    return windowed, window_planes(sheet, [shot.z_window or _open_window(shot) for shot in shots])
+
+
+def _open_window(shot: Shot) -> ZWindow:
+    size = (shot.crop.height, shot.crop.width)
+    like = {"dtype": shot.view.viewmat.dtype, "device": shot.view.viewmat.device}
+    return ZWindow(torch.full(size, -math.inf, **like), torch.full(size, math.inf, **like))
 
 
 def _check_window(window: ZWindow | None, crop: Crop) -> None:
@@ -192,17 +197,17 @@ def _check_window(window: ZWindow | None, crop: Crop) -> None:
         )
 
 
-def _info(splats: Splats, view: View) -> dict[str, Any]:
+def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot]) -> dict[str, Any]:
     """What gsplat's densification strategies read."""
     return {
-        "means2d": splats.means2d[None],
-        "radii": splats.radii[None],
-        "depths": splats.depths[None],
-        "conics": splats.conics[None],
-        "opacities": splats.opacities[None],
-        "width": view.width,
-        "height": view.height,
-        "n_cameras": 1,
+        "means2d": own[:, :DEPTH].transpose(1, 2),
+        "radii": own[:, RADIUS].detach().int(),
+        "depths": own[:, DEPTH],
+        "conics": own[:, CONIC_XX:OPACITY].transpose(1, 2),
+        "opacities": own[:, OPACITY],
+        "width": shots[0].view.width,
+        "height": shots[0].view.height,
+        "n_cameras": len(shots),
         "camera_ids": None,
         "gaussian_ids": None,
     }

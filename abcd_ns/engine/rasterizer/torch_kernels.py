@@ -12,7 +12,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.splat_kernels import MIN_ALPHA
+from abcd_ns.engine.rasterizer.splat_kernels import (
+    BLUE,
+    CONIC_XX,
+    CONIC_XY,
+    CONIC_YY,
+    DEPTH,
+    GRADED,
+    GREEN,
+    MIN_ALPHA,
+    OPACITY,
+    RED,
+    X,
+    Y,
+)
 
 MAX_ALPHA = 0.999
 """Alphas are clamped to this."""
@@ -20,11 +33,9 @@ MIN_TRANSMITTANCE = 1e-4
 """The fragment after which T would be at most this, and all behind it, are not drawn."""
 STATE_PLANES = 5
 
-X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, ALWAYS = range(11)
-"""Rows of the parameter table: splat_kernels' first, a colour, and 1 where the z window does not apply."""
+ALWAYS = GRADED
+"""Row of the parameter table after those that splat_kernels draws: 1 where the z window does not apply."""
 PARAMETERS = ALWAYS + 1
-DRAWN = ALWAYS
-"""Rows that take gradients."""
 
 MOMENTS = 6
 GRADIENTS = MOMENTS + 4
