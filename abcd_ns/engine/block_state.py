@@ -52,7 +52,7 @@ class BlockState:
         zeros = Gaussians(**{name: torch.zeros_like(value) for name, value in gaussians.items()})
         return BlockState(gaussians, zeros, Gaussians(**{n: v.clone() for n, v in zeros.items()}))
 
-    def __getitem__(self, rows: Tensor) -> "BlockState":
+    def __getitem__(self, rows: Tensor | slice) -> "BlockState":
         """The Gaussians at `rows` with all that belongs to them; the clocks stay the block's."""
         return BlockState(
             self.gaussians[rows],

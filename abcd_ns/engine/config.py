@@ -18,6 +18,9 @@ class TrainingConfig:
     paper). `auto` takes fragments where the rasterizer can mask by depth."""
     window_percentile: float = 0.9
     """Share of the active Gaussians' extents that the window of sorted-in fragments must hold."""
+    warmup: float = 0.2
+    """Share of the run for which a scaffold, no larger than a block but all over the scene, is trained before
+    blocks are; 0 for none."""
     batch: int = 0
     """Views drawn in one step; learning rates grow with its square root. 0 takes 1 where the scene is one
     block, which is 3DGS, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""

@@ -5,37 +5,38 @@ sample, renders it, steps its optimizers, and reports back. The coordinator deci
 everything else at rest in the store, and tells its listeners what happens.
 """
 
+import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.batch import Batch, Rendered, Sample, background
 from abcd_ns.engine.block_state import BlockState, Clocks
-from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
 from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
-from abcd_ns.engine.painter import Painter, PaintSettings, Parts
+from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import (
     Optimizers,
+    Pace,
     Params,
     attach,
     detach,
     live_gaussians,
-    scale_to_batch,
 )
-from abcd_ns.engine.rasterizer import Rasterizer, Shot, ZWindow
-from abcd_ns.engine.rasterizer.projection import Splats
+from abcd_ns.engine.rasterizer import Rasterizer, Shot
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
+from abcd_ns.engine.scaffold import WHOLE, join, part
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
     VisitPlan,
+    endless_order,
     exponential_decay,
     passes_of_sweep,
     plan_sweep,
@@ -44,43 +45,15 @@ from abcd_ns.engine.schedule import (
     views_per_visit,
     visit_views,
 )
+from abcd_ns.engine.settle import reserve, settle_block, settle_scaffold
 from abcd_ns.engine.storage import LayerCache
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One view that a step trains on."""
-
-    view: View
-    crop: Crop
-    layers: Parts | None
-    near: Splats | None
-    window: ZWindow | None
-    background: Float[Tensor, "3"]
-
-
-@dataclass(frozen=True)
-class Batch:
-    """What one step trains on."""
-
-    step: int
-    samples: tuple[Sample, ...]
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """The active block within its surroundings, as a batch shows it."""
-
-    pictures: tuple[Float[Tensor, "_h _w 3"], ...]
-    """Of each sample's crop, background included, 0..1."""
-    transmittances: tuple[Float[Tensor, "_h _w"], ...]
-    """Of the active block and what was sorted in with it."""
-    infos: tuple[dict[str, Any], ...]
+UNLIMITED = 2**31
+"""Steps of a visit that something else ends."""
 
 
 class Coordinator:
@@ -119,12 +92,12 @@ class Coordinator:
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
         self.batch = config.batch or (1 if scene.tree.num_blocks == 1 else DEFAULT_BATCH)
-        scale_to_batch(optimizers, self.batch)
-        self._means_lr: float = optimizers["means"].param_groups[0]["lr"]
+        self._pace = Pace(optimizers)
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
         self._layers: VisitLayers | None = None
         self._order: tuple[int, ...] = ()
+        self._owner = torch.zeros(0, dtype=torch.int64)
 
     # -- the loop ------------------------------------------------------------------------------------
 
@@ -148,10 +121,15 @@ class Coordinator:
         if self.state.active is None:
             self._begin_visit()
         active = self._active
-        rate = exponential_decay(self.progress, self._means_lr, self._means_lr * self.config.means_lr_decay)
-        self.optimizers["means"].param_groups[0]["lr"] = rate
-        views = self._order[active.done * self.batch : (active.done + 1) * self.batch]
-        return Batch(self.state.step, tuple(self._sample(view, place) for place, view in enumerate(views)))
+        decay = exponential_decay(self.progress, 1.0, self.config.means_lr_decay)
+        self._pace.set(1 if active.is_whole else self.batch, means_decay=decay)
+        samples = enumerate(self._next_views(active))
+        return Batch(self.state.step, tuple(self._sample(view, place) for place, view in samples))
+
+    def _next_views(self, active: ActiveVisit) -> tuple[int, ...]:
+        if active.is_whole:
+            return (endless_order(active.views, active.done, self.config.seed),)
+        return self._order[active.done * self.batch : (active.done + 1) * self.batch]
 
     def _sample(self, view: int, place: int) -> Sample:
         around = self._layers.around(view) if self._layers else None
@@ -161,7 +139,7 @@ class Coordinator:
             layers=around and around.layers,
             near=around and around.near,
             window=around and around.window,
-            background=self._background(place),
+            background=background(self.config, self.state.step, place).to(self.device),
         )
 
     def render(self, batch: Batch) -> Rendered:
@@ -172,7 +150,7 @@ class Coordinator:
                 Shot(sample.view, sample.crop, sample.near, None if sample.near is None else sample.window)
                 for sample in batch.samples
             ],
-            sh_degree=self._active.sh_degree,
+            sh_degree=self.sh_degree if self._active.is_whole else self._active.sh_degree,
             antialiased=self.config.antialiased,
             absgrad=self.density.absgrad,
         )
@@ -216,6 +194,18 @@ class Coordinator:
         self.state.step += 1
         active.done += 1
         self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)
+        if not active.is_whole:
+            self._refine(rendered, taken)
+        self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
+        if (
+            active.done >= active.steps
+            or self.finished
+            or (active.is_whole and self.progress >= self.config.warmup)
+        ):
+            self._end_visit()
+
+    def _refine(self, rendered: Rendered, taken: int) -> None:
+        active = self._active
         limit = self.config.density.limit
         clock = DensityClock(
             progress=self.progress,
@@ -228,9 +218,6 @@ class Coordinator:
         self._growth = self.density.after_step(
             self.params, self.optimizers, self._growth, rendered.infos, clock
         )
-        self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
-        if active.done >= active.steps or self.finished:
-            self._end_visit()
 
     # -- at rest -------------------------------------------------------------------------------------
 
@@ -250,8 +237,10 @@ class Coordinator:
             pin: keep this state under a name until it is unpinned.
         """
         updates = {}
-        if self.state.active is not None:
-            updates[self.state.active.geometry.block] = self._detached().to_tensors()
+        if (active := self.state.active) is not None:
+            block, state = active.geometry.block, self._detached()
+            held = part(state, self._owner) if active.is_whole else {block: state}
+            updates = {block: state.to_tensors() for block, state in held.items()}
         self.state.seconds = self.stopwatch.seconds
         self.scene.store.commit(updates, state=self.state.to_json())
         if pin is not None:
@@ -264,8 +253,6 @@ class Coordinator:
         if self.state.active is not None:
             self._attach(self.state.active)
 
-    # -- visits --------------------------------------------------------------------------------------
-
     @property
     def _active(self) -> ActiveVisit:
         if self.state.active is None:
@@ -274,10 +261,23 @@ class Coordinator:
 
     def _begin_visit(self) -> None:
         began = self.stopwatch.seconds
+        if self.state.visit == 0 and reserve(self.scene) is not None and self.progress < self.config.warmup:
+            self.state.active = self._scaffold_visit(began)
+        else:
+            self.state.active = self._block_visit(began)
+        self.state.visit += 1
+        self._attach(self.state.active)
+
+    def _scaffold_visit(self, began: float) -> ActiveVisit:
+        geometry = VisitGeometry(WHOLE, {index: view.full for index, view in self.views.items()}, None)
+        steps = UNLIMITED if self.budget.steps is None else math.ceil(self.budget.steps * self.config.warmup)
+        return ActiveVisit(0, geometry, self.sh_degree, steps, geometry.views, began=began)
+
+    def _block_visit(self, began: float) -> ActiveVisit:
         plan, geometry = self._next_visit()
         earlier = BlockState.from_tensors(*self.scene.store.load(plan.block)).clocks.visits
         used = self._views_used(len(geometry.views))
-        self.state.active = ActiveVisit(
+        return ActiveVisit(
             number=self.state.visit,
             geometry=geometry,
             sh_degree=self.sh_degree,
@@ -285,8 +285,6 @@ class Coordinator:
             views=visit_views(geometry.views, used, earlier, self.config.seed),
             began=began,
         )
-        self.state.visit += 1
-        self._attach(self.state.active)
 
     def _next_visit(self) -> tuple[VisitPlan, VisitGeometry]:
         """The next block that some view sees; blocks that none sees any more are passed over."""
@@ -298,27 +296,34 @@ class Coordinator:
                 return plan, geometry
 
     def _attach(self, active: ActiveVisit) -> None:
-        block = active.geometry.block
-        rest = BlockState.from_tensors(*self.scene.store.load(block)).to(self.device)
+        blocks = range(self.scene.tree.num_blocks) if active.is_whole else [active.geometry.block]
+        states = [BlockState.from_tensors(*self.scene.store.load(block)) for block in blocks]
+        rows = torch.tensor([len(state) for state in states])
+        self._owner = torch.tensor(list(blocks)).repeat_interleave(rows).to(self.device)
+        rest = join(states).to(self.device)
         attach(rest, self.params, self.optimizers)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
-        self.scene.lay_over(block, lambda: live_gaussians(self.params))
-        self._order = view_order(active.views, active.steps * self.batch, active.number, self.config.seed)
-        seen = len(active.geometry.views)
+        self.scene.lay_over(
+            None if active.is_whole else active.geometry.block, lambda: live_gaussians(self.params)
+        )
+        if not active.is_whole:
+            taken = active.steps * self.batch
+            self._order = view_order(active.views, taken, active.number, self.config.seed)
+        seen, block = len(active.geometry.views), None if active.is_whole else active.geometry.block
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
         self._layers = self._draw_layers(active)
         active.layer_seconds += self.stopwatch.seconds - before
 
     def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
-        if self.scene.tree.num_blocks == 1 or not self.config.layers:
+        if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
             return None
         painter = Painter(
             self.scene,
             list(self.views.values()),
             self._rasterizer,
             ownership=self._ownership,
-            pass_gaussians=self.config.pass_gaussians or self._default_pass(),
+            pass_gaussians=self.config.pass_gaussians or default_pass(self.scene),
             device=self.device,
         )
         settings = PaintSettings(active.sh_degree, self.config.antialiased)
@@ -330,31 +335,30 @@ class Coordinator:
 
     def _end_visit(self) -> None:
         active = self._active
-        block = active.geometry.block
-        self._clocks = replace(self._clocks, visits=self._clocks.visits + 1)
+        self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
         state = self._detached()
-        owner = self.scene.tree.assign(state.gaussians.means.cpu()).to(self.device)
-        updates = {block: state[owner == block]}
-        for target in owner.unique().tolist():
-            if target != block:
-                rest = BlockState.from_tensors(*self.scene.store.load(target)).to(self.device)
-                updates[target] = rest.joined_by(state[owner == target])
+        if active.is_whole:
+            updates = settle_scaffold(self.scene, state)
+        else:
+            updates = settle_block(self.scene, active.geometry.block, state)
         self.scene.lift()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
         self.scene.store.commit({b: s.to_tensors() for b, s in updates.items()}, state=self.state.to_json())
+        block = None if active.is_whole else active.geometry.block
+        staying = len(state) if block is None else len(updates[block])
         self.announce(
             VisitEnded(
                 active.number,
                 self.state.sweep,
                 block,
-                gaussians=len(updates[block]),
-                migrated=len(state) - len(updates[block]),
+                gaussians=staying,
+                migrated=len(state) - staying,
                 layer_seconds=active.layer_seconds,
                 seconds=self.stopwatch.seconds - active.began,
             )
         )
-        if not self.state.queue:
+        if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
 
     def _next_plan(self) -> VisitPlan:
@@ -394,22 +398,3 @@ class Coordinator:
 
     def _detached(self) -> BlockState:
         return detach(self.params, self.optimizers, self._growth, self._clocks)
-
-    def _default_pass(self) -> int:
-        counts = [self.scene.count(block) for block in range(self.scene.tree.num_blocks)]
-        return max(2 * max(counts), 200_000)
-
-    def _background(self, place: int) -> Tensor:
-        if self.config.background == "random":
-            drawn = random.Random(f"background {self.config.seed} {self.state.step} {place}").getrandbits(62)
-            generator = torch.Generator().manual_seed(drawn)
-            return torch.rand(3, generator=generator).to(self.device)
-        return torch.full((3,), float(self.config.background == "white"), device=self.device)
-
-
-def blocks_at_rest(
-    tree: BlockTree, gaussians: Gaussians
-) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
-    """The first content of a store: `gaussians` parted by `tree`, nothing trained yet."""
-    owner = tree.assign(gaussians.means)
-    return {b: BlockState.fresh(gaussians[owner == b]).to_tensors() for b in range(tree.num_blocks)}

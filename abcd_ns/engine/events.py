@@ -10,7 +10,8 @@ class VisitBegan:
 
     visit: int
     sweep: int
-    block: int
+    block: int | None
+    """None for the warm-up, in which a scaffold of all blocks is trained."""
     steps: int
     views: int
     gaussians: int
@@ -42,7 +43,7 @@ class VisitEnded:
 
     visit: int
     sweep: int
-    block: int
+    block: int | None
     gaussians: int
     """In the block, after migration."""
     migrated: int

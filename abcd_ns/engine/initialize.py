@@ -36,15 +36,19 @@ def gaussians_from_points(
         points, colors = points[keep], colors[keep]
     count = points.shape[0]
     generator = torch.Generator().manual_seed(seed)
-    spacing = torch.from_numpy(_neighbour_distance(points.double().numpy())).to(points.dtype)
     return Gaussians(
         means=points.clone(),
-        scales=spacing.log()[:, None].repeat(1, 3),
+        scales=spacing(points).log()[:, None].repeat(1, 3),
         quats=_random_quats(count, generator).to(points.dtype),
         features_dc=(colors.to(points.dtype) / 255 - 0.5) / SH_C0,
         features_rest=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
         opacities=points.new_full((count, 1), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
     )
+
+
+def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """The mean distance of each point to its three nearest others; never 0."""
+    return torch.from_numpy(_neighbour_distance(points.double().numpy())).to(points.dtype)
 
 
 def random_points(count: int, extent: float, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -193,6 +193,11 @@ class Painter:
         return self.tree.leaves(unit)[0] in front
 
 
+def default_pass(scene: BlockScene) -> int:
+    """Frozen Gaussians to draw in one pass: room for twice the largest block, and for any small scene."""
+    return max(2 * max(map(scene.count, range(scene.tree.num_blocks))), 200_000)
+
+
 class _Optics:
     """Bounds over all views, for a test of reach that does not depend on the view."""
 

@@ -74,19 +74,26 @@ def make_adam(params: Params, learning_rates: Mapping[str, float], eps: float = 
     }
 
 
-def scale_to_batch(optimizers: Optimizers, batch: int) -> None:
-    """Set learning rates and memories, those of one view a step so far, for steps of `batch` views.
+class Pace:
+    """Learning rates and memories of the optimizers, as they were given for steps of one view each."""
 
-    Rates grow with the square root, and moments forget as many views' worth a step: for Adam this follows the
-    same path as single views do, as far as gradients are noise (Malladi et al. 2022, "On the SDEs and scaling
-    rules for adaptive gradient algorithms"; Zhao et al. 2024 use it for Gaussian Splatting).
-    """
-    if batch == 1:
-        return
-    for optimizer in optimizers.values():
-        for group in optimizer.param_groups:
-            group["lr"] *= math.sqrt(batch)
-            group["betas"] = tuple(beta**batch for beta in group["betas"])
+    def __init__(self, optimizers: Optimizers) -> None:
+        groups = {name: optimizer.param_groups[0] for name, optimizer in optimizers.items()}
+        self._optimizers = optimizers
+        self._given = {name: (group["lr"], group["betas"]) for name, group in groups.items()}
+
+    def set(self, batch: int, means_decay: float) -> None:
+        """For a step of `batch` views, with the means' rate at a share of what was given.
+
+        Rates grow with the square root, and moments forget as many views' worth a step: for Adam this follows
+        the path of single views, as far as gradients are noise (Malladi et al. 2022, "On the SDEs and scaling
+        rules for adaptive gradient algorithms"; Zhao et al. 2024 use it for Gaussian Splatting).
+        """
+        for name, (rate, betas) in self._given.items():
+            group = self._optimizers[name].param_groups[0]
+            decay = means_decay if name == "means" else 1.0
+            group["lr"] = rate * decay * math.sqrt(batch)
+            group["betas"] = tuple(beta**batch for beta in betas)
 
 
 def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:

@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
 from abcd_ns.engine.visit import VisitGeometry
 
@@ -44,6 +45,11 @@ class ActiveVisit:
     """Training time that went into drawing F and B."""
     began: float = 0.0
     """Training time when the visit began."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether this is the warm-up, in which the scaffold of all blocks is trained at once."""
+        return self.geometry.block == WHOLE
 
 
 @dataclass

@@ -57,10 +57,10 @@ class StoredScene:
         self.store = store
         self._ram_bytes = ram_bytes
         self._ram: OrderedDict[tuple[int, int], Gaussians] = OrderedDict()
-        self._live: tuple[int, Callable[[], Gaussians]] | None = None
+        self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
 
-    def lay_over(self, block: int, live: Callable[[], Gaussians]) -> None:
-        """From now on `block` is what `live` returns, not what the store holds."""
+    def lay_over(self, block: int | None, live: Callable[[], Gaussians]) -> None:
+        """From now on `block`, or with None the whole scene, is what `live` returns, not what is stored."""
         self._live = (block, live)
 
     def lift(self) -> None:
@@ -68,6 +68,9 @@ class StoredScene:
         self._live = None
 
     def gaussians(self, block: int) -> Gaussians:
+        if self._live is not None and self._live[0] is None:
+            everything = self._live[1]().detach()
+            return everything[self.tree.assign(everything.means) == block]
         if self._live is not None and self._live[0] == block:
             return self._live[1]().detach()
         key = (block, self.version(block))
@@ -83,6 +86,9 @@ class StoredScene:
         return self.store.version(block)
 
     def count(self, block: int) -> int:
+        if self._live is not None and self._live[0] is None:
+            # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
+            return len(self._live[1]()) if block == 0 else 0
         if self._live is not None and self._live[0] == block:
             return len(self._live[1]())
         return self.store.counts(block)

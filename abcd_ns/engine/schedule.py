@@ -80,6 +80,14 @@ def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tup
     return tuple(shuffled[:steps])
 
 
+def endless_order(views: tuple[int, ...], index: int, seed: int) -> int:
+    """The view of step `index` where nobody knows how many there will be: shuffled passes over all views."""
+    number, place = divmod(index, len(views))
+    shuffled = list(views)
+    random.Random(f"scaffold {seed} {number}").shuffle(shuffled)
+    return shuffled[place]
+
+
 def exponential_decay(progress: float, initial: float, final: float) -> float:
     """initial (final / initial)^progress for progress 0..1, as 3DGS decays the rate of the means."""
     return initial * (final / initial) ** min(max(progress, 0.0), 1.0)

@@ -8,9 +8,10 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.coordinator import Coordinator, blocks_at_rest
+from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore, view_fingerprint
 from abcd_ns.engine.types import Gaussians, View
@@ -115,7 +116,10 @@ class AbcdPipeline(VanillaPipeline):
         gaussians = self.model.initial
         tree = cut_space(gaussians, self.config.blocks, self.config.partition)
         store = ParameterStore.create(folder, {"tree": tree.to_json()})
-        store.commit(blocks_at_rest(tree, gaussians))
+        training = self.config.training
+        largest = -(-len(gaussians) // tree.num_blocks)
+        keep = largest if training.warmup > 0 and tree.num_blocks > 1 else None
+        store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
 
 

@@ -62,7 +62,8 @@ class ProgressReport:
         before = event.psnr if self._psnr is None else self._psnr
         self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
         steps = self._visit.steps if self._visit else 0
-        self._show(f"step {event.visit_step}/{steps}")
+        whole = self._visit is not None and self._visit.block is None
+        self._show(f"step {event.visit_step}" if whole else f"step {event.visit_step}/{steps}")
 
     def _end_sweep(self, event: SweepEnded) -> None:
         if self._coordinator.scene.tree.num_blocks > 1:
@@ -86,7 +87,10 @@ class ProgressReport:
     def _line(self, what: str) -> str:
         coordinator, visit = self._coordinator, self._visit
         blocks = coordinator.scene.tree.num_blocks
-        where = f"sweep {self._sweep} block {visit.block + 1 if visit else '-'}/{blocks}"
+        if visit is not None and visit.block is None:
+            where = "warm-up of the whole scene"
+        else:
+            where = f"sweep {self._sweep} block {'-' if visit is None else visit.block + 1}/{blocks}"
         quality = "" if self._psnr is None else f"{self._psnr:.2f} dB  "
         left = _clock(self._seconds_left())
         return f"{where}  {what}  {quality}{coordinator.count():,} Gaussians  {_memory()}  {left} left"

@@ -7,11 +7,12 @@ from torch import Tensor
 
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.coordinator import Coordinator, blocks_at_rest
+from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.param_swap import make_adam
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -95,6 +96,7 @@ def make_coordinator(
     tree: BlockTree | None = None,
     resume: bool = False,
     bits: int = 32,
+    scaffold: int | None = None,
     **training,
 ) -> Coordinator:
     """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is."""
@@ -104,7 +106,7 @@ def make_coordinator(
     else:
         tree = tree or build_kd(gaussians.means, blocks)
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-        store.commit(blocks_at_rest(tree, gaussians))
+        store.commit(blocks_at_rest(tree, gaussians, scaffold))
     empty = Gaussians.empty(gaussians.sh_degree)
     params = {name: torch.nn.Parameter(value) for name, value in empty.items()}
     config = TrainingConfig(sh_degree=gaussians.sh_degree, **training)

@@ -1,0 +1,77 @@
+"""The warm-up: as many Gaussians as one block may hold, spread over the whole scene and trained at once.
+
+Blocks that begin among neighbours which are still blobs learn little from them, and each block's first
+visits are spent on that. A scaffold is a coarse picture of everything that fits where one block fits, needs
+no layers, and takes little of the time. The remaining Gaussians wait in reserve, and join it when it ends.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.initialize import spacing
+from abcd_ns.engine.types import Gaussians
+
+WHOLE = -1
+"""Stands for all blocks at once where a visit names its block."""
+REVEALED_OPACITY = 0.02
+"""Of a Gaussian from the reserve: enough to be drawn and to learn, too little to spoil what is there."""
+REVEALED_SCALE = 0.5
+"""Its size, as a share of the distance to its neighbours."""
+
+
+def reserve_of(tree: BlockTree) -> int:
+    """Under which number the store keeps the Gaussians that wait: the first that is no block's."""
+    return tree.num_blocks
+
+
+def split_off_reserve(gaussians: Gaussians, keep: int, seed: int) -> tuple[Gaussians, Gaussians]:
+    """A random `keep` of freshly initialised Gaussians, widened to fill the gaps, and the others."""
+    order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(seed))
+    chosen, waiting = gaussians[order[:keep].sort().values], gaussians[order[keep:].sort().values]
+    wide = torch.maximum(chosen.scales, spacing(chosen.means).log()[:, None])
+    return replace(chosen, scales=wide), waiting
+
+
+def revealed(waiting: BlockState) -> BlockState:
+    """The reserve as it joins a trained scaffold: faint and small."""
+    old = waiting.gaussians
+    faint = torch.full_like(old.opacities, math.log(REVEALED_OPACITY / (1 - REVEALED_OPACITY)))
+    return replace(
+        waiting, gaussians=replace(old, opacities=faint, scales=old.scales + math.log(REVEALED_SCALE))
+    )
+
+
+def part(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
+    """By block, the rows that `owner` [n] gives it; the clocks stay those of `state`."""
+    return {block: state[owner == block] for block in owner.unique().tolist()}
+
+
+def join(states: list[BlockState]) -> BlockState:
+    """All in one, in order, under the clocks of the first."""
+    joined = states[0]
+    for state in states[1:]:
+        joined = joined.joined_by(state)
+    return joined
+
+
+def blocks_at_rest(
+    tree: BlockTree, gaussians: Gaussians, keep: int | None = None, seed: int = 0
+) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
+    """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
+
+    Args:
+        keep: begin with a scaffold of so many, the others in reserve; None for all at once.
+    """
+    if keep is None or keep >= len(gaussians):
+        at_rest = part(BlockState.fresh(gaussians), tree.assign(gaussians.means))
+        nobody = BlockState.fresh(gaussians[:0])
+        return {b: at_rest.get(b, nobody).to_tensors() for b in range(tree.num_blocks)}
+    scaffold, waiting = split_off_reserve(gaussians, keep, seed)
+    reserve = BlockState.fresh(waiting).to_tensors()
+    return {**blocks_at_rest(tree, scaffold), reserve_of(tree): reserve}

@@ -1,0 +1,54 @@
+"""Where the Gaussians of a visit come to rest: each in the block that holds its mean."""
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.scaffold import part, reserve_of, revealed
+from abcd_ns.engine.scene import StoredScene
+
+
+def settle_block(scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:
+    """The blocks that change when `block` has been trained: it, and those that its Gaussians moved to."""
+    parts = part(state, _owner(scene, state))
+    settled = {block: parts.get(block, state[:0])}
+    for target, arrivals in parts.items():
+        if target != block:
+            settled[target] = _at_rest(scene, target).to(state.gaussians.device).joined_by(arrivals)
+    return settled
+
+
+def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockState]:
+    """Every block with its part of the scaffold and of the reserve, which is empty from then on.
+
+    Raises:
+        ValueError: the store holds no reserve.
+    """
+    waiting = reserve(scene)
+    if waiting is None:
+        raise ValueError("a scaffold has a reserve, but the store holds none")
+    waiting = waiting.to(state.gaussians.device)
+    trained, arrivals = part(state, _owner(scene, state)), part(revealed(waiting), _owner(scene, waiting))
+    nobody = replace(waiting[:0], clocks=state.clocks)
+    settled = {
+        block: trained.get(block, nobody).joined_by(arrivals.get(block, nobody))
+        for block in range(scene.tree.num_blocks)
+    }
+    return {**settled, reserve_of(scene.tree): waiting[:0]}
+
+
+def reserve(scene: StoredScene) -> BlockState | None:
+    """The Gaussians that wait for the scaffold to be done, or None."""
+    number = reserve_of(scene.tree)
+    if number not in scene.store.blocks or scene.store.counts(number) == 0:
+        return None
+    return _at_rest(scene, number)
+
+
+def _at_rest(scene: StoredScene, block: int) -> BlockState:
+    return BlockState.from_tensors(*scene.store.load(block))
+
+
+def _owner(scene: StoredScene, state: BlockState) -> Tensor:
+    return scene.tree.assign(state.gaussians.means.cpu()).to(state.gaussians.device)

@@ -1,0 +1,117 @@
+"""The warm-up: bounded, lossless, resumable."""
+
+import pytest
+import torch
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.scaffold import REVEALED_OPACITY, blocks_at_rest, reserve_of, split_off_reserve
+from abcd_ns.engine.training_loop import train, train_step
+from abcd_ns.engine.types import Gaussians
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+STILL = DensityConfig(strategy="off")
+
+
+@pytest.fixture(scope="module")
+def views():
+    return ring_of_views(5)
+
+
+@pytest.fixture(scope="module")
+def photos(views):
+    return Photos(random_gaussians(150, seed=7, size=0.12), views)
+
+
+@pytest.fixture
+def start():
+    return random_gaussians(120, seed=1, size=0.12)
+
+
+def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
+    return {tuple(row) for row in gaussians.quats.tolist()}
+
+
+def test_scaffold_and_reserve_are_all_there_is(start):
+    scaffold, waiting = split_off_reserve(start, 30, seed=3)
+    assert len(scaffold) == 30
+    assert rows(scaffold) | rows(waiting) == rows(start)
+    assert not rows(scaffold) & rows(waiting)
+    originals = {tuple(q): s for q, s in zip(start.quats.tolist(), start.scales, strict=True)}
+    for quat, scales in zip(scaffold.quats.tolist(), scaffold.scales, strict=True):
+        assert bool((scales >= originals[tuple(quat)]).all())
+    assert float(scaffold.scales.mean()) > float(start.scales.mean()) + 0.2
+
+
+def test_without_a_scaffold_nothing_waits(start):
+    tree = build_kd(start.means, 4)
+    assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
+    assert sorted(blocks_at_rest(tree, start, keep=len(start))) == [0, 1, 2, 3]
+    assert sorted(blocks_at_rest(tree, start, keep=30)) == [0, 1, 2, 3, reserve_of(tree)]
+
+
+def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=40, scaffold=30)
+    train(coordinator, photos, steps=3)
+    assert coordinator.state.active.is_whole
+    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == 30
+    batch = coordinator.next_batch()
+    assert [sample.crop for sample in batch.samples] == [views[0].full]
+    assert batch.samples[0].layers is None
+
+
+def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL
+    )
+    begun = []
+    coordinator.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
+    train(coordinator, photos, steps=10)
+    assert coordinator.state.active is None
+    scene, store = coordinator.scene, coordinator.scene.store
+    assert store.counts(reserve_of(scene.tree)) == 0
+    for block in range(4):
+        state = BlockState.from_tensors(*store.load(block))
+        assert bool((scene.tree.assign(state.gaussians.means) == block).all())
+        faint = torch.sigmoid(state.gaussians.opacities[:, 0]).sub(REVEALED_OPACITY).abs() < 1e-6
+        trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)
+        assert not bool((faint & trained).any())
+        assert state.clocks.adam_steps == 10
+        assert state.clocks.visits == 0
+    assert coordinator.count() == 120
+    train(coordinator, photos)
+    assert [event.block for event in begun][:2] != [None, None]
+    assert begun[0].block is None
+    assert {event.block for event in begun[1:]} == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("stop", [4, 10, 13])
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop):
+    """Bit for bit: within the warm-up, at its end, and after it (invariant 7)."""
+    runs = {}
+    for name in ("whole", "stopped"):
+        (tmp_path / name).mkdir()
+        runs[name] = make_coordinator(
+            tmp_path / name, start, views, blocks=4, steps=24, scaffold=30, warmup=0.4
+        )
+    train(runs["whole"], photos)
+    train(runs["stopped"], photos, steps=stop)
+    runs["stopped"].save()
+    runs["stopped"].scene.store.close()
+    again = make_coordinator(tmp_path / "stopped", start, views, steps=24, warmup=0.4, resume=True)
+    train(again, photos)
+    found, expected = whole_scene(again), whole_scene(runs["whole"])
+    assert all(torch.equal(value, getattr(found, name)) for name, value in expected.items())
+
+
+def test_no_more_is_live_than_in_the_largest_block(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, density=STILL, warmup=0.25
+    )
+    most = 0
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        most = max(most, len(coordinator.params["means"]))
+    assert most <= 32  # a migrant or two
