@@ -23,7 +23,6 @@ from abcd_ns.engine.rasterizer import torch_backend as backend
 from abcd_ns.engine.rasterizer.binning import bin_splats
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels
 from abcd_ns.engine.rasterizer.projection import project
-from abcd_ns.engine.rasterizer.spherical_harmonics import sh_colors
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.rasterizer.torch_kernels import (
     ALWAYS,
@@ -32,6 +31,7 @@ from abcd_ns.engine.rasterizer.torch_kernels import (
     CONIC_XY,
     CONIC_YY,
     DEPTH,
+    GRADED,
     GREEN,
     OPACITY,
     RED,
@@ -193,16 +193,12 @@ def part_sides(args: Args, gaussians: Gaussians, view: View) -> dict[str, Callab
     with torch.no_grad():
         splats = project(gaussians, view)
 
-    def projection() -> None:
-        projected = project(leaves, view)
-        (projected.means2d.sum() + projected.conics.sum() + projected.opacities.sum()).backward()
-
-    def colours() -> None:
-        sh_colors(leaves.features_dc, leaves.features_rest, splats.bases, 3).sum().backward()
+    def projection(built: bool) -> None:
+        (project(leaves, view, sh_degree=3, built=built).planes[:GRADED].sum()).backward()
 
     return {
-        "projection, both ways": projection,
-        "spherical harmonics, both ways": colours,
+        "projection and colours, both ways, eager": lambda: projection(False),
+        "projection and colours, both ways, built": lambda: projection(True),
         "binning and sorting": lambda: bin_splats(splats, grid, args.chunk),
     }
 
