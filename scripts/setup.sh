@@ -109,8 +109,12 @@ check_open3d() {
 
 # The torch rasterizer's kernels for this processor; without a compiler it stays slow and says so itself.
 build_kernels() {
-  say "building the CPU rasterizer's kernels: a minute or two, once per machine"
-  "$VENV_PYTHON" -c 'from abcd_ns.engine.rasterizer import TorchRasterizer; TorchRasterizer().warm_up()'
+  say "building the CPU kernels: two or three minutes, once per machine"
+  "$VENV_PYTHON" -c '
+from abcd_ns.engine.build_kernels import all_kernels
+from abcd_ns.engine.kernels.build import build_kernels
+from abcd_ns.engine.rasterizer.torch_backend import CHUNK, TILE_SIDE
+build_kernels(all_kernels(TILE_SIDE, CHUNK), TILE_SIDE, CHUNK)'
 }
 
 [[ $(uname -sm) == "Linux x86_64" ]] ||
