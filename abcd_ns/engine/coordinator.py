@@ -22,14 +22,7 @@ from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
-from abcd_ns.engine.param_swap import (
-    Optimizers,
-    Pace,
-    Params,
-    attach,
-    detach,
-    live_gaussians,
-)
+from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.scaffold import WHOLE, join, part
@@ -45,7 +38,7 @@ from abcd_ns.engine.schedule import (
     views_per_visit,
     visit_views,
 )
-from abcd_ns.engine.settle import reserve, settle_block, settle_scaffold
+from abcd_ns.engine.settle import has_reserve, settle_block, settle_scaffold
 from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
@@ -193,8 +186,8 @@ class Coordinator:
         active, taken = self._active, len(rendered.pictures)
         self.state.step += 1
         active.done += 1
-        self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)
         if not active.is_whole:
+            self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)
             self._refine(rendered, taken)
         self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
         if (
@@ -261,7 +254,7 @@ class Coordinator:
 
     def _begin_visit(self) -> None:
         began = self.stopwatch.seconds
-        if self.state.visit == 0 and reserve(self.scene) is not None and self.progress < self.config.warmup:
+        if self.state.visit == 0 and has_reserve(self.scene) and self.progress < self.config.warmup:
             self.state.active = self._scaffold_visit(began)
         else:
             self.state.active = self._block_visit(began)
@@ -392,6 +385,7 @@ class Coordinator:
             self.scene.gaussians(block).to(self.device),
             block,
             self.views.values(),
+            self._rasterizer,
             cell=self.scene.tree.cell(block) if window else None,
             percentile=self.config.window_percentile,
         )

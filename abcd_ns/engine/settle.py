@@ -23,12 +23,9 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
     """Every block with its part of the scaffold and of the reserve, which is empty from then on.
 
     Raises:
-        ValueError: the store holds no reserve.
+        KeyError: the store holds no reserve.
     """
-    waiting = reserve(scene)
-    if waiting is None:
-        raise ValueError("a scaffold has a reserve, but the store holds none")
-    waiting = waiting.to(state.gaussians.device)
+    waiting = _at_rest(scene, reserve_of(scene.tree)).to(state.gaussians.device)
     trained, arrivals = part(state, _owner(scene, state)), part(revealed(waiting), _owner(scene, waiting))
     nobody = replace(waiting[:0], clocks=state.clocks)
     settled = {
@@ -38,12 +35,10 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
     return {**settled, reserve_of(scene.tree): waiting[:0]}
 
 
-def reserve(scene: StoredScene) -> BlockState | None:
-    """The Gaussians that wait for the scaffold to be done, or None."""
+def has_reserve(scene: StoredScene) -> bool:
+    """Whether Gaussians wait for the scaffold to be done."""
     number = reserve_of(scene.tree)
-    if number not in scene.store.blocks or scene.store.counts(number) == 0:
-        return None
-    return _at_rest(scene, number)
+    return number in scene.store.blocks and scene.store.counts(number) > 0
 
 
 def _at_rest(scene: StoredScene, block: int) -> BlockState:

@@ -12,8 +12,8 @@ from abcd_ns.engine.compositing import empty_layer
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.painter import Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
-from abcd_ns.engine.rasterizer import ZWindow
-from abcd_ns.engine.rasterizer.projection import Splats, pack, project_packed
+from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
+from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 from abcd_ns.engine.visibility import footprint, fragment_box_intersects, reach_radius
@@ -58,6 +58,7 @@ def survey(
     gaussians: Gaussians,
     block: int,
     views: Iterable[View],
+    rasterizer: Rasterizer,
     *,
     cell: Box | None,
     percentile: float = 0.9,
@@ -72,9 +73,8 @@ def survey(
     """
     crops = {}
     with torch.no_grad():
-        packed = pack(gaussians)
         for view in views:
-            seen = project_packed(packed, view)
+            seen = rasterizer.project(gaussians, view)
             crop = footprint(seen.means2d, seen.radii, view, margin=CROP_MARGIN, align=align)
             if crop is not None:
                 crops[view.index] = crop

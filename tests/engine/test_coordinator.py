@@ -17,24 +17,9 @@ from abcd_ns.engine.storage import StaleLayerError
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views, whole_scene
 
 GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
-
-
-@pytest.fixture(scope="module")
-def views():
-    return ring_of_views(5)
-
-
-@pytest.fixture(scope="module")
-def photos(views):
-    return Photos(random_gaussians(150, seed=7, size=0.12), views)
-
-
-@pytest.fixture
-def start():
-    return random_gaussians(120, seed=1, size=0.12)
 
 
 def equal(a: Gaussians, b: Gaussians) -> bool:

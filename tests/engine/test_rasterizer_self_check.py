@@ -38,7 +38,9 @@ class Broken(TorchRasterizer):
 
 
 def test_a_sound_backend_passes():
-    self_check(TorchRasterizer("never", tile_side=8, chunk=5), "cpu")
+    assert self_check(TorchRasterizer("never"), "cpu") == 0.0
+    # Other tiles add up in another order: close, and not the very same computation.
+    assert 0 < self_check(TorchRasterizer("never", tile_side=8, chunk=5), "cpu") < 1e-4
 
 
 @pytest.mark.parametrize(

@@ -10,24 +10,9 @@ from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.scaffold import REVEALED_OPACITY, blocks_at_rest, reserve_of, split_off_reserve
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import make_coordinator, whole_scene
 
 STILL = DensityConfig(strategy="off")
-
-
-@pytest.fixture(scope="module")
-def views():
-    return ring_of_views(5)
-
-
-@pytest.fixture(scope="module")
-def photos(views):
-    return Photos(random_gaussians(150, seed=7, size=0.12), views)
-
-
-@pytest.fixture
-def start():
-    return random_gaussians(120, seed=1, size=0.12)
 
 
 def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
@@ -80,6 +65,7 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
         assert not bool((faint & trained).any())
         assert state.clocks.adam_steps == 10
         assert state.clocks.visits == 0
+        assert state.clocks.steps == 0
     assert coordinator.count() == 120
     train(coordinator, photos)
     assert [event.block for event in begun][:2] != [None, None]

@@ -58,10 +58,6 @@ class Splats:
         """Those at `index`."""
         return Splats(self.planes.index_select(1, index))
 
-    def detach(self) -> "Splats":
-        """Cut from any autograd graph; shares memory."""
-        return Splats(self.planes.detach())
-
 
 class _Splat(torch.autograd.Function):
     """`splat` and its gradient by the Gaussians; nothing but the inputs is kept in between."""

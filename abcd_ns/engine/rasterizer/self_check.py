@@ -58,17 +58,21 @@ def _values_and_gradients(rasterizer: Rasterizer, device: torch.device | str) ->
     return {name: value.detach().cpu().double() for name, value in results.items()}
 
 
-def self_check(rasterizer: Rasterizer, device: torch.device | str) -> None:
+def self_check(rasterizer: Rasterizer, device: torch.device | str) -> float:
     """Compare a rasterizer with the torch backend, forward and gradient, on a tiny fixed scene.
 
     A backend whose picture is right and whose gradient is wrong trains to a much worse model without any
     error, as a port of gsplat to other hardware once did; hence this check at every start.
+
+    Returns:
+        The largest difference, relative to the largest value of its kind.
 
     Raises:
         RuntimeError: a value or gradient differs by more than rounding.
     """
     expected = _values_and_gradients(TorchRasterizer("never"), "cpu")
     found = _values_and_gradients(rasterizer, device)
+    largest = 0.0
     for name, reference in expected.items():
         scale = reference.abs().max().clamp_min(1e-12)
         error = float((found[name] - reference).abs().max() / scale)
@@ -77,3 +81,5 @@ def self_check(rasterizer: Rasterizer, device: torch.device | str) -> None:
                 f'The rasterizer "{rasterizer.name}" on {device} is off in {name} by {error:.2g} of the '
                 f'largest value, so its kernels cannot be trusted there. Set the rasterizer to "torch".'
             )
+        largest = max(largest, error)
+    return largest
