@@ -4,7 +4,7 @@ import sys
 
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.kernels.build import compile_all
-from abcd_ns.engine.photometric_kernel import PHOTOMETRIC
+from abcd_ns.engine.photometric_kernel import PHOTOMETRIC_KERNELS
 from abcd_ns.engine.rasterizer.chunk_kernels import chunk_kernels
 from abcd_ns.engine.rasterizer.splat_kernels import SPLAT_KERNELS
 
@@ -15,7 +15,7 @@ def all_kernels(side: int, chunk: int) -> tuple[Kernel, ...]:
     Args:
         side, chunk: of the torch rasterizer, see TorchRasterizer.
     """
-    return (PHOTOMETRIC, *chunk_kernels(side, chunk), *SPLAT_KERNELS)
+    return (*chunk_kernels(side, chunk), *PHOTOMETRIC_KERNELS, *SPLAT_KERNELS)
 
 
 if __name__ == "__main__":

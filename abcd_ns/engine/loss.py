@@ -8,17 +8,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from abcd_ns.engine.photometric_kernel import PHOTOMETRIC, SSIM_WINDOW
+from abcd_ns.engine.photometric_kernel import SSIM_WINDOW, photometric_sums
 
 
 class _Photometric(torch.autograd.Function):
-    """`weights` . sums of `photometric_kernel`, which finds the gradient in the same go."""
+    """`weights` . `photometric_sums`, which finds the gradient in the same go."""
 
     @staticmethod
     def forward(
         ctx: Any, rendered: Float[Tensor, "3 h w"], photo: Float[Tensor, "3 h w"], weights: Float[Tensor, "2"]
     ) -> Float[Tensor, ""]:
-        sums, gradient = PHOTOMETRIC(rendered, photo, weights)
+        sums, gradient = photometric_sums(rendered, photo, weights)
         ctx.save_for_backward(gradient)
         return (sums * weights).sum()
 

@@ -135,7 +135,7 @@ def test_float64_is_eager_whatever_is_built():
 
 def test_names_tell_all_kernels_and_sizes_apart():
     kernels = {kernel for side in (2, 4) for chunk in (8, 16) for kernel in all_kernels(side, chunk)}
-    assert len({kernel.path for kernel in kernels}) == len(kernels) == 5 + 4 * 2
+    assert len({kernel.path for kernel in kernels}) == len(kernels) == 7 + 4 * 2
 
 
 def test_using_kernels_does_not_import_the_compiler():

@@ -15,6 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -67,16 +68,7 @@ def compile_kernel(kernel: Kernel) -> None:
     examples = tuple(torch.rand([_example_size(size) for size in shape.split()]) for shape in kernel.shapes)
     # Traced first, because torch.export does not look through torch.func.
     traced = make_fx(lambda *tensors: kernel.function(*tensors), tracing_mode="symbolic")(*examples)
-    dims: dict[str, torch.export.Dim] = {}
-    dynamic = tuple(
-        {
-            axis: dims.setdefault(size, torch.export.Dim(size, min=kernel.smallest, max=2**30))
-            for axis, size in enumerate(shape.split())
-            if not size.isdigit()
-        }
-        for shape in kernel.shapes
-    )
-    exported = torch.export.export(traced, examples, dynamic_shapes=dynamic)
+    exported = torch.export.export(traced, examples, dynamic_shapes=_dynamic_shapes(kernel))
     with tempfile.TemporaryDirectory(dir=kernel.path.parent) as folder:
         package = torch._inductor.aoti_compile_and_package(
             exported, package_path=str(Path(folder) / "kernel.pt2"), inductor_configs=dict(COMPILER_OPTIONS)
@@ -84,9 +76,27 @@ def compile_kernel(kernel: Kernel) -> None:
         os.replace(package, kernel.path)
 
 
+def _dynamic_shapes(kernel: Kernel) -> tuple[dict[int, Any], ...]:
+    """Of each argument, the axes whose size is dynamic, as torch.export wants them."""
+    dims: dict[str, Any] = {}
+
+    def dim(size: str) -> Any:
+        name, _, more = size.partition("+")
+        found = dims.setdefault(name, torch.export.Dim(name, min=kernel.smallest, max=2**30))
+        return found + int(more) if more else found
+
+    return tuple(
+        {axis: dim(size) for axis, size in enumerate(shape.split()) if not size.isdigit()}
+        for shape in kernel.shapes
+    )
+
+
 def _example_size(size: str) -> int:
     """A dynamic size's example: any number that equals no other size, lest a compiler takes both for one."""
-    return int(size) if size.isdigit() else 64 + sum(map(ord, size))
+    if size.isdigit():
+        return int(size)
+    name, _, more = size.partition("+")
+    return 64 + sum(map(ord, name)) + int(more or 0)
 
 
 @contextmanager

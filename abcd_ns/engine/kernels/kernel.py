@@ -42,7 +42,7 @@ class Kernel:
     function: Callable[..., tuple[Tensor, ...]]
     """Without data-dependent control flow; may use torch.func. Returns a tuple."""
     shapes: tuple[str, ...]
-    """Of each argument, as "11 n": numbers are fixed sizes, names are dynamic ones."""
+    """Of each argument, as "11 n" or "3 n+10": numbers are fixed sizes, names are dynamic ones."""
     depends: tuple[str, ...] = ()
     """Other source files, whose constants or functions the kernel uses."""
     smallest: int = 2
