@@ -11,17 +11,14 @@ from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from abcd_ns.tools.compare.charts import COLORS, MARKERS, draw_speed_accuracy, mean_curve, spread
-from abcd_ns.tools.compare.pictures import (
-    draw_comparison,
-    draw_pictures,
-    error_map,
-    evenly,
-    psnr_of,
-)
-from abcd_ns.tools.compare.protocol import METHODS
-from abcd_ns.tools.compare.results import ViewScore
-from abcd_ns.tools.compare.tables import MEASURES, cell, notes, print_table, rows, write_table
+from abcd_ns.tools.compare.charts import draw_speed_accuracy, mean_curve
+from abcd_ns.tools.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
+from abcd_ns.tools.compare.tables import notes, print_table, rows, write_table
+from abcd_ns.tools.runs.evaluate import evenly
+from abcd_ns.tools.runs.job import METHODS
+from abcd_ns.tools.runs.run import ViewScore
+from abcd_ns.tools.runs.style import COLORS, MARKERS, spread
+from abcd_ns.tools.runs.tables import MEASURES, cell
 from tests.tools.compare_records import made_up_results, made_up_run
 
 

@@ -13,12 +13,13 @@ import pytest
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.compare import runner
 from abcd_ns.tools.compare.command import carry_out, without_impossible
 from abcd_ns.tools.compare.protocol import Options, Plan, make_plan
-from abcd_ns.tools.compare.records import encode
-from abcd_ns.tools.compare.results import Failure, Run, read_results
-from abcd_ns.tools.compare.runner import claim, last_line, run_jobs
+from abcd_ns.tools.compare.results import read_results
+from abcd_ns.tools.runs import runner
+from abcd_ns.tools.runs.records import encode
+from abcd_ns.tools.runs.run import Failure, Run
+from abcd_ns.tools.runs.runner import claim, last_line, run_jobs
 from tests.tools.compare_records import MACHINE, made_up_run
 
 WORKER = """

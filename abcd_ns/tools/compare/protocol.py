@@ -5,21 +5,15 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.compare.records import decode
+from abcd_ns.tools.runs.job import METHODS, Job, Settings
+from abcd_ns.tools.runs.records import decode
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
-
-Method = Literal["abcd-monolithic", "abcd", "abcd-ablated", "splatfacto"]
-METHODS: tuple[str, ...] = get_args(Method)
-"""In the order in which tables and charts show them."""
-HELD_OUT_EVERY = 8
-"""Views 0, 8, 16, ... of the list sorted by name are never trained on, as in the papers of the field."""
 
 
 @dataclass(frozen=True)
@@ -64,55 +58,6 @@ def read_options(path: Path) -> Options:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What all runs of a comparison share; runs that differ in any of these are not comparable."""
-
-    data: str
-    """The scene, as an absolute path."""
-    downscale: int
-    blocks: int
-    seconds: float | None
-    """Of training; None where the budget is in steps."""
-    steps: int | None
-    evals: int
-    """Points of the curve of held-out PSNR over training time, the end included."""
-    max_gaussians: int
-    """In the whole scene; 0 means no limit."""
-    densify: bool
-    pictures: int
-    """Held-out views that are shown."""
-
-    @property
-    def scene(self) -> str:
-        """The name of the scene: its folder's."""
-        path = Path(self.data)
-        return path.parent.name if path.suffix == ".json" else path.name
-
-    @property
-    def moments(self) -> tuple[float, ...]:
-        """Shares of the run, up to 1, at which held-out views are drawn; denser where quality rises fast."""
-        return tuple((k / self.evals) ** 2 for k in range(1, self.evals + 1))
-
-
-@dataclass(frozen=True)
-class Job:
-    """One run: what a worker process is given."""
-
-    method: str
-    seed: int
-    settings: Settings
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return f"{self.method}, seed {self.seed}"
-
-    def folder(self, out: Path) -> Path:
-        """Where the run is kept; nerfstudio's layout of output_dir/experiment/method/timestamp."""
-        return out / "runs" / self.method / f"seed-{self.seed}"
-
-
-@dataclass(frozen=True)
 class Plan:
     """All runs of a comparison."""
 
@@ -120,6 +65,7 @@ class Plan:
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
     out: Path
+    kind = "comparison"
 
     @property
     def jobs(self) -> tuple[Job, ...]:

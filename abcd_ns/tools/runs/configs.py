@@ -13,7 +13,8 @@ from abcd_ns import methods
 from abcd_ns.plugin.config import AbcdTrainerConfig
 from abcd_ns.plugin.data.dataset import AbcdDataset
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
-from abcd_ns.tools.compare.protocol import HELD_OUT_EVERY, Job
+from abcd_ns.tools.runs.job import HELD_OUT_EVERY, Job
+from abcd_ns.tools.runs.options import change_options
 
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
@@ -27,7 +28,7 @@ def trainer_config(job: Job, out: Path) -> TrainerConfig:
     """What the job trains with; its files go to `job.folder(out)`."""
     config = _splatfacto(job) if job.method == "splatfacto" else _abcd(job)
     settings = job.settings
-    config.output_dir, config.experiment_name, config.timestamp = out, "runs", f"seed-{job.seed}"
+    config.output_dir, config.experiment_name, config.timestamp = out, "runs", job.folder(out).name
     config.machine.seed = job.seed
     config.max_num_iterations = ENDLESS if settings.steps is None else settings.steps
     # "tensorboard" is the value of `vis` that starts no viewer and asks no service for an account.
@@ -56,6 +57,7 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
     pipeline.training.density.max_gaussians = settings.max_gaussians
     if not settings.densify:
         pipeline.training.density.strategy = "off"
+    change_options(pipeline, job.variant)
     return config
 
 

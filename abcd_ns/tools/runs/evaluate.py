@@ -17,7 +17,7 @@ from abcd_ns.engine.types import Layer
 from abcd_ns.plugin.metrics import image_metrics
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.views import view_of
-from abcd_ns.tools.compare.results import ViewScore
+from abcd_ns.tools.runs.run import ViewScore
 
 Picture = Float[Tensor, "h w 3"]
 Drawer = Callable[[Cameras], Picture]
@@ -121,6 +121,12 @@ def mean(values: Sequence[float | None]) -> float | None:
     if not values or any(value is None for value in values):
         return None
     return sum(values) / len(values)
+
+
+def evenly(count: int, wanted: int) -> tuple[int, ...]:
+    """`wanted` of the rows 0 .. count - 1, as far apart from each other as from both ends."""
+    wanted = min(count, wanted)
+    return tuple(int((k + 0.5) * count / wanted) for k in range(wanted))
 
 
 @contextmanager
