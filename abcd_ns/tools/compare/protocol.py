@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from abcd_ns.errors import UserError
+from abcd_ns.tools.runs.checks import LOWEST, check_budget, check_numbers, check_places, check_ranges
 from abcd_ns.tools.runs.job import METHODS, Job, Settings
 from abcd_ns.tools.runs.records import decode
 
@@ -94,15 +95,9 @@ def make_plan(options: Options) -> Plan:
         methods=METHODS[:3], seeds=(0,), downscale=1, blocks=8, evals=8, max_gaussians=0, pictures=3
     )
     given = options.over(defaults)
-    if given.data is None:
-        raise UserError("Give the scene to compare on with --data FOLDER.")
-    if given.out is None:
-        raise UserError("Give the folder for the results with --out FOLDER.")
-    if (given.seconds is None) == (given.steps is None):
-        raise UserError("Give each run's budget: either --seconds or --steps.")
-    if not Path(given.data).exists():
-        raise UserError(f"--data {given.data} does not exist.")
-    _check_ranges(given)
+    check_places(given.data, given.out)
+    check_budget(given.seconds, given.steps)
+    check_ranges({name: getattr(given, name) for name in LOWEST})
     _check_lists(given)
     settings = Settings(
         data=str(Path(given.data).resolve()),
@@ -116,21 +111,10 @@ def make_plan(options: Options) -> Plan:
     return Plan(settings, methods, given.seeds, Path(given.out))
 
 
-def _check_ranges(given: Options) -> None:
-    lowest = {"downscale": 1, "blocks": 1, "steps": 1, "evals": 1, "max_gaussians": 0, "pictures": 0}
-    for name, low in lowest.items():
-        value = getattr(given, name)
-        if value is not None and value < low:
-            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}.")
-    if given.seconds is not None and not 0 < given.seconds < float("inf"):
-        raise UserError(f"--seconds is {given.seconds}; it must be above 0.")
-
-
 def _check_lists(given: Options) -> None:
     for method in given.methods:
         if method not in METHODS:
             raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
     if not given.methods or not given.seeds:
         raise UserError("Give at least one of --methods and one of --seeds.")
-    if len(set(given.seeds)) < len(given.seeds) or min(given.seeds) < 0:
-        raise UserError(f"--seeds {' '.join(map(str, given.seeds))}: give different numbers from 0 up.")
+    check_numbers("--seeds", given.seeds, 0)

@@ -10,7 +10,8 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
-from abcd_ns.plugin.config import AbcdTrainerConfig
+from abcd_ns.errors import UserError
+from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig
 from abcd_ns.plugin.data.dataset import AbcdDataset
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
 from abcd_ns.tools.runs.job import HELD_OUT_EVERY, Job
@@ -18,6 +19,13 @@ from abcd_ns.tools.runs.options import change_options
 
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
+
+
+_REGISTERED = {
+    "abcd": methods.abcd,
+    "abcd-ablated": methods.abcd_ablated,
+    "abcd-monolithic": methods.abcd_monolithic,
+}
 
 
 class SplatfactoData(FullImageDatamanager[AbcdDataset]):
@@ -40,13 +48,34 @@ def trainer_config(job: Job, out: Path) -> TrainerConfig:
     return config
 
 
+def check_scene(job: Job) -> None:
+    """Look at the scene as a worker would, photos included.
+
+    Raises:
+        UserError: it cannot be trained on.
+    """
+    _parser(job).setup().check()
+
+
+def check_options(job: Job) -> None:
+    """Whether the options of the job's variant exist and go together.
+
+    Raises:
+        UserError: they do not.
+    """
+    pipeline = _abcd(job).pipeline
+    pipeline.model.mirror(pipeline.training)
+    if pipeline.blocks < 1:
+        raise UserError(f"{job.variant.name}: blocks must be 1 or more, not {pipeline.blocks}.")
+
+
+def default_options(method: str) -> AbcdPipelineConfig:
+    """The method's pipeline as it is registered; not a copy."""
+    return _REGISTERED[method].config.pipeline
+
+
 def _abcd(job: Job) -> AbcdTrainerConfig:
-    registered = {
-        "abcd": methods.abcd,
-        "abcd-ablated": methods.abcd_ablated,
-        "abcd-monolithic": methods.abcd_monolithic,
-    }
-    config: AbcdTrainerConfig = copy.deepcopy(registered[job.method].config)
+    config: AbcdTrainerConfig = copy.deepcopy(_REGISTERED[job.method].config)
     settings, pipeline = job.settings, config.pipeline
     pipeline.datamanager.data = Path(settings.data)
     pipeline.datamanager.dataparser = _parser(job)

@@ -17,11 +17,16 @@ SET_BY_THE_PROTOCOL = {
     "max_seconds": "--seconds",
     "training.seed": "--seeds",
     "datamanager.data": "--data",
+    "datamanager.dataparser.data": "--data",
     "datamanager.dataparser.downscale_factor": "--downscale",
 }
 """Options that all runs of a folder share, and what sets them."""
-PHOTOS = "datamanager.dataparser."
-"""Options of the photos themselves: with other photos, scores could not be compared."""
+HELD_OUT = {
+    "datamanager.dataparser.eval_mode",
+    "datamanager.dataparser.eval_interval",
+    "datamanager.camera_res_scale_factor",
+}
+"""Options that decide which photos scores are taken from, and of what size."""
 SCALARS = (bool, int, float, str, Path)
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
 
@@ -81,8 +86,10 @@ def read_value(change: Change, pipeline: Any) -> Any:
     if change.path in SET_BY_THE_PROTOCOL:
         flag = SET_BY_THE_PROTOCOL[change.path]
         raise UserError(f"{change.path} cannot be varied: it is the same in all runs; set it with {flag}.")
-    if change.path.startswith(PHOTOS):
-        raise UserError(f"{change.path} cannot be varied: it changes the photos that scores are taken from.")
+    if change.path in HELD_OUT:
+        raise UserError(
+            f"{change.path} cannot be varied: it would change the photos that scores are taken from."
+        )
     known = option_names(pipeline)
     if change.path not in known:
         raise UserError(f"There is no option {change.path!r}; {_near(change.path, known)}")
@@ -158,9 +165,9 @@ def _near(path: str, known: dict[str, Any]) -> str:
     by_end = {name: name.rpartition(".")[2] for name in known}
     last = path.rpartition(".")[2]
     same = [name for name, end in by_end.items() if end == last]
-    ends = difflib.get_close_matches(last, set(by_end.values()), n=3, cutoff=0.7)
+    ends = difflib.get_close_matches(last, sorted(set(by_end.values())), n=3, cutoff=0.8)
     alike = [name for end in ends for name, known_end in by_end.items() if known_end == end]
-    whole = difflib.get_close_matches(path, known, n=3, cutoff=0.7)
+    whole = difflib.get_close_matches(path, known, n=3, cutoff=0.8)
     ours = sorted(dict.fromkeys([*same, *whole, *alike]), key=lambda name: name.startswith("model."))[:3]
     if ours:
         return f"did you mean {' or '.join(ours)}?"
