@@ -43,7 +43,7 @@ def draw_size_accuracy(results: Results, out: Path) -> list[Path]:
         ends = {m: _draw_curves(axes, m, results.of(m), lambda p: p.gaussians) for m in results.methods}
         for method, end in ends.items():
             axes.plot(*end, MARKERS[method], color=COLORS[method], markersize=9, markeredgecolor="white")
-        _dress(axes, results, "Gaussians in the scene, at each evaluation (large mark: the end)")
+        _dress(axes, results, "Gaussians in the scene (large mark: at the end)")
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         label_ends(axes, ends, 1.01 * axes.get_xlim()[1])
         return save(figure, out, "size_accuracy")

@@ -6,6 +6,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from abcd_ns.tools.runs.run import Run
@@ -22,7 +23,10 @@ from abcd_ns.tools.study.results import Arm, StudyResults, average
 
 BAND = "#ececec"
 BETTER, WORSE, SAME = "#007A5A", "#D55E00", "#666666"
-ROW_INCHES = 0.3
+ROW_INCHES, LINE_INCHES = 0.3, 0.17
+COLUMNS = ("change", "PSNR", "Gaussians")
+"""Numbers beside the bars, right-aligned at COLUMN_POINTS from the axis."""
+COLUMN_POINTS = (40, 80, 140)
 Value = Callable[[Run], float]
 
 
@@ -101,16 +105,19 @@ def _draw_gap(axes: Axes, arms: Sequence[Arm]) -> None:
         fontsize=7,
         color="#777777",
     )
-    for arm, word, offset in ((gap.best, "best", 8), (gap.worst, "worst", -15)):
-        axes.annotate(
+    left, right = arms[0], arms[-1]
+    for arm, word, offset in ((gap.best, "best", 9), (gap.worst, "worst", -16)):
+        label = axes.annotate(
             f"{word} {arm.psnr:.2f}",
             xy=(arm.value, arm.psnr),
-            xytext=(0, offset),
+            xytext=(-4 if arm is left else 4 if arm is right else 0, offset),
             textcoords="offset points",
-            ha="center",
+            ha="left" if arm is left else "right" if arm is right else "center",
             fontsize=8,
             color=COLORS[arm.method],
+            zorder=5,
         )
+        label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
 def _draw_line(
@@ -177,6 +184,9 @@ def _draw_gaussians(results: StudyResults) -> Figure | None:
         ends[method] = (arms[-1].gaussians, arms[-1].psnr)
     axes.set_xscale("log")
     axes.margins(x=0.06, y=0.15)
+    # The largest limit stays in sight, unless growth ended far below it.
+    reached, largest = (max(get(arm) for arm in results.arms) for get in (_end, _limit))
+    axes.set_xlim(right=max(axes.get_xlim()[1], 1.1 * min(largest, 1.6 * reached)))
     for row, method in enumerate(results.methods):
         _mark_knee(axes, results.of(method), row)
     counts = sorted({arm.value for arm in results.arms})
@@ -194,26 +204,28 @@ def _draw_gaussians(results: StudyResults) -> Figure | None:
     return figure
 
 
+def _end(arm: Arm) -> float:
+    return arm.gaussians
+
+
+def _limit(arm: Arm) -> int:
+    return arm.value
+
+
 def _mark_knee(axes: Axes, arms: Sequence[Arm], row: int) -> None:
-    """A ring around the knee, and its number at the bottom, in the method's colour."""
+    """A ring around the knee, a line down to its number, in the method's colour."""
     knee = find_knee(arms)
     if knee is None:
         return
-    color = COLORS[knee.method]
+    color, (low, high) = COLORS[knee.method], axes.get_ylim()
     axes.plot(knee.gaussians, knee.psnr, "o", markersize=12, markerfacecolor="none", markeredgecolor=color)
-    axes.plot(
-        [knee.gaussians] * 2,
-        [0, knee.psnr],
-        color=color,
-        linewidth=0.8,
-        linestyle=(0, (3, 3)),
-        scaley=False,
-    )
+    axes.vlines(knee.gaussians, low, knee.psnr, color=color, linewidth=0.8, linestyle=(0, (3, 3)), zorder=1)
+    axes.set_ylim(low, high)
     axes.annotate(
-        f"{_short(knee.gaussians)}",
+        f"knee {_short(knee.gaussians)}",
         xy=(knee.gaussians, 0.02 + 0.07 * row),
         xycoords=("data", "axes fraction"),
-        xytext=(3, 0),
+        xytext=(4, 0),
         textcoords="offset points",
         color=color,
         fontsize=8,
@@ -238,33 +250,46 @@ def _draw_options(results: StudyResults) -> Figure | None:
     rows = sorted(((a, d) for a, d in found if d is not None), key=lambda pair: pair[1].mean)
     if not rows:
         return None
-    figure = Figure(figsize=(7.2, 1.1 + ROW_INCHES * len(rows)), layout="constrained")
+    lines = max(len(arm.variant.split()) for arm, _ in rows)
+    height = max(ROW_INCHES, LINE_INCHES * lines)
+    figure = Figure(figsize=(7.2, 1.25 + height * len(rows)), layout="constrained")
     axes = figure.add_subplot()
     axes.axvline(0, color="#444444", linewidth=0.9)
+    _write_columns(axes, len(rows) - 0.35, COLUMNS, "#444444")
     for row, (arm, difference) in enumerate(rows):
         noise = difference.deviation or 0.0
         color = SAME if abs(difference.mean) <= noise else BETTER if difference.mean > 0 else WORSE
         axes.barh(row, difference.mean, height=0.56, color=color, alpha=0.85, linewidth=0)
         if len(difference.by_seed) > 1:
-            axes.scatter(difference.by_seed, [row] * len(difference.by_seed), s=10, color="#222222", zorder=3)
-        axes.annotate(
-            f"{difference.mean:+.2f}     {arm.psnr:.2f} dB     {arm.gaussians:,.0f}",
-            xy=(1.02, row),
-            xycoords=("axes fraction", "data"),
-            va="center",
-            fontsize=8,
-            color=color,
-        )
+            axes.scatter(difference.by_seed, [row] * len(difference.by_seed), s=8, color="#222222", zorder=3)
+        texts = (f"{difference.mean:+.2f}", f"{arm.psnr:.2f}", f"{arm.gaussians:,.0f}")
+        _write_columns(axes, row, texts, color)
     axes.set_yticks(range(len(rows)), [arm.variant.replace(" ", "\n") for arm, _ in rows])
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
-    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.set_ylim(-0.6, len(rows) - 0.1)
     axes.margins(x=0.08)
-    axes.set_xlabel("held-out PSNR against the default's (dB)")
+    dots = "; dots: seeds" if len(default.runs) > 1 else ""
+    axes.set_xlabel(f"held-out PSNR against the default's (dB){dots}")
     axes.set_title(f"{_title(results, default.method)}\ndefault: {default.psnr:.2f} dB", loc="left")
     lay_grid(axes)
     axes.grid(visible=False, axis="y")
     return figure
+
+
+def _write_columns(axes: Axes, row: float, texts: Sequence[str], color: str) -> None:
+    for text, place in zip(texts, COLUMN_POINTS, strict=True):
+        axes.annotate(
+            text,
+            xy=(1, row),
+            xycoords=("axes fraction", "data"),
+            xytext=(place, 0),
+            textcoords="offset points",
+            ha="right",
+            va="center",
+            fontsize=8,
+            color=color,
+        )
 
 
 def _title(results: StudyResults, method: str | None = None) -> str:

@@ -107,9 +107,8 @@ class GaussiansStudy(Common):
 @dataclass(frozen=True, kw_only=True)
 class OptionsStudy(Common):
     """An ablation: the method as it is, and once more for each change of an option. Names are those of
-    `ns-train abcd --help` under --pipeline; a change of several options at once stands in quotes:
-
-    --vary training.warmup=0 training.batch=1 "partition=grid blocks=27" """
+    `ns-train abcd --help` under --pipeline; several options that change at
+    once stand in quotes, as in --vary training.warmup=0 "partition=grid blocks=27"."""
 
     vary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")]
     """Changes to try, a row for each; all are checked before the first run."""
@@ -142,7 +141,9 @@ def study(wanted: Annotated[Wanted, tyro.conf.arg(name="")]) -> int:
     that are finished, so that more seeds or more values may be added later.
 
     abcd study blocks --data scene --seconds 60 --out blocks
+
     abcd study gaussians --data scene --seconds 60 --out gaussians
+
     abcd study options --data scene --seconds 60 --vary training.warmup=0 training.batch=1 --out options
 
     Args:

@@ -81,10 +81,10 @@ def _of_blocks(results: StudyResults) -> tuple[str, ...]:
     gap = find_gap(results.arms)
     if gap is None:
         return ()
-    verdict = "no cliff" if gap.decibels <= GOAL_DB else "a cliff"
+    verdict = "within" if gap.decibels <= GOAL_DB else "above"
     return (
         f"Best: {_blocks(gap.best)}, {gap.best.psnr:.2f} dB. Worst: {_blocks(gap.worst)}, "
-        f"{gap.worst.psnr:.2f} dB. Gap: {gap.decibels:.2f} dB; {verdict} (the goal is {GOAL_DB:g} dB at most).",
+        f"{gap.worst.psnr:.2f} dB. Gap: {gap.decibels:.2f} dB, {verdict} the {GOAL_DB:g} dB of the goal.",
     )
 
 
@@ -97,8 +97,8 @@ def _of_gaussians(results: StudyResults) -> tuple[str, ...]:
             continue
         best = max(arms, key=lambda arm: arm.psnr)
         text = (
-            f"{method}: a limit of {knee.value:,} Gaussians is enough: {knee.psnr:.2f} dB, within {KNEE_DB:g} dB "
-            f"of the best measured ({best.psnr:.2f} dB, limit {best.value:,})."
+            f"{method}: a limit of {knee.value:,} Gaussians is enough: {knee.psnr:.2f} dB, within "
+            f"{KNEE_DB:g} dB of the best measured ({best.psnr:.2f} dB, limit {best.value:,})."
         )
         if knee.value == max(arm.value for arm in arms):
             text += " It is the largest that was tried: more may be better."

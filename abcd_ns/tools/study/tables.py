@@ -48,17 +48,16 @@ def rows(results: StudyResults) -> list[list[str]]:
 
 
 def notes(results: StudyResults) -> list[str]:
-    """What was found, then what a reader of the table has to know, a sentence each."""
+    """What a reader of the table has to know, a sentence each."""
     p = results.protocol
     conditions = [budget_of(p.seconds, p.steps) + " a run", seeds_in_words(p.seeds)]
     if len(results.methods) == 1:
         conditions.insert(0, results.methods[0])
-    if results.study != "blocks":
+    if results.study != "blocks" and set(results.methods) != {"abcd-monolithic"}:
         conditions.append(f"{p.blocks} blocks")
     if p.max_gaussians:
         conditions.append(f"at most {p.max_gaussians:,} Gaussians")
     found = [
-        *results.findings,
         f"Scene {p.scene} at 1/{p.downscale} of its size; held out: {p.held_out}; {', '.join(conditions)}.",
         about_machine(results.machine),
         "Evaluation, saving and compiling are left out of the training time.",
@@ -75,13 +74,14 @@ def notes(results: StudyResults) -> list[str]:
 
 
 def write_table(results: StudyResults, path: Path) -> None:
-    """The table as Markdown."""
-    path.write_text(markdown(rows(results), notes(results)), encoding="utf-8")
+    """What was found and the table, as Markdown."""
+    found = "".join(f"{finding}\n\n" for finding in results.findings)
+    path.write_text(found + markdown(rows(results), notes(results)), encoding="utf-8")
 
 
 def print_table(results: StudyResults, console: Console) -> None:
     """The table in the terminal."""
-    print_rows(rows(results), notes(results), console)
+    print_rows(rows(results), [*results.findings, *notes(results)], console)
 
 
 def _difference(arm: Arm, results: StudyResults) -> str:
