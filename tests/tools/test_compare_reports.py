@@ -15,8 +15,7 @@ from rich.console import Console
 from abcd_ns.tools.compare.charts import draw_size_accuracy, draw_speed_accuracy, mean_curve
 from abcd_ns.tools.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
 from abcd_ns.tools.compare.tables import notes, print_table, rows, write_table
-from abcd_ns.tools.runs.evaluate import evenly
-from abcd_ns.tools.runs.job import METHODS
+from abcd_ns.tools.runs.job import METHODS, evenly
 from abcd_ns.tools.runs.run import ViewScore
 from abcd_ns.tools.runs.style import COLORS, MARKERS, spread
 from abcd_ns.tools.runs.tables import MEASURES, cell

@@ -87,6 +87,21 @@ def test_differences_are_taken_seed_by_seed():
     assert find_difference(made_up_arm("x=1", None, {7: 20.0}), default) is None
 
 
+@pytest.mark.parametrize(
+    ("psnr", "begins"),
+    [
+        (21.0, "Best change: training.batch=1, +1.00 dB. One seed"),
+        (19.5, "No change is better than the default; nearest: training.batch=1, -0.50 dB."),
+    ],
+)
+def test_an_ablation_says_which_change_is_best(psnr, begins):
+    default, other = (
+        made_up_arm(n, None, {0: p}) for n, p in (("default", 20.0), ("training.batch=1", psnr))
+    )
+    (finding,) = made_up_study("options", default, other).findings
+    assert finding.startswith(begins)
+
+
 # Tables
 
 

@@ -123,12 +123,6 @@ def mean(values: Sequence[float | None]) -> float | None:
     return sum(values) / len(values)
 
 
-def evenly(count: int, wanted: int) -> tuple[int, ...]:
-    """`wanted` of the rows 0 .. count - 1, as far apart from each other as from both ends."""
-    wanted = min(count, wanted)
-    return tuple(int((k + 0.5) * count / wanted) for k in range(wanted))
-
-
 @contextmanager
 def undisturbed(pipeline: VanillaPipeline) -> Iterator[None]:
     """No gradients; training mode and torch's random numbers are afterwards as they were."""

@@ -116,3 +116,9 @@ class Plan(Protocol):
     @property
     def jobs(self) -> tuple[Job, ...]:
         """All runs, in the order in which they are made."""
+
+
+def evenly(count: int, wanted: int) -> tuple[int, ...]:
+    """`wanted` of the rows 0 .. count - 1, as far apart from each other as from both ends."""
+    wanted = min(count, wanted)
+    return tuple(int((k + 0.5) * count / wanted) for k in range(wanted))

@@ -22,13 +22,12 @@ from abcd_ns.plugin.pipeline import CACHE, STORE
 from abcd_ns.tools.runs.configs import trainer_config
 from abcd_ns.tools.runs.evaluate import (
     draw_held_out,
-    evenly,
     mean,
     ordering_gap,
     score,
     squared_gap,
 )
-from abcd_ns.tools.runs.job import Job
+from abcd_ns.tools.runs.job import Job, evenly
 from abcd_ns.tools.runs.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
 from abcd_ns.tools.runs.run import CurvePoint, Run, ViewScore

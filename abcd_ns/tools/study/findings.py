@@ -118,6 +118,8 @@ def _of_options(results: StudyResults) -> tuple[str, ...]:
         return ()
     best, worst = (pick(known, key=lambda pair: pair[1]) for pick in (max, min))
     text = f"Best change: {best[0].variant}, {best[1]:+.2f} dB."
+    if best[1] <= 0:
+        text = f"No change is better than the default; nearest: {best[0].variant}, {best[1]:+.2f} dB."
     if best[0] is not worst[0]:
         text += f" Worst: {worst[0].variant}, {worst[1]:+.2f} dB."
     if len(default.runs) < 2:
