@@ -22,6 +22,8 @@ from abcd_ns.tools.study.findings import (
 from abcd_ns.tools.study.results import Arm, StudyResults, average
 
 BAND = "#ececec"
+KNEE_LINE = 0.065
+"""Height of a line of text, as a share of the axis' height."""
 BETTER, WORSE, SAME = "#007A5A", "#D55E00", "#666666"
 ROW_INCHES, LINE_INCHES = 0.3, 0.17
 COLUMNS = ("change", "PSNR", "Gaussians")
@@ -187,6 +189,8 @@ def _draw_gaussians(results: StudyResults) -> Figure | None:
     # The largest limit stays in sight, unless growth ended far below it.
     reached, largest = (max(get(arm) for arm in results.arms) for get in (_end, _limit))
     axes.set_xlim(right=max(axes.get_xlim()[1], 1.1 * min(largest, 1.6 * reached)))
+    low, high = axes.get_ylim()
+    axes.set_ylim(low - KNEE_LINE * len(results.methods) * (high - low), high)  # room for the knees' names
     for row, method in enumerate(results.methods):
         _mark_knee(axes, results.of(method), row)
     counts = sorted({arm.value for arm in results.arms})
@@ -221,12 +225,14 @@ def _mark_knee(axes: Axes, arms: Sequence[Arm], row: int) -> None:
     axes.plot(knee.gaussians, knee.psnr, "o", markersize=12, markerfacecolor="none", markeredgecolor=color)
     axes.vlines(knee.gaussians, low, knee.psnr, color=color, linewidth=0.8, linestyle=(0, (3, 3)), zorder=1)
     axes.set_ylim(low, high)
+    far = axes.transAxes.inverted().transform(axes.transData.transform((knee.gaussians, low)))[0] > 0.8
     axes.annotate(
         f"knee {_short(knee.gaussians)}",
-        xy=(knee.gaussians, 0.02 + 0.07 * row),
+        xy=(knee.gaussians, 0.02 + KNEE_LINE * row),
         xycoords=("data", "axes fraction"),
-        xytext=(4, 0),
+        xytext=(-4 if far else 4, 0),
         textcoords="offset points",
+        ha="right" if far else "left",
         color=color,
         fontsize=8,
     )
@@ -254,6 +260,7 @@ def _draw_options(results: StudyResults) -> Figure | None:
     height = max(ROW_INCHES, LINE_INCHES * lines)
     figure = Figure(figsize=(7.2, 1.25 + height * len(rows)), layout="constrained")
     axes = figure.add_subplot()
+    axes.use_sticky_edges = False  # bars that end at 0 leave room beyond it
     axes.axvline(0, color="#444444", linewidth=0.9)
     _write_columns(axes, len(rows) - 0.35, COLUMNS, "#444444")
     for row, (arm, difference) in enumerate(rows):
