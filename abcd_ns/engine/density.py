@@ -58,7 +58,8 @@ class DensityConfig:
     use_absgrad: bool = True
     """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum."""
     max_gaussians: int = 0
-    """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000)."""
+    """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
+    to begin with, a random choice of them begins."""
     noise_lr: float = 5e5
     """Strength of the exploration noise of `mcmc`."""
     opacity_reg: float = 0.01

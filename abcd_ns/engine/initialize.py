@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -49,6 +50,29 @@ def gaussians_from_points(
 def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     """The mean distance of each point to its three nearest others; never 0."""
     return torch.from_numpy(_neighbour_distance(points.double().numpy())).to(points.dtype)
+
+
+def split_off(gaussians: Gaussians, keep: int, seed: int) -> tuple[Gaussians, Gaussians]:
+    """A random `keep` of freshly initialised Gaussians, widened to fill the gaps, and the others."""
+    order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(seed))
+    chosen, others = gaussians[order[:keep].sort().values], gaussians[order[keep:].sort().values]
+    wide = torch.maximum(chosen.scales, spacing(chosen.means).log()[:, None])
+    return replace(chosen, scales=wide), others
+
+
+def thin_out(gaussians: Gaussians, limit: int | None, seed: int) -> Gaussians:
+    """Freshly initialised Gaussians, no more than `limit`: all of them, or a random choice, widened to fill
+    the gaps, so that a scene with fewer Gaussians than points is covered all the same.
+
+    Density control never adds above the limit, but it removes only what is faint or huge.
+
+    Args:
+        limit: None for no limit.
+        seed: the same one makes the same choice.
+    """
+    if limit is None or len(gaussians) <= limit:
+        return gaussians
+    return split_off(gaussians, limit, seed)[0]
 
 
 def random_points(count: int, extent: float, seed: int = 0) -> tuple[Tensor, Tensor]:

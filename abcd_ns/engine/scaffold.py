@@ -14,7 +14,7 @@ from torch import Tensor
 
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.initialize import spacing
+from abcd_ns.engine.initialize import split_off
 from abcd_ns.engine.types import Gaussians
 
 WHOLE = -1
@@ -28,14 +28,6 @@ REVEALED_SCALE = 0.5
 def reserve_of(tree: BlockTree) -> int:
     """Under which number the store keeps the Gaussians that wait: the first that is no block's."""
     return tree.num_blocks
-
-
-def split_off_reserve(gaussians: Gaussians, keep: int, seed: int) -> tuple[Gaussians, Gaussians]:
-    """A random `keep` of freshly initialised Gaussians, widened to fill the gaps, and the others."""
-    order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(seed))
-    chosen, waiting = gaussians[order[:keep].sort().values], gaussians[order[keep:].sort().values]
-    wide = torch.maximum(chosen.scales, spacing(chosen.means).log()[:, None])
-    return replace(chosen, scales=wide), waiting
 
 
 def revealed(waiting: BlockState) -> BlockState:
@@ -72,6 +64,6 @@ def blocks_at_rest(
         at_rest = part(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
         return {b: at_rest.get(b, nobody).to_tensors() for b in range(tree.num_blocks)}
-    scaffold, waiting = split_off_reserve(gaussians, keep, seed)
+    scaffold, waiting = split_off(gaussians, keep, seed)
     reserve = BlockState.fresh(waiting).to_tensors()
     return {**blocks_at_rest(tree, scaffold), reserve_of(tree): reserve}

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.initialize import thin_out
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
@@ -113,10 +115,16 @@ class AbcdPipeline(VanillaPipeline):
             with ParameterStore.open(source, pin, read_only=True) as old:
                 old.clone_to(folder, pin)
             return ParameterStore.open(folder), True
-        gaussians = self.model.initial
+        training = self.config.training
+        gaussians = thin_out(self.model.initial, training.density.limit, training.seed)
+        if len(gaussians) < len(self.model.initial):
+            CONSOLE.print(
+                f"Training begins with {len(gaussians):,} of {len(self.model.initial):,} points, the limit "
+                "on Gaussians.",
+                highlight=False,
+            )
         tree = cut_space(gaussians, self.config.blocks, self.config.partition)
         store = ParameterStore.create(folder, {"tree": tree.to_json()})
-        training = self.config.training
         largest = -(-len(gaussians) // tree.num_blocks)
         keep = largest if training.warmup > 0 and tree.num_blocks > 1 else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))

@@ -41,6 +41,11 @@ COMMANDS = (
         "abcd_ns.tools.compare.command:compare",
         "train ABCD and its peers on one scene and compare",
     ),
+    Command(
+        "study",
+        "abcd_ns.tools.study.command:study",
+        "vary one thing: blocks, Gaussians, or any options",
+    ),
 )
 
 EXAMPLES = (

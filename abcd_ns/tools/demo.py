@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.compare.pictures import draw_comparison, evenly, read_picture
+from abcd_ns.tools.compare.pictures import draw_comparison, read_picture
+from abcd_ns.tools.runs.job import evenly
 
 SCENE = {"courts": 2, "views_per_court": 20, "width": 192, "height": 144, "points_per_court": 3000}
 MARKER = "abcd-demo.txt"

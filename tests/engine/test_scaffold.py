@@ -6,8 +6,9 @@ import torch
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.initialize import split_off
 from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.scaffold import REVEALED_OPACITY, blocks_at_rest, reserve_of, split_off_reserve
+from abcd_ns.engine.scaffold import REVEALED_OPACITY, blocks_at_rest, reserve_of
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import make_coordinator, whole_scene
@@ -20,7 +21,7 @@ def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
 
 
 def test_scaffold_and_reserve_are_all_there_is(start):
-    scaffold, waiting = split_off_reserve(start, 30, seed=3)
+    scaffold, waiting = split_off(start, 30, seed=3)
     assert len(scaffold) == 30
     assert rows(scaffold) | rows(waiting) == rows(start)
     assert not rows(scaffold) & rows(waiting)

@@ -152,6 +152,17 @@ def test_while_training_only_the_live_block_is_registered(data, tmp_path):
     assert 0 < max(sizes) < 300
 
 
+@pytest.mark.parametrize(
+    "method", [methods.abcd, methods.abcd_monolithic], ids=lambda m: m.config.method_name
+)
+def test_a_limit_below_the_number_of_points_is_kept_from_the_start(data, tmp_path, method, capsys):
+    config = configure(data, tmp_path, method, steps=8)
+    config.pipeline.training.density.max_gaussians = 100
+    trainer = run(config)
+    assert trainer.pipeline.coordinator.count() == 100
+    assert "Training begins with 100 of 300 points" in capsys.readouterr().out
+
+
 def test_seconds_end_a_run(data, tmp_path):
     config = configure(data, tmp_path, steps=100_000)
     config.pipeline.max_seconds = 2.0

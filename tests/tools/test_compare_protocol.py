@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.compare.protocol import METHODS, Options, Settings, make_plan, read_options
+from abcd_ns.tools.compare.protocol import Options, make_plan, read_options
+from abcd_ns.tools.runs.job import METHODS, Settings
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("compare-*.toml"))
 

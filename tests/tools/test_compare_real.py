@@ -63,6 +63,8 @@ def test_curves_rise_in_time_to_the_final_score(compared):
         assert steps == sorted(set(steps))
         assert run.curve[-1].psnr == run.psnr_merged
         assert (seconds[-1], steps[-1]) == (run.train_seconds, STEPS)
+        assert run.curve[-1].gaussians == run.gaussians
+        assert all(point.gaussians > 0 for point in run.curve)
         for share, point in zip(plan.settings.moments, run.curve, strict=True):
             assert point.steps == int(np.ceil(share * STEPS))
 
@@ -86,7 +88,7 @@ def test_reports_are_there_and_a_second_call_trains_nothing(compared):
     results, plan, _ = compared
     pictures = [path.name for path in (plan.out / "pictures").iterdir()]
     assert pictures == ["view-0001.png"]
-    for name in ("table.md", "speed_accuracy.png", "speed_accuracy.svg"):
+    for name in ("table.md", "speed_accuracy.png", "speed_accuracy.svg", "size_accuracy.png"):
         assert (plan.out / name).stat().st_size > 0
     stream = StringIO()
     assert carry_out(plan, Console(file=stream, width=100)) == 0

@@ -1,5 +1,6 @@
 """Chart, table and pictures, from made-up runs."""
 
+import dataclasses
 import re
 import xml.etree.ElementTree as ET
 from io import StringIO
@@ -11,17 +12,13 @@ from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from abcd_ns.tools.compare.charts import COLORS, MARKERS, draw_speed_accuracy, mean_curve, spread
-from abcd_ns.tools.compare.pictures import (
-    draw_comparison,
-    draw_pictures,
-    error_map,
-    evenly,
-    psnr_of,
-)
-from abcd_ns.tools.compare.protocol import METHODS
-from abcd_ns.tools.compare.results import ViewScore
-from abcd_ns.tools.compare.tables import MEASURES, cell, notes, print_table, rows, write_table
+from abcd_ns.tools.compare.charts import draw_size_accuracy, draw_speed_accuracy, mean_curve
+from abcd_ns.tools.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
+from abcd_ns.tools.compare.tables import notes, print_table, rows, write_table
+from abcd_ns.tools.runs.job import METHODS, evenly
+from abcd_ns.tools.runs.run import ViewScore
+from abcd_ns.tools.runs.style import COLORS, MARKERS, spread
+from abcd_ns.tools.runs.tables import MEASURES, cell
 from tests.tools.compare_records import made_up_results, made_up_run
 
 
@@ -63,6 +60,28 @@ def test_chart_is_the_same_file_every_time(tmp_path):
 def test_no_run_no_chart(tmp_path):
     assert draw_speed_accuracy(made_up_results(), tmp_path) == []
     assert list(tmp_path.iterdir()) == []
+
+
+def counted(*counts: int, **fields):
+    """A run whose curve holds these numbers of Gaussians."""
+    base = made_up_run(**fields)
+    curve = base.curve[: len(counts)]
+    points = [dataclasses.replace(p, gaussians=n) for p, n in zip(curve, counts, strict=True)]
+    return dataclasses.replace(base, curve=tuple(points))
+
+
+def test_the_way_through_numbers_of_gaussians_has_a_chart(tmp_path):
+    results = made_up_results(counted(100, 900, 2000), counted(100, 500, 800, method="abcd-monolithic"))
+    paths = draw_size_accuracy(results, tmp_path)
+    assert [path.name for path in paths] == ["size_accuracy.png", "size_accuracy.svg"]
+    texts = svg_texts(paths[1])
+    assert {"held-out PSNR (dB)", "2,000"} <= set(texts)
+    assert any(text.startswith("Gaussians in the scene") for text in texts)
+
+
+def test_runs_that_counted_no_gaussians_have_no_such_chart(tmp_path):
+    assert draw_size_accuracy(made_up_results(counted(1, 2), made_up_run()), tmp_path) == []
+    assert draw_size_accuracy(made_up_results(), tmp_path) == []
 
 
 def test_mean_curve_is_the_mean_of_seeds_and_keeps_every_end():

@@ -5,75 +5,27 @@ The worker here is a script that makes runs up; tests/tools/test_compare_real.py
 
 import dataclasses
 import json
-import sys
 from io import StringIO
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.compare import runner
 from abcd_ns.tools.compare.command import carry_out, without_impossible
 from abcd_ns.tools.compare.protocol import Options, Plan, make_plan
-from abcd_ns.tools.compare.records import encode
-from abcd_ns.tools.compare.results import Failure, Run, read_results
-from abcd_ns.tools.compare.runner import claim, last_line, run_jobs
-from tests.tools.compare_records import MACHINE, made_up_run
-
-WORKER = """
-import json, os, pathlib, sys
-path = pathlib.Path(sys.argv[1])
-job = json.loads(path.read_text())
-calls = pathlib.Path(__file__).with_name("calls.txt")
-calls.write_text((calls.read_text() if calls.exists() else "") + job["method"] + "\\n")
-print("starting")
-behaviours = json.loads(pathlib.Path(__file__).with_name("behaviour.json").read_text())
-behaviour = behaviours.get(job["method"])
-if behaviour == "raises":
-    print()
-    sys.exit("ValueError: the scene is empty\\n")
-if behaviour == "is killed":
-    os.kill(os.getpid(), 9)
-if behaviour == "is silent":
-    sys.exit(0)
-run = json.loads(pathlib.Path(__file__).with_name("run.json").read_text())
-run.update(method=job["method"], seed=job["seed"])
-path.with_name("run.json").write_text(json.dumps(run))
-"""
-
-
-class FakeWorker:
-    """A worker process that trains nothing and does what it is told."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        folder.mkdir()
-        (folder / "worker.py").write_text(WORKER)
-        (folder / "run.json").write_text(json.dumps(encode(made_up_run())))
-        self.behave()
-
-    def behave(self, **by_method: str) -> None:
-        named = {name.replace("_", "-"): what for name, what in by_method.items()}
-        (self.folder / "behaviour.json").write_text(json.dumps(named))
-
-    @property
-    def command(self) -> tuple[str, ...]:
-        return (sys.executable, str(self.folder / "worker.py"))
-
-    def calls(self) -> list[str]:
-        """The methods it was started for since the last call of this."""
-        path = self.folder / "calls.txt"
-        found = path.read_text().split() if path.exists() else []
-        path.unlink(missing_ok=True)
-        return found
+from abcd_ns.tools.compare.results import read_results
+from abcd_ns.tools.runs import runner
+from abcd_ns.tools.runs.records import encode
+from abcd_ns.tools.runs.run import Failure, Run
+from abcd_ns.tools.runs.runner import claim, last_line, run_jobs
+from tests.tools.compare_records import MACHINE
+from tests.tools.fake_worker import FakeWorker
 
 
 @pytest.fixture
 def worker(tmp_path, monkeypatch) -> FakeWorker:
-    fake = FakeWorker(tmp_path / "worker")
     monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
-    return fake
+    return FakeWorker(tmp_path / "worker")
 
 
 @pytest.fixture

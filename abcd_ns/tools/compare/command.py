@@ -8,13 +8,15 @@ import torch
 import tyro
 from rich.console import Console
 
-from abcd_ns.tools.compare.charts import draw_speed_accuracy
-from abcd_ns.tools.compare.machine import describe_machine, describe_versions
+from abcd_ns.tools.compare.charts import draw_size_accuracy, draw_speed_accuracy
 from abcd_ns.tools.compare.pictures import draw_pictures
-from abcd_ns.tools.compare.protocol import HELD_OUT_EVERY, Job, Method, Options, Plan, make_plan, read_options
-from abcd_ns.tools.compare.results import SCHEMA, Failure, LeftOut, Protocol, Results, Run, write_results
-from abcd_ns.tools.compare.runner import claim, run_jobs
+from abcd_ns.tools.compare.protocol import Options, Plan, make_plan, read_options
+from abcd_ns.tools.compare.results import SCHEMA, LeftOut, Protocol, Results, write_results
 from abcd_ns.tools.compare.tables import print_table, write_table
+from abcd_ns.tools.runs.job import HELD_OUT_EVERY, Job, Method
+from abcd_ns.tools.runs.machine import describe_machine, describe_versions
+from abcd_ns.tools.runs.run import Failure, Run
+from abcd_ns.tools.runs.runner import claim, run_jobs
 
 RESULTS_FILE, TABLE_FILE, PICTURES = "results.json", "table.md", "pictures"
 
@@ -46,9 +48,10 @@ def compare(
 ) -> int:
     """Train several methods on one scene under one protocol, and write what came of it.
 
-    Each run has a process of its own, one after the other. OUT gets results.json, table.md, a chart of
-    accuracy over training time (speed_accuracy.png and .svg) and pictures of held-out views. Called again
-    with the same OUT, it reuses the runs that are finished.
+    Each run has a process of its own, one after the other. OUT gets results.json, table.md, charts of
+    accuracy over training time (speed_accuracy.png and .svg) and over the number of Gaussians
+    (size_accuracy), and pictures of held-out views. Called again with the same OUT, it reuses the runs that
+    are finished.
 
     Args:
         data: The scene: a folder with a COLMAP model or transforms.json, as for `ns-train abcd --data`.
@@ -156,6 +159,7 @@ def report(results: Results, plan: Plan, console: Console) -> None:
         out / RESULTS_FILE,
         out / TABLE_FILE,
         *draw_speed_accuracy(results, out),
+        *draw_size_accuracy(results, out),
         *draw_pictures(_first_runs(results, plan), out / PICTURES),
     ]
     if results.runs:

@@ -12,8 +12,8 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from PIL import Image
 
-from abcd_ns.tools.compare.charts import STYLE
-from abcd_ns.tools.compare.results import Run
+from abcd_ns.tools.runs.run import Run
+from abcd_ns.tools.runs.style import STYLE
 
 ERROR_GAIN = 4
 """By how much errors are amplified; 1 / ERROR_GAIN is the largest that can be told from larger ones."""
@@ -37,12 +37,6 @@ def psnr_of(picture: PictureArray, photo: PictureArray) -> float:
     """Of 8-bit pictures, dB; infinite where both are equal."""
     squared = np.mean((picture.astype(np.float64) - photo.astype(np.float64)) ** 2) / 255**2
     return float("inf") if squared == 0 else float(-10 * np.log10(squared))
-
-
-def evenly(count: int, wanted: int) -> tuple[int, ...]:
-    """`wanted` of the rows 0 .. count - 1, as far apart from each other as from both ends."""
-    wanted = min(count, wanted)
-    return tuple(int((k + 0.5) * count / wanted) for k in range(wanted))
 
 
 def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], title: str, path: Path) -> None:

@@ -5,21 +5,16 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.compare.records import decode
+from abcd_ns.tools.runs.checks import LOWEST, check_budget, check_numbers, check_places, check_ranges
+from abcd_ns.tools.runs.job import METHODS, Job, Settings
+from abcd_ns.tools.runs.records import decode
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
-
-Method = Literal["abcd-monolithic", "abcd", "abcd-ablated", "splatfacto"]
-METHODS: tuple[str, ...] = get_args(Method)
-"""In the order in which tables and charts show them."""
-HELD_OUT_EVERY = 8
-"""Views 0, 8, 16, ... of the list sorted by name are never trained on, as in the papers of the field."""
 
 
 @dataclass(frozen=True)
@@ -64,55 +59,6 @@ def read_options(path: Path) -> Options:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What all runs of a comparison share; runs that differ in any of these are not comparable."""
-
-    data: str
-    """The scene, as an absolute path."""
-    downscale: int
-    blocks: int
-    seconds: float | None
-    """Of training; None where the budget is in steps."""
-    steps: int | None
-    evals: int
-    """Points of the curve of held-out PSNR over training time, the end included."""
-    max_gaussians: int
-    """In the whole scene; 0 means no limit."""
-    densify: bool
-    pictures: int
-    """Held-out views that are shown."""
-
-    @property
-    def scene(self) -> str:
-        """The name of the scene: its folder's."""
-        path = Path(self.data)
-        return path.parent.name if path.suffix == ".json" else path.name
-
-    @property
-    def moments(self) -> tuple[float, ...]:
-        """Shares of the run, up to 1, at which held-out views are drawn; denser where quality rises fast."""
-        return tuple((k / self.evals) ** 2 for k in range(1, self.evals + 1))
-
-
-@dataclass(frozen=True)
-class Job:
-    """One run: what a worker process is given."""
-
-    method: str
-    seed: int
-    settings: Settings
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return f"{self.method}, seed {self.seed}"
-
-    def folder(self, out: Path) -> Path:
-        """Where the run is kept; nerfstudio's layout of output_dir/experiment/method/timestamp."""
-        return out / "runs" / self.method / f"seed-{self.seed}"
-
-
-@dataclass(frozen=True)
 class Plan:
     """All runs of a comparison."""
 
@@ -120,6 +66,7 @@ class Plan:
     methods: tuple[str, ...]
     seeds: tuple[int, ...]
     out: Path
+    kind = "comparison"
 
     @property
     def jobs(self) -> tuple[Job, ...]:
@@ -148,15 +95,9 @@ def make_plan(options: Options) -> Plan:
         methods=METHODS[:3], seeds=(0,), downscale=1, blocks=8, evals=8, max_gaussians=0, pictures=3
     )
     given = options.over(defaults)
-    if given.data is None:
-        raise UserError("Give the scene to compare on with --data FOLDER.")
-    if given.out is None:
-        raise UserError("Give the folder for the results with --out FOLDER.")
-    if (given.seconds is None) == (given.steps is None):
-        raise UserError("Give each run's budget: either --seconds or --steps.")
-    if not Path(given.data).exists():
-        raise UserError(f"--data {given.data} does not exist.")
-    _check_ranges(given)
+    check_places(given.data, given.out)
+    check_budget(given.seconds, given.steps)
+    check_ranges({name: getattr(given, name) for name in LOWEST})
     _check_lists(given)
     settings = Settings(
         data=str(Path(given.data).resolve()),
@@ -170,21 +111,10 @@ def make_plan(options: Options) -> Plan:
     return Plan(settings, methods, given.seeds, Path(given.out))
 
 
-def _check_ranges(given: Options) -> None:
-    lowest = {"downscale": 1, "blocks": 1, "steps": 1, "evals": 1, "max_gaussians": 0, "pictures": 0}
-    for name, low in lowest.items():
-        value = getattr(given, name)
-        if value is not None and value < low:
-            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}.")
-    if given.seconds is not None and not 0 < given.seconds < float("inf"):
-        raise UserError(f"--seconds is {given.seconds}; it must be above 0.")
-
-
 def _check_lists(given: Options) -> None:
     for method in given.methods:
         if method not in METHODS:
             raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
     if not given.methods or not given.seeds:
         raise UserError("Give at least one of --methods and one of --seeds.")
-    if len(set(given.seeds)) < len(given.seeds) or min(given.seeds) < 0:
-        raise UserError(f"--seeds {' '.join(map(str, given.seeds))}: give different numbers from 0 up.")
+    check_numbers("--seeds", given.seeds, 0)

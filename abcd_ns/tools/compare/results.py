@@ -3,83 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from abcd_ns.tools.compare.machine import Machine, Versions
-from abcd_ns.tools.compare.records import RecordError, decode, encode, read_json, write_json
+from abcd_ns.tools.runs.machine import Machine, Versions
+from abcd_ns.tools.runs.records import RecordError, decode, encode, read_json, write_json
+from abcd_ns.tools.runs.run import Failure, Run
 
 SCHEMA = 1
 """Raised whenever a field changes its name or meaning."""
-
-
-@dataclass(frozen=True)
-class CurvePoint:
-    """Where a run stood at one moment."""
-
-    seconds: float
-    """Of training; evaluation does not count."""
-    steps: int
-    psnr: float
-    """Mean over the held-out views, merged, dB."""
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """One held-out view after training."""
-
-    row: int
-    """In the list of held-out views."""
-    name: str
-    """The photo's file name."""
-    psnr: float
-    ssim: float | None
-    """None where the picture is smaller than SSIM's window."""
-    lpips: float | None
-    psnr_merged: float
-    ssim_merged: float | None
-
-
-@dataclass(frozen=True)
-class Run:
-    """One method on the scene, once. Scores are means over the held-out views."""
-
-    method: str
-    scene: str
-    seed: int
-    blocks: int
-    steps: int
-    train_seconds: float
-    """Of training, drawing layers included; evaluation, saving and warm-up not."""
-    total_seconds: float
-    """Of the process, from its start to the end of saving; evaluation not."""
-    psnr: float
-    """Composited, dB. Likewise `ssim` and `lpips`."""
-    ssim: float | None
-    lpips: float | None
-    lpips_reason: str | None
-    """Why `lpips` is None."""
-    psnr_merged: float
-    """All Gaussians drawn at once, as every viewer does, dB. Likewise `ssim_merged`."""
-    ssim_merged: float | None
-    ordering_gap_db: float | None
-    """PSNR of the merged against the composited pictures, from the mean of the views' squared errors."""
-    ordering_gap_note: str | None
-    """Why `ordering_gap_db` is None."""
-    gaussians: int
-    peak_device_bytes: int | None
-    """The most that torch held on the GPU until the end of training."""
-    peak_device_note: str | None
-    """Why `peak_device_bytes` is None."""
-    peak_rss_bytes: int
-    """The most RAM that the process held until the end of training, the curve's evaluations included."""
-    store_bytes: int
-    """On disk: the blocks at rest, with their optimiser state."""
-    cache_bytes: int
-    """On disk: cached layers."""
-    layer_seconds: float
-    """Training time that went into drawing layers."""
-    curve: tuple[CurvePoint, ...]
-    views: tuple[ViewScore, ...]
-    versions: Versions
-    """Of the run itself, which may be older than the file it is listed in."""
 
 
 @dataclass(frozen=True)
@@ -101,18 +30,6 @@ class Protocol:
     date: str
     """When the comparison was finished: ISO 8601, UTC."""
     command: str
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A run that came to nothing."""
-
-    method: str
-    seed: int
-    reason: str
-    """The last line of its log."""
-    log: str
-    """Its log, relative to the results' folder."""
 
 
 @dataclass(frozen=True)

@@ -1,70 +1,19 @@
 """The comparison as a table: a row per measure, a column per method."""
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from rich import box
 from rich.console import Console
-from rich.measure import Measurement
-from rich.table import Table
 
-from abcd_ns.tools.compare.results import Results, Run
-
-NOTHING = "-"
-"""Stands where there is no value."""
-Value = Callable[[Run], float | None]
-
-
-@dataclass(frozen=True)
-class Measure:
-    """One row."""
-
-    title: str
-    """With its unit."""
-    value: Value
-    digits: int
-
-
-def _in(unit: int, get: Value) -> Value:
-    return lambda run: None if (size := get(run)) is None else size / unit
-
-
-MIB, GIB = 2**20, 2**30
-
-
-MEASURES = (
-    Measure("PSNR, composited (dB)", lambda run: run.psnr, 2),
-    Measure("SSIM, composited", lambda run: run.ssim, 3),
-    Measure("LPIPS, composited", lambda run: run.lpips, 3),
-    Measure("PSNR, merged (dB)", lambda run: run.psnr_merged, 2),
-    Measure("SSIM, merged", lambda run: run.ssim_merged, 3),
-    Measure("ordering gap (dB)", lambda run: run.ordering_gap_db, 1),
-    Measure("Gaussians", lambda run: run.gaussians, 0),
-    Measure("blocks", lambda run: run.blocks, 0),
-    Measure("steps", lambda run: run.steps, 0),
-    Measure("training (s)", lambda run: run.train_seconds, 1),
-    Measure("of it, layers (s)", lambda run: run.layer_seconds, 1),
-    Measure("whole process (s)", lambda run: run.total_seconds, 1),
-    Measure("peak GPU memory (GiB)", _in(GIB, lambda run: run.peak_device_bytes), 2),
-    Measure("peak RAM (GiB)", _in(GIB, lambda run: run.peak_rss_bytes), 2),
-    Measure("blocks on disk (MiB)", _in(MIB, lambda run: run.store_bytes), 1),
-    Measure("layers on disk (MiB)", _in(MIB, lambda run: run.cache_bytes), 1),
+from abcd_ns.tools.compare.results import Results
+from abcd_ns.tools.runs.tables import (
+    MEASURES,
+    about_machine,
+    budget_of,
+    cell,
+    markdown,
+    print_rows,
+    seeds_in_words,
 )
-
-
-def cell(runs: Sequence[Run], measure: Measure) -> str:
-    """The measure of a method's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
-    values = [measure.value(run) for run in runs]
-    if not values or any(value is None for value in values):
-        return NOTHING
-    mean = sum(values) / len(values)
-    text = f"{mean:,.{measure.digits}f}"
-    if len(values) == 1:
-        return text
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
-    return f"{text} ± {deviation:,.{measure.digits}f}"
 
 
 def rows(results: Results) -> list[list[str]]:
@@ -75,16 +24,14 @@ def rows(results: Results) -> list[list[str]]:
 
 def notes(results: Results) -> list[str]:
     """What a reader of the table has to know, a sentence each."""
-    p, machine = results.protocol, results.machine
-    budget = f"{p.steps:,} steps" if p.seconds is None else f"{p.seconds:g} s of training"
-    seeds = ("seed " if len(p.seeds) == 1 else "seeds ") + ", ".join(map(str, p.seeds))
+    p = results.protocol
+    budget, seeds = budget_of(p.seconds, p.steps), seeds_in_words(p.seeds)
     growth = "the number of Gaussians fixed" if not p.densify else ""
     limit = f"at most {p.max_gaussians:,} Gaussians" if p.max_gaussians else ""
     conditions = ", ".join(filter(None, [f"{budget} a run", seeds, growth, limit]))
     found = [
         f"Scene {p.scene} at 1/{p.downscale} of its size; held out: {p.held_out}; {conditions}.",
-        f"{machine.cpu}, {machine.cores} cores, {machine.torch_threads} torch threads, "
-        f"{machine.ram_bytes / 2**30:.0f} GiB RAM, {machine.gpu or 'no GPU'}, {machine.os}.",
+        about_machine(results.machine),
         "Evaluation, saving and compiling are left out of the training time.",
     ]
     reasons = {}
@@ -100,27 +47,9 @@ def notes(results: Results) -> list[str]:
 
 def write_table(results: Results, path: Path) -> None:
     """The table as Markdown."""
-    titles, *body = rows(results)
-    lines = ["| " + " | ".join(row) + " |" for row in body]
-    head = "| " + " | ".join(titles) + " |"
-    rule = "| --- |" + " ---: |" * (len(titles) - 1)
-    text = "\n".join([head, rule, *lines, "", *(f"- {note}" for note in notes(results)), ""])
-    path.write_text(text, encoding="utf-8")
+    path.write_text(markdown(rows(results), notes(results)), encoding="utf-8")
 
 
 def print_table(results: Results, console: Console) -> None:
     """The table in the terminal."""
-    titles, *body = rows(results)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for i, title in enumerate(titles):
-        table.add_column(title, justify="right" if i else "left", no_wrap=True)
-    for row in body:
-        table.add_row(*row)
-    width = console.width
-    # Wider than a narrow terminal rather than with numbers cut off.
-    needed = Measurement.get(console, console.options.update(width=1000), table).maximum
-    console.width = max(width, needed)
-    console.print(table)
-    console.width = width
-    for note in notes(results):
-        console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
+    print_rows(rows(results), notes(results), console)

@@ -13,15 +13,13 @@ from pathlib import Path
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.compare.machine import Machine
-from abcd_ns.tools.compare.protocol import Job, Plan, Settings
-from abcd_ns.tools.compare.records import RecordError, decode, encode, read_json, write_json
-from abcd_ns.tools.compare.results import Failure, Run
+from abcd_ns.tools.runs.job import Job, Plan, Settings
+from abcd_ns.tools.runs.machine import Machine
+from abcd_ns.tools.runs.records import RecordError, decode, encode, read_json, write_json
+from abcd_ns.tools.runs.run import Failure, Run
 
 JOB_FILE, RUN_FILE, LOG_FILE = "job.json", "run.json", "log.txt"
-CLAIM_FILE = "comparison.json"
-"""Marks a folder of results and holds what all its runs share."""
-WORKER = (sys.executable, "-m", "abcd_ns.tools.compare.worker")
+WORKER = (sys.executable, "-m", "abcd_ns.tools.runs.worker")
 POLL_SECONDS = 0.2
 SECONDS_BETWEEN_LINES = 30.0
 """Where the output is no terminal, a line says this often that a run is still going on."""
@@ -35,8 +33,13 @@ class Claim:
     machine: Machine
 
 
+def claim_file(kind: str) -> str:
+    """The file that marks a folder of such results and holds what all its runs share."""
+    return f"{kind.replace(' ', '-')}.json"
+
+
 def claim(out: Path, plan: Plan, machine: Machine, overwrite: bool) -> None:
-    """Make `out` the folder of this comparison.
+    """Make `out` the folder of this plan's runs.
 
     Args:
         overwrite: drop the runs that are there.
@@ -47,10 +50,10 @@ def claim(out: Path, plan: Plan, machine: Machine, overwrite: bool) -> None:
     mine = Claim(plan.settings, machine)
     if out.exists() and not out.is_dir():
         raise UserError(f"--out {out} is a file; name a folder.")
-    path = out / CLAIM_FILE
+    path = out / claim_file(plan.kind)
     if not path.exists():
         if out.is_dir() and any(out.iterdir()):
-            raise UserError(f"--out {out} is not empty and holds no comparison; name another folder.")
+            raise UserError(f"--out {out} is not empty and holds no {plan.kind}; name another folder.")
         out.mkdir(parents=True, exist_ok=True)
     elif overwrite:
         shutil.rmtree(out / "runs", ignore_errors=True)
@@ -125,7 +128,8 @@ def run_job(
                 process.terminate()
                 process.wait()
     run = finished_run(job, out) if process.returncode == 0 else None
-    return run or Failure(job.method, job.seed, _reason(process.returncode, log), str(log.relative_to(out)))
+    reason = _reason(process.returncode, log)
+    return run or Failure(job.method, job.seed, reason, str(log.relative_to(out)), job.variant.name)
 
 
 def last_line(log: Path) -> str:

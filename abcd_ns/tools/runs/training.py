@@ -8,9 +8,9 @@ from nerfstudio.engine.trainer import Trainer
 
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
 from abcd_ns.engine.run_state import Budget, Stopwatch
-from abcd_ns.tools.compare.evaluate import mean_psnr
-from abcd_ns.tools.compare.protocol import Settings
-from abcd_ns.tools.compare.results import CurvePoint
+from abcd_ns.tools.runs.evaluate import mean_psnr
+from abcd_ns.tools.runs.job import Settings
+from abcd_ns.tools.runs.run import CurvePoint
 
 
 class CurveRecorder:
@@ -21,6 +21,7 @@ class CurveRecorder:
         progress: the share of the run that is done.
         steps: optimisation steps taken.
         measure: the score, dB.
+        count: Gaussians that are drawn.
     """
 
     def __init__(
@@ -30,12 +31,14 @@ class CurveRecorder:
         progress: Callable[[], float],
         steps: Callable[[], int],
         measure: Callable[[], float],
+        count: Callable[[], int],
     ) -> None:
         self.points: list[CurvePoint] = []
         self.seconds = 0.0
         """Spent on evaluation."""
         self._left = [moment for moment in moments if moment < 1]
-        self._stopwatch, self._progress, self._steps, self._measure = stopwatch, progress, steps, measure
+        self._stopwatch, self._progress, self._steps = stopwatch, progress, steps
+        self._measure, self._count = measure, count
 
     def look(self) -> None:
         """Call after every step."""
@@ -45,7 +48,8 @@ class CurveRecorder:
         self._left = [moment for moment in self._left if moment > progress]
         self._stopwatch.pause()
         began = time.perf_counter()
-        self.points.append(CurvePoint(self._stopwatch.seconds, self._steps(), self._measure()))
+        seconds, steps = self._stopwatch.seconds, self._steps()
+        self.points.append(CurvePoint(seconds, steps, self._measure(), self._count()))
         self.seconds += time.perf_counter() - began
         self._stopwatch.start()
 
@@ -71,6 +75,7 @@ class Training:
             lambda: coordinator.progress,
             lambda: coordinator.state.step,
             lambda: mean_psnr(self.pipeline),
+            lambda: self.gaussians,
         )
 
         def listen(event: Event) -> None:
@@ -95,6 +100,7 @@ class Training:
             progress,
             lambda: trainer.step + 1,
             lambda: mean_psnr(self.pipeline),
+            lambda: self.gaussians,
         )
 
         def begin_step(step: int) -> None:  # noqa: ARG001 - nerfstudio passes it

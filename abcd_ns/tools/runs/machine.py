@@ -1,4 +1,4 @@
-"""On what a comparison ran: hardware and versions."""
+"""On what runs were made: hardware and versions."""
 
 import os
 import platform

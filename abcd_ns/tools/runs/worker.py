@@ -1,4 +1,4 @@
-"""One run in a process of its own: `python -m abcd_ns.tools.compare.worker JOB.json`.
+"""One run in a process of its own: `python -m abcd_ns.tools.runs.worker JOB.json`.
 
 Reads a job, trains as `ns-train` does, and writes run.json and pictures beside the job. Whatever it prints is
 the run's log; its last line tells what went wrong.
@@ -19,20 +19,19 @@ from abcd_ns.errors import UserError
 from abcd_ns.plugin.config import AbcdTrainerConfig
 from abcd_ns.plugin.metrics import lpips_missing
 from abcd_ns.plugin.pipeline import CACHE, STORE
-from abcd_ns.tools.compare.configs import trainer_config
-from abcd_ns.tools.compare.evaluate import (
+from abcd_ns.tools.runs.configs import trainer_config
+from abcd_ns.tools.runs.evaluate import (
     draw_held_out,
     mean,
     ordering_gap,
     score,
     squared_gap,
 )
-from abcd_ns.tools.compare.machine import describe_versions, disk_bytes, peak_rss_bytes
-from abcd_ns.tools.compare.pictures import evenly
-from abcd_ns.tools.compare.protocol import Job
-from abcd_ns.tools.compare.records import decode, encode, read_json, write_json
-from abcd_ns.tools.compare.results import CurvePoint, Run, ViewScore
-from abcd_ns.tools.compare.training import Training
+from abcd_ns.tools.runs.job import Job, evenly
+from abcd_ns.tools.runs.machine import describe_versions, disk_bytes, peak_rss_bytes
+from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
+from abcd_ns.tools.runs.run import CurvePoint, Run, ViewScore
+from abcd_ns.tools.runs.training import Training
 
 RUN_FILE = "run.json"
 """Written when all is done, beside the job."""
@@ -113,7 +112,7 @@ def _record(
     names = ("psnr", "ssim", "lpips", "psnr_merged", "ssim_merged")
     means = {name: mean_of(name) for name in names}
     gap, note = ordering_gap(gaps, training.blocks)
-    end = CurvePoint(training.stopwatch.seconds, training.steps, means["psnr_merged"])
+    end = CurvePoint(training.stopwatch.seconds, training.steps, means["psnr_merged"], training.gaussians)
     return Run(
         method=job.method,
         scene=job.settings.scene,

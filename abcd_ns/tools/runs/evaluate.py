@@ -17,7 +17,7 @@ from abcd_ns.engine.types import Layer
 from abcd_ns.plugin.metrics import image_metrics
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.views import view_of
-from abcd_ns.tools.compare.results import ViewScore
+from abcd_ns.tools.runs.run import ViewScore
 
 Picture = Float[Tensor, "h w 3"]
 Drawer = Callable[[Cameras], Picture]

@@ -10,13 +10,22 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
-from abcd_ns.plugin.config import AbcdTrainerConfig
+from abcd_ns.errors import UserError
+from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig
 from abcd_ns.plugin.data.dataset import AbcdDataset
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
-from abcd_ns.tools.compare.protocol import HELD_OUT_EVERY, Job
+from abcd_ns.tools.runs.job import HELD_OUT_EVERY, Job
+from abcd_ns.tools.runs.options import change_options
 
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
+
+
+_REGISTERED = {
+    "abcd": methods.abcd,
+    "abcd-ablated": methods.abcd_ablated,
+    "abcd-monolithic": methods.abcd_monolithic,
+}
 
 
 class SplatfactoData(FullImageDatamanager[AbcdDataset]):
@@ -27,7 +36,7 @@ def trainer_config(job: Job, out: Path) -> TrainerConfig:
     """What the job trains with; its files go to `job.folder(out)`."""
     config = _splatfacto(job) if job.method == "splatfacto" else _abcd(job)
     settings = job.settings
-    config.output_dir, config.experiment_name, config.timestamp = out, "runs", f"seed-{job.seed}"
+    config.output_dir, config.experiment_name, config.timestamp = out, "runs", job.folder(out).name
     config.machine.seed = job.seed
     config.max_num_iterations = ENDLESS if settings.steps is None else settings.steps
     # "tensorboard" is the value of `vis` that starts no viewer and asks no service for an account.
@@ -39,13 +48,34 @@ def trainer_config(job: Job, out: Path) -> TrainerConfig:
     return config
 
 
+def check_scene(job: Job) -> None:
+    """Look at the scene as a worker would, photos included.
+
+    Raises:
+        UserError: it cannot be trained on.
+    """
+    _parser(job).setup().check()
+
+
+def check_options(job: Job) -> None:
+    """Whether the options of the job's variant exist and go together.
+
+    Raises:
+        UserError: they do not.
+    """
+    pipeline = _abcd(job).pipeline
+    pipeline.model.mirror(pipeline.training)
+    if pipeline.blocks < 1:
+        raise UserError(f"{job.variant.name}: blocks must be 1 or more, not {pipeline.blocks}.")
+
+
+def default_options(method: str) -> AbcdPipelineConfig:
+    """The method's pipeline as it is registered; not a copy."""
+    return _REGISTERED[method].config.pipeline
+
+
 def _abcd(job: Job) -> AbcdTrainerConfig:
-    registered = {
-        "abcd": methods.abcd,
-        "abcd-ablated": methods.abcd_ablated,
-        "abcd-monolithic": methods.abcd_monolithic,
-    }
-    config: AbcdTrainerConfig = copy.deepcopy(registered[job.method].config)
+    config: AbcdTrainerConfig = copy.deepcopy(_REGISTERED[job.method].config)
     settings, pipeline = job.settings, config.pipeline
     pipeline.datamanager.data = Path(settings.data)
     pipeline.datamanager.dataparser = _parser(job)
@@ -56,6 +86,7 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
     pipeline.training.density.max_gaussians = settings.max_gaussians
     if not settings.densify:
         pipeline.training.density.strategy = "off"
+    change_options(pipeline, job.variant)
     return config
 
 

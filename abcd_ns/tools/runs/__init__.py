@@ -1,0 +1,1 @@
+"""Training runs, each in a process of its own, under one protocol; for `abcd compare` and `abcd study`."""

@@ -1,0 +1,1 @@
+"""`abcd study`: one method with one thing varied, under one protocol."""
