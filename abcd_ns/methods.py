@@ -50,6 +50,12 @@ abcd_ablated = MethodSpecification(
     config=_quiet(_trainer("abcd-ablated", training=TrainingConfig(layers=False))),
     description="ABCD without its layers: each block alone against the photos (the paper's ablation).",
 )
+abcd_partition = MethodSpecification(
+    config=_quiet(
+        _trainer("abcd-partition", training=TrainingConfig(layers=False, warmup=0.0, overlap=0.2))
+    ),
+    description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
+)
 abcd_monolithic = MethodSpecification(
     config=_quiet(_trainer("abcd-monolithic", blocks=1)),
     description="3D Gaussian Splatting in ABCD's engine: one block, no layers. Runs without a GPU.",

@@ -13,6 +13,9 @@ class TrainingConfig:
 
     layers: bool = True
     """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
+    overlap: float = 0.0
+    """Above 0: partition, train, merge. Each block is trained once, by itself, on its cell enlarged at each face
+    by this share of its extent, and keeps what lies in its cell at the end. Goes with layers and warmup off."""
     ownership: Literal["auto", "fragments", "means"] = "auto"
     """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
     paper). `auto` takes fragments where the rasterizer can mask by depth."""

@@ -24,7 +24,7 @@ from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
-from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
+from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.scaffold import WHOLE, join, part
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
@@ -38,15 +38,13 @@ from abcd_ns.engine.schedule import (
     views_per_visit,
     visit_views,
 )
-from abcd_ns.engine.settle import has_reserve, settle_block, settle_scaffold
+from abcd_ns.engine.settle import has_reserve, settle
 from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
-UNLIMITED = 2**31
-"""Steps of a visit that something else ends."""
 
 
 class Coordinator:
@@ -198,18 +196,20 @@ class Coordinator:
             self._end_visit()
 
     def _refine(self, rendered: Rendered, taken: int) -> None:
-        active = self._active
+        clock = self._density_clock(taken)
+        self._growth = self.density.after_step(
+            self.params, self.optimizers, self._growth, rendered.infos, clock
+        )
+
+    def _density_clock(self, taken: int) -> DensityClock:
         limit = self.config.density.limit
-        clock = DensityClock(
+        return DensityClock(
             progress=self.progress,
             steps=self._clocks.steps,
             taken=taken,
-            views=len(active.geometry.views),
+            views=len(self._active.geometry.views),
             room=None if limit is None else limit - self.count(),
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
-        )
-        self._growth = self.density.after_step(
-            self.params, self.optimizers, self._growth, rendered.infos, clock
         )
 
     # -- at rest -------------------------------------------------------------------------------------
@@ -299,14 +299,16 @@ class Coordinator:
         self.scene.lay_over(
             None if active.is_whole else active.geometry.block, lambda: live_gaussians(self.params)
         )
-        if not active.is_whole:
-            taken = active.steps * self.batch
-            self._order = view_order(active.views, taken, active.number, self.config.seed)
+        self._order = self._order_of(active)
         seen, block = len(active.geometry.views), None if active.is_whole else active.geometry.block
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
         self._layers = self._draw_layers(active)
         active.layer_seconds += self.stopwatch.seconds - before
+
+    def _order_of(self, active: ActiveVisit) -> tuple[int, ...]:
+        taken = 0 if active.is_whole else active.steps * self.batch
+        return view_order(active.views, taken, active.number, self.config.seed)
 
     def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
         if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
@@ -330,10 +332,7 @@ class Coordinator:
         active = self._active
         self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
         state = self._detached()
-        if active.is_whole:
-            updates = settle_scaffold(self.scene, state)
-        else:
-            updates = settle_block(self.scene, active.geometry.block, state)
+        updates = self._settle(self.scene, active.geometry.block, state)
         self.scene.lift()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
@@ -353,6 +352,9 @@ class Coordinator:
         )
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
+
+    def _settle(self, scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:
+        return settle(scene, block, state)
 
     def _next_plan(self) -> VisitPlan:
         state, config = self.state, self.config

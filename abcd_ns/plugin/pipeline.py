@@ -9,6 +9,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
@@ -90,7 +91,8 @@ class AbcdPipeline(VanillaPipeline):
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer)
         tree = BlockTree.from_json(store.header["tree"])
-        coordinator = Coordinator(
+        runs = IndependentCoordinator if config.training.overlap > 0 else Coordinator
+        coordinator = runs(
             config.training,
             Budget(trainer.total_steps, config.max_seconds),
             StoredScene(tree, store),
@@ -117,6 +119,9 @@ class AbcdPipeline(VanillaPipeline):
         tree = cut_space(gaussians, self.config.blocks, self.config.partition)
         store = ParameterStore.create(folder, {"tree": tree.to_json()})
         training = self.config.training
+        if training.overlap > 0:
+            store.commit(independent_at_rest(tree, gaussians))
+            return store, False
         largest = -(-len(gaussians) // tree.num_blocks)
         keep = largest if training.warmup > 0 and tree.num_blocks > 1 else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))

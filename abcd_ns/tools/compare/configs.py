@@ -43,6 +43,7 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
     registered = {
         "abcd": methods.abcd,
         "abcd-ablated": methods.abcd_ablated,
+        "abcd-partition": methods.abcd_partition,
         "abcd-monolithic": methods.abcd_monolithic,
     }
     config: AbcdTrainerConfig = copy.deepcopy(registered[job.method].config)
