@@ -135,13 +135,14 @@ class Coordinator:
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
+        changes = self._active.is_whole or self.config.sh_restart
         rasters = self._rasterizer.draw(
             live_gaussians(self.params),
             [
                 Shot(sample.view, sample.crop, sample.near, None if sample.near is None else sample.window)
                 for sample in batch.samples
             ],
-            sh_degree=self.sh_degree if self._active.is_whole else self._active.sh_degree,
+            sh_degree=self.sh_degree if changes else self._active.sh_degree,
             antialiased=self.config.antialiased,
             absgrad=self.density.absgrad,
         )
@@ -173,6 +174,7 @@ class Coordinator:
                 full_pixels=view.width * view.height,
                 full_windows=ssim_windows(view.height, view.width),
                 ssim_lambda=self.config.ssim_lambda,
+                pixel_loss=self.config.pixel_loss,
             )
         photometric = total / len(batch.samples)
         if self.config.density.strategy != "mcmc":
@@ -221,7 +223,9 @@ class Coordinator:
     @property
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use."""
-        return sh_degree_at(self.progress, self.config.sh_ramp, self.config.sh_degree)
+        active = self.state.active
+        share = active.done / active.steps if self.config.sh_restart and active else self.progress
+        return sh_degree_at(share, self.config.sh_ramp, self.config.sh_degree)
 
     def save(self, pin: str | None = None) -> None:
         """Commit everything, the live block in the middle of its visit included.
@@ -273,7 +277,7 @@ class Coordinator:
         return ActiveVisit(
             number=self.state.visit,
             geometry=geometry,
-            sh_degree=self.sh_degree,
+            sh_degree=self.config.sh_degree if self.config.sh_restart else self.sh_degree,
             steps=plan.steps,
             views=visit_views(geometry.views, used, earlier, self.config.seed),
             began=began,
@@ -294,6 +298,8 @@ class Coordinator:
         rows = torch.tensor([len(state) for state in states])
         self._owner = torch.tensor(list(blocks)).repeat_interleave(rows).to(self.device)
         rest = join(states).to(self.device)
+        if active.done == 0 and not self.config.keep_moments:
+            rest = rest.forgetful()
         attach(rest, self.params, self.optimizers)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
         self.scene.lay_over(
@@ -332,7 +338,7 @@ class Coordinator:
         active = self._active
         self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
         state = self._detached()
-        updates = self._settle(self.scene, active.geometry.block, state)
+        updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
         self.scene.lift()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
@@ -353,9 +359,6 @@ class Coordinator:
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
 
-    def _settle(self, scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:
-        return settle(scene, block, state)
-
     def _next_plan(self) -> VisitPlan:
         state, config = self.state, self.config
         if not state.queue:
@@ -367,7 +370,8 @@ class Coordinator:
             remaining = None if self.budget.steps is None else self.budget.steps - state.step
             passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
             used = {block: self._views_used(seen) for block, seen in state.views.items()}
-            state.queue = list(plan_sweep(state.sweep, used, passes / self.batch, remaining, config.seed))
+            steps = (passes / self.batch, remaining, config.seed, config.visit_steps)
+            state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
                 raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
         return state.queue.pop(0)

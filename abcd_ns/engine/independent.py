@@ -2,15 +2,15 @@
 
 What published systems do that train large scenes by parts, in this engine's terms:
 
-- A block begins with the Gaussians of its cell enlarged by `overlap` (VastGaussian, Lin et al., CVPR 2024, and
-  Mega-NeRF, Turki et al., CVPR 2022: 20% and 15%). It knows nothing of its neighbours' training.
-- It is trained on the pixels whose surface lies in the enlarged cell, as Mega-NeRF prunes its data, the surface
-  being that of the initial points; where there are none, the ray's far end counts as the surface. Each pixel is
+- A block begins with the Gaussians of its cell enlarged by `overlap` (VastGaussian, Lin et al., CVPR 2024,
+  and Mega-NeRF, Turki et al., CVPR 2022: 20% and 15%). It knows nothing of its neighbours' training.
+- It is trained on the pixels whose surface lies in the enlarged cell, as Mega-NeRF prunes its data. The
+  surface is that of the initial points; where there are none, the ray's far end stands for it. Each pixel is
   thus some block's, and no block is asked for what it cannot explain.
 - At the end it keeps the Gaussians whose means lie in its cell; all blocks together are the scene.
 
-A block has one visit, as long as its share of the budget by the views that see it, and every schedule runs over
-that visit. The store also holds each block as it began, under numbers of its own.
+A block has one visit, as long as its share of the budget by the views in which it has pixels, and every
+schedule runs over that visit. The store also holds each block as it began, under numbers of its own.
 """
 
 import math
@@ -24,6 +24,7 @@ from torch import Tensor
 from abcd_ns.engine.batch import Batch, Rendered
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.blocks import BlockTree, Box
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.density import DensityClock
 from abcd_ns.engine.intervals import ray_interval
@@ -33,12 +34,13 @@ from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.scaffold import blocks_at_rest, join
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import endless_order, exponential_decay, plan_sweep, sh_degree_at
-from abcd_ns.engine.settle import settle_inside
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitGeometry
 
 SURFACE_OPACITY = 0.9
 """Of the initial points where they stand for surfaces."""
+SURFACE_SCALE = 0.5
+"""Their size as such, as a share of what they begin with: outliers, which begin large, hide too much."""
 BEYOND = 1e30
 """Camera z of a pixel that shows no point: further than any finite cell."""
 CROP_ALIGN = 16
@@ -62,8 +64,8 @@ def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
     """The cell, moved outward at each face by `overlap` of its extent on that axis.
 
     Args:
-        means: of the cell's Gaussians; where the cell is infinite, its extent is theirs, outliers (a twentieth
-            at either end) aside.
+        means: of the cell's Gaussians; where the cell is infinite, its extent is theirs, a twentieth at
+            either end left out.
     """
     extent = cell.upper - cell.lower
     if len(means):
@@ -93,7 +95,9 @@ class Surfaces:
         self._views = {view.index: view for view in views}
         gaussians = Gaussians.cat([initial_gaussians(scene, b) for b in range(scene.tree.num_blocks)])
         opaque = math.log(SURFACE_OPACITY / (1 - SURFACE_OPACITY))
-        points = replace(gaussians, opacities=torch.full_like(gaussians.opacities, opaque)).to(device)
+        scales = gaussians.scales + math.log(SURFACE_SCALE)
+        opacities = torch.full_like(gaussians.opacities, opaque)
+        points = replace(gaussians, opacities=opacities, scales=scales).to(device)
         self._depths = {index: self._depth(points, view, rasterizer) for index, view in self._views.items()}
 
     def region(self, view: int, cell: Box) -> Region | None:
@@ -119,8 +123,8 @@ class Surfaces:
 class IndependentCoordinator(Coordinator):
     """Trains each block in one visit, alone; options as for `Coordinator`, with `training.overlap` > 0."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, config: TrainingConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(replace(config, migrate=False), *args, **kwargs)
         self._surfaces: Surfaces | None = None
         self._regions: dict[int, Region] = {}
         self._part = 1.0
@@ -172,9 +176,6 @@ class IndependentCoordinator(Coordinator):
         if limit is not None:
             limit = int(limit * self._part) - len(self.params["means"])
         return replace(clock, progress=self.share, room=limit)
-
-    def _settle(self, scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:
-        return settle_inside(scene, block, state)
 
     # -- visits --------------------------------------------------------------------------------------
 

@@ -9,14 +9,17 @@ from abcd_ns.engine.scaffold import WHOLE, part, reserve_of, revealed
 from abcd_ns.engine.scene import StoredScene
 
 
-def settle(scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:
-    """The blocks that change when `block`, or with WHOLE the scaffold of all, has been trained."""
-    return settle_scaffold(scene, state) if block == WHOLE else settle_block(scene, block, state)
+def settle(scene: StoredScene, block: int, state: BlockState, migrate: bool = True) -> dict[int, BlockState]:
+    """The blocks that change when `block`, or with WHOLE the scaffold of all, has been trained.
 
-
-def settle_inside(scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:
-    """The block without the Gaussians that are not in its cell: these are dropped."""
-    return {block: state[_owner(scene, state) == block]}
+    Args:
+        migrate: False drops the Gaussians that left their cell.
+    """
+    if block == WHOLE:
+        return settle_scaffold(scene, state)
+    if not migrate:
+        return {block: state[_owner(scene, state) == block]}
+    return settle_block(scene, block, state)
 
 
 def settle_block(scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:

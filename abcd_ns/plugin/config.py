@@ -141,7 +141,9 @@ class AbcdTrainerConfig(TrainerConfig):
             if self.pipeline.blocks < 1:
                 raise UserError(f"--pipeline.blocks must be 1 or more, not {self.pipeline.blocks}.")
             if self.pipeline.training.overlap > 0 and self.pipeline.training.layers:
-                raise UserError("--pipeline.training.overlap is for blocks without layers; set layers to False.")
+                raise UserError(
+                    "--pipeline.training.overlap is for blocks without layers; set layers to False."
+                )
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")
             self.pipeline.model.mirror(self.pipeline.training)

@@ -36,7 +36,9 @@ def visits(coordinator) -> list[VisitBegan]:
 
 def test_a_cell_is_enlarged_by_a_share_of_its_extent():
     infinity = float("inf")
-    cell = Box(torch.tensor([0.0, -infinity, -infinity]).double(), torch.tensor([2.0, 1.0, infinity]).double())
+    cell = Box(
+        torch.tensor([0.0, -infinity, -infinity]).double(), torch.tensor([2.0, 1.0, infinity]).double()
+    )
     means = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([2.0, 10.0, 1.0])
     found = enlarged(cell, means, 0.5)
     assert found.lower.tolist() == [-1.0, -infinity, -infinity]
@@ -46,22 +48,22 @@ def test_a_cell_is_enlarged_by_a_share_of_its_extent():
 
 
 def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(tmp_path, views, photos, start):
-    coordinator = independent(tmp_path, start, views, steps=60, density=STILL)
+    coordinator = independent(tmp_path, start, views, steps=30, density=STILL, batch=1)
     begun, ended = visits(coordinator), []
     coordinator.announce.subscribe(
         lambda e: ended.append(coordinator.state.step) if isinstance(e, VisitEnded) else None
     )
     train(coordinator, photos)
     assert sorted(event.block for event in begun) == [0, 1, 2, 3]
-    assert coordinator.state.step == 60
+    assert coordinator.state.step == 30
     taken = [b - a for a, b in zip([0, *ended[:-1]], ended, strict=True)]
     seen = [event.views for event in begun]
     for steps, count in zip(taken, seen, strict=True):
-        assert abs(steps - 60 * count / sum(seen)) <= 2
+        assert abs(steps - 30 * count / sum(seen)) <= 2
 
 
 def test_a_block_begins_with_its_overlap_and_keeps_its_cell(tmp_path, views, photos, start):
-    coordinator = independent(tmp_path, start, views, steps=40, density=STILL)
+    coordinator = independent(tmp_path, start, views, steps=12, density=STILL)
     begun, ended = visits(coordinator), []
     coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
     tree = coordinator.scene.tree
@@ -81,7 +83,7 @@ def test_what_others_became_is_nothing_to_a_block(tmp_path, views, photos, start
     results = []
     for name in ("plain", "spoilt"):
         (tmp_path / name).mkdir()
-        coordinator = independent(tmp_path / name, start, views, steps=40, density=STILL, background="black")
+        coordinator = independent(tmp_path / name, start, views, steps=16, density=STILL, background="black")
         begun = visits(coordinator)
         while not coordinator.finished:
             train_step(coordinator, photos)
@@ -124,7 +126,7 @@ def test_pixels_that_are_others_teach_nothing(tmp_path, views, photos, start):
 
 
 def test_training_improves_every_photo(tmp_path, views, photos, start):
-    coordinator = independent(tmp_path, start, views, steps=160, density=STILL, background="black")
+    coordinator = independent(tmp_path, start, views, steps=60, density=STILL, background="black")
 
     def errors() -> list[float]:
         scene = whole_scene(coordinator)
@@ -135,20 +137,20 @@ def test_training_improves_every_photo(tmp_path, views, photos, start):
 
     before = errors()
     train(coordinator, photos)
-    assert all(new < 0.9 * old for old, new in zip(before, errors(), strict=True))
+    assert all(new < 0.95 * old for old, new in zip(before, errors(), strict=True))
 
 
-@pytest.mark.parametrize("stop", [3, 14, 22])
+@pytest.mark.parametrize("stop", [3, 14])
 def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop):
     runs = {}
     for name in ("whole", "stopped"):
         (tmp_path / name).mkdir()
-        runs[name] = independent(tmp_path / name, start, views, steps=30, density=GROWING)
+        runs[name] = independent(tmp_path / name, start, views, steps=20, density=GROWING)
     train(runs["whole"], photos)
     train(runs["stopped"], photos, steps=stop)
     runs["stopped"].save()
     runs["stopped"].scene.store.close()
-    again = independent(tmp_path / "stopped", start, views, steps=30, density=GROWING, resume=True)
+    again = independent(tmp_path / "stopped", start, views, steps=20, density=GROWING, resume=True)
     train(again, photos)
     found, expected = whole_scene(again), whole_scene(runs["whole"])
     assert all(torch.equal(value, getattr(found, name)) for name, value in expected.items())

@@ -16,6 +16,7 @@ COLORS = {
     "abcd": "#0072B2",
     "abcd-ablated": "#8A5A83",
     "abcd-partition": "#8A6A00",
+    "abcd-paper": "#7A3E00",
     "splatfacto": "#007A5A",
 }
 """After Okabe and Ito 2008, told apart with every kind of colour blindness; darkened where text needs it."""
@@ -24,6 +25,7 @@ MARKERS = {
     "abcd": "o",
     "abcd-ablated": "^",
     "abcd-partition": "v",
+    "abcd-paper": "P",
     "splatfacto": "D",
 }
 """For print without colour."""

@@ -15,7 +15,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Method = Literal["abcd-monolithic", "abcd", "abcd-ablated", "abcd-partition", "splatfacto"]
+Method = Literal["abcd-monolithic", "abcd", "abcd-ablated", "abcd-partition", "abcd-paper", "splatfacto"]
 METHODS: tuple[str, ...] = get_args(Method)
 """In the order in which tables and charts show them."""
 HELD_OUT_EVERY = 8
@@ -184,6 +184,10 @@ def _check_lists(given: Options) -> None:
     for method in given.methods:
         if method not in METHODS:
             raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
+    if "abcd-paper" in given.methods and given.steps is None:
+        raise UserError(
+            "abcd-paper gives each cell a fixed number of steps: use --steps instead of --seconds."
+        )
     if not given.methods or not given.seeds:
         raise UserError("Give at least one of --methods and one of --seeds.")
     if len(set(given.seeds)) < len(given.seeds) or min(given.seeds) < 0:
