@@ -68,6 +68,10 @@ abcd_partition = MethodSpecification(
     config=_quiet(_trainer("abcd-partition", training=TrainingConfig(layers=False, warmup=0.0, overlap=0.2))),
     description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
 )
+abcd_exact = MethodSpecification(
+    config=_quiet(_trainer("abcd-exact", training=TrainingConfig(exact=True, warmup=0.0))),
+    description="Exact joint training over blocks, one on the device at a time: slow, the reference.",
+)
 abcd_paper = MethodSpecification(
     config=_quiet(_trainer("abcd-paper", partition="grid", training=PAPER)),
     description="ABCD by its paper's recipe: MSE, fixed steps for each cell, a new Adam at each visit.",

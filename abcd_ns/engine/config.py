@@ -16,6 +16,9 @@ class TrainingConfig:
     overlap: float = 0.0
     """Above 0: partition, train, merge. Each block is trained once, by itself, on its cell enlarged at each
     face by this share of its extent, and keeps what lies in its cell at the end. Needs `layers` off."""
+    exact: bool = False
+    """Exact joint training: every step trains all blocks, one at a time on the device, each drawn twice.
+    Slow; the reference for gradients. There are no visits, so what concerns them has no effect."""
     ownership: Literal["auto", "fragments", "means"] = "auto"
     """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
     paper). `auto` takes fragments where the rasterizer can mask by depth."""

@@ -144,6 +144,8 @@ class AbcdTrainerConfig(TrainerConfig):
                 raise UserError(
                     "--pipeline.training.overlap is for blocks without layers; set layers to False."
                 )
+            if self.pipeline.training.overlap > 0 and self.pipeline.training.exact:
+                raise UserError("--pipeline.training.exact and overlap exclude each other; choose one.")
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")
             self.pipeline.model.mirror(self.pipeline.training)

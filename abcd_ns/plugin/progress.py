@@ -63,7 +63,7 @@ class ProgressReport:
         before = event.psnr if self._psnr is None else self._psnr
         self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
         steps = self._visit.steps if self._visit else 0
-        endless = steps >= UNLIMITED or (self._visit is not None and self._visit.block is None)
+        endless = not 0 < steps < UNLIMITED or (self._visit is not None and self._visit.block is None)
         self._show(f"step {event.visit_step}" if endless else f"step {event.visit_step}/{steps}")
 
     def _end_sweep(self, event: SweepEnded) -> None:

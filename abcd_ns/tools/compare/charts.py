@@ -16,6 +16,7 @@ COLORS = {
     "abcd": "#0072B2",
     "abcd-ablated": "#8A5A83",
     "abcd-partition": "#8A6A00",
+    "abcd-exact": "#B3306B",
     "abcd-paper": "#7A3E00",
     "splatfacto": "#007A5A",
 }
@@ -25,6 +26,7 @@ MARKERS = {
     "abcd": "o",
     "abcd-ablated": "^",
     "abcd-partition": "v",
+    "abcd-exact": "X",
     "abcd-paper": "P",
     "splatfacto": "D",
 }

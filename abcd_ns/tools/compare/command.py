@@ -53,8 +53,8 @@ def compare(
     Args:
         data: The scene: a folder with a COLMAP model or transforms.json, as for `ns-train abcd --data`.
         out: Folder for the results; absent, empty, or one of an earlier comparison under the same protocol.
-        methods: Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-paper
-            (needs steps) and splatfacto (needs CUDA).
+        methods: Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-exact,
+            abcd-paper (needs steps) and splatfacto (needs CUDA).
         seconds: Budget of a run: seconds of training; evaluation, saving and compiling do not count.
         steps: Budget of a run: optimisation steps. Give either this or seconds.
         seeds: One run of every method for each. Default: 0.

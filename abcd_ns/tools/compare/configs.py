@@ -44,6 +44,7 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
         "abcd": methods.abcd,
         "abcd-ablated": methods.abcd_ablated,
         "abcd-partition": methods.abcd_partition,
+        "abcd-exact": methods.abcd_exact,
         "abcd-paper": methods.abcd_paper,
         "abcd-monolithic": methods.abcd_monolithic,
     }

@@ -15,7 +15,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Method = Literal["abcd-monolithic", "abcd", "abcd-ablated", "abcd-partition", "abcd-paper", "splatfacto"]
+Method = Literal[
+    "abcd-monolithic", "abcd", "abcd-ablated", "abcd-partition", "abcd-exact", "abcd-paper", "splatfacto"
+]
 METHODS: tuple[str, ...] = get_args(Method)
 """In the order in which tables and charts show them."""
 HELD_OUT_EVERY = 8
