@@ -2,8 +2,8 @@
 
 What published systems do that train large scenes by parts, in this engine's terms:
 
-- A block begins with the Gaussians of its cell enlarged by `overlap` (VastGaussian, Lin et al., CVPR 2024,
-  and Mega-NeRF, Turki et al., CVPR 2022: 20% and 15%). It knows nothing of its neighbours' training.
+- A block begins with the Gaussians of its cell enlarged by `overlap` (as in VastGaussian, Lin et al., CVPR
+  2024, and Mega-NeRF, Turki et al., CVPR 2022). It knows nothing of its neighbours' training.
 - It is trained on the pixels whose surface lies in the enlarged cell, as Mega-NeRF prunes its data. The
   surface is that of the initial points; where there are none, the ray's far end stands for it. Each pixel is
   thus some block's, and no block is asked for what it cannot explain.
