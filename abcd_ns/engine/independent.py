@@ -7,9 +7,12 @@ What published systems do that train large scenes by parts, in this engine's ter
 - It is trained on the pixels whose surface lies in the enlarged cell, as Mega-NeRF prunes its data. The
   surface is that of the initial points; where there are none, the ray's far end stands for it. Each pixel is
   thus some block's, and no block is asked for what it cannot explain.
+- Where the surface lies behind the cell, or the ray misses it, the block must stay clear: the target is the
+  background, another one in every step. Without that, blocks fill with floaters before others' surfaces;
+  VastGaussian's airspace-aware choice of cameras and BlockGaussian's auxiliary points are against the same.
 - At the end it keeps the Gaussians whose means lie in its cell; all blocks together are the scene.
 
-A block has one visit, as long as its share of the budget by the views in which it has pixels, and every
+A block has one visit, as long as its share of the budget by the views that say something about it, and every
 schedule runs over that visit. The store also holds each block as it began, under numbers of its own.
 """
 
@@ -35,7 +38,7 @@ from abcd_ns.engine.scaffold import blocks_at_rest, join
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import endless_order, exponential_decay, plan_sweep, sh_degree_at
 from abcd_ns.engine.types import Crop, Gaussians, View
-from abcd_ns.engine.visit import VisitGeometry
+from abcd_ns.engine.visit import VisitGeometry, survey
 
 SURFACE_OPACITY = 0.9
 """Of the initial points where they stand for surfaces."""
@@ -43,8 +46,6 @@ SURFACE_SCALE = 0.5
 """Their size as such, as a share of what they begin with: outliers, which begin large, hide too much."""
 BEYOND = 1e30
 """Camera z of a pixel that shows no point: further than any finite cell."""
-CROP_ALIGN = 16
-"""Crops begin and end on multiples of this, pixels (or at the image's edge)."""
 
 
 def initial_of(tree: BlockTree, block: int) -> int:
@@ -77,12 +78,19 @@ def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
 
 @dataclass(frozen=True)
 class Region:
-    """The pixels of one view that a block is trained on."""
+    """What the pixels of one view are to a block, by where their surface lies; of a crop or the whole view.
 
-    crop: Crop
-    """Holds them all."""
-    mask: Bool[Tensor, "h w"]
-    """Which of the crop's they are."""
+    Neither of both: the cell lies behind the surface, and nobody can tell what is there.
+    """
+
+    own: Bool[Tensor, "h w"]
+    """In the enlarged cell: the photo is the block's to explain."""
+    clear: Bool[Tensor, "h w"]
+    """Behind the cell, or the ray misses it: the block must let all light through."""
+
+    def __getitem__(self, crop: Crop) -> "Region":
+        """The crop of a whole view's."""
+        return Region(self.own[crop.slices], self.clear[crop.slices])
 
 
 class Surfaces:
@@ -100,16 +108,14 @@ class Surfaces:
         points = replace(gaussians, opacities=opacities, scales=scales).to(device)
         self._depths = {index: self._depth(points, view, rasterizer) for index, view in self._views.items()}
 
-    def region(self, view: int, cell: Box) -> Region | None:
-        """Where `view` sees a surface in `cell`; None if nowhere."""
+    def region(self, view: int, cell: Box) -> Region:
+        """What every pixel of `view` is to a block with this cell."""
         camera = self._views[view]
         depth = self._depths[view].to(camera.viewmat)
         span = ray_interval(cell, camera, camera.full)
-        mask = (span.near <= depth) & (depth < span.far)
-        if not bool(mask.any()):
-            return None
-        crop = _crop_around(mask)
-        return Region(crop, mask[crop.slices])
+        own = (span.near <= depth) & (depth < span.far)
+        hidden = (depth < span.near) & span.near.isfinite()
+        return Region(own, ~own & ~hidden)
 
     @staticmethod
     @torch.no_grad()
@@ -127,6 +133,7 @@ class IndependentCoordinator(Coordinator):
         super().__init__(replace(config, migrate=False), *args, **kwargs)
         self._surfaces: Surfaces | None = None
         self._regions: dict[int, Region] = {}
+        self._crops: dict[int, Crop] = {}
         self._part = 1.0
 
     @property
@@ -151,10 +158,14 @@ class IndependentCoordinator(Coordinator):
         return batch
 
     def loss(self, batch: Batch, pictures: Any, photos: Any) -> Float[Tensor, ""]:
-        """As Coordinator's, of the pixels that are the block's."""
-        masks = [self._regions[sample.view.index].mask[..., None] for sample in batch.samples]
-        shown = [picture * mask.to(picture) for picture, mask in zip(pictures, masks, strict=True)]
-        wanted = [photo * mask.to(photo) for photo, mask in zip(photos, masks, strict=True)]
+        """As Coordinator's, of the pixels that say something about the block."""
+        shown, wanted = [], []
+        for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
+            region = self._regions[sample.view.index]
+            counts = (region.own | region.clear)[..., None].to(picture)
+            target = torch.where(region.clear[..., None], sample.background.to(photo), photo)
+            shown.append(picture * counts)
+            wanted.append(target * counts)
         return super().loss(batch, shown, wanted)
 
     def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
@@ -191,7 +202,7 @@ class IndependentCoordinator(Coordinator):
         share = plans[0].steps / sum(plan.steps for plan in plans)
         block = plans.pop(0).block
         self._look(block)
-        crops = {view: region.crop for view, region in self._regions.items()}
+        crops = self._crops
         self.state.active = ActiveVisit(
             number=self.state.visit,
             geometry=VisitGeometry(block, crops, None),
@@ -208,10 +219,11 @@ class IndependentCoordinator(Coordinator):
         self._attach(self.state.active)
 
     def _plan(self) -> None:
-        """One visit to every block that has Gaussians and pixels, weighed by the views with such pixels."""
+        """One visit to every block that owns a pixel, weighed by the views that say something about it."""
         for block in self._blocks:
             self._look(block)
-            self.state.views[block] = len(self._regions) if len(self._joined(block)) else 0
+            owns = any(bool(region.own.any()) for region in self._regions.values())
+            self.state.views[block] = len(self._regions) if owns else 0
         self.state.queue = list(plan_sweep(0, self.state.views, 1, None, self.config.seed))
         if not self.state.queue:
             raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
@@ -232,12 +244,17 @@ class IndependentCoordinator(Coordinator):
         self.scene.lay_over(block, inside)
 
     def _look(self, block: int) -> None:
-        """Find the pixels that are the block's, and let go of the last block's."""
+        """Find out what pixels are to the block, and let go of the last block's."""
         if self._surfaces is None:
             views = list(self.views.values())
             self._surfaces = Surfaces(self.scene, views, self._rasterizer, self.device)
-        seen = {view: self._surfaces.region(view, self._box(block)) for view in self.views}
-        self._regions = {view: region for view, region in seen.items() if region is not None}
+        box, self._regions, self._crops = self._box(block), {}, {}
+        begun = self._joined(block).gaussians.to(self.device)
+        crops = survey(begun, block, self.views.values(), self._rasterizer, cell=None).crops
+        for view, crop in crops.items():
+            region = self._surfaces.region(view, box)[crop]
+            if bool((region.own | region.clear).any()):
+                self._regions[view], self._crops[view] = region, crop
 
     def _box(self, block: int) -> Box:
         means = initial_gaussians(self.scene, block).means
@@ -254,14 +271,3 @@ def initial_gaussians(scene: StoredScene, block: int) -> Gaussians:
     """A block's Gaussians as they began."""
     tensors, meta = scene.store.load(initial_of(scene.tree, block))
     return BlockState.from_tensors(tensors, meta).gaussians
-
-
-def _crop_around(mask: Bool[Tensor, "h w"]) -> Crop:
-    spans = []
-    for axis in (1, 0):  # columns, then rows
-        (found,) = mask.any(dim=1 - axis).nonzero(as_tuple=True)
-        start = int(found[0]) // CROP_ALIGN * CROP_ALIGN
-        stop = min((int(found[-1]) // CROP_ALIGN + 1) * CROP_ALIGN, mask.shape[axis])
-        spans.append((start, stop - start))
-    (x, width), (y, height) = spans
-    return Crop(x, y, width, height)
