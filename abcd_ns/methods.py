@@ -16,6 +16,20 @@ LEARNING_RATES = {
 }
 """Splatfacto's. The means' decays with the progress of the run, see TrainingConfig."""
 
+PAPER = TrainingConfig(
+    ownership="means",
+    warmup=0.0,
+    batch=1,
+    visit_views=10**6,
+    visit_steps=5000,
+    keep_moments=False,
+    sh_restart=True,
+    migrate=False,
+    ssim_lambda=0.0,
+    pixel_loss="l2",
+)
+"""What Shiu and Subr 2026 did, as far as it is published; docs/method.md says where it is not."""
+
 
 def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
     return AbcdTrainerConfig(
@@ -49,6 +63,18 @@ abcd = MethodSpecification(
 abcd_ablated = MethodSpecification(
     config=_quiet(_trainer("abcd-ablated", training=TrainingConfig(layers=False))),
     description="ABCD without its layers: each block alone against the photos (the paper's ablation).",
+)
+abcd_partition = MethodSpecification(
+    config=_quiet(_trainer("abcd-partition", training=TrainingConfig(layers=False, warmup=0.0, overlap=0.2))),
+    description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
+)
+abcd_exact = MethodSpecification(
+    config=_quiet(_trainer("abcd-exact", training=TrainingConfig(exact=True, warmup=0.0))),
+    description="Exact joint training over blocks, one on the device at a time: slow, the reference.",
+)
+abcd_paper = MethodSpecification(
+    config=_quiet(_trainer("abcd-paper", partition="grid", training=PAPER)),
+    description="ABCD by its paper's recipe: MSE, fixed steps for each cell, a new Adam at each visit.",
 )
 abcd_monolithic = MethodSpecification(
     config=_quiet(_trainer("abcd-monolithic", blocks=1)),

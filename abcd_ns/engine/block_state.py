@@ -1,6 +1,6 @@
 """All that belongs to one block: its Gaussians, their Adam moments, growth statistics and clocks."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -76,6 +76,10 @@ class BlockState:
             growth,
             self.clocks,
         )
+
+    def forgetful(self) -> "BlockState":
+        """As if no optimizer had ever seen it: zero moments and no statistics. The other clocks stay."""
+        return replace(BlockState.fresh(self.gaussians), clocks=replace(self.clocks, adam_steps=0))
 
     def to(self, device: torch.device | str) -> "BlockState":
         """On another device."""

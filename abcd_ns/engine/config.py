@@ -13,6 +13,12 @@ class TrainingConfig:
 
     layers: bool = True
     """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
+    overlap: float = 0.0
+    """Above 0: partition, train, merge. Each block is trained once, by itself, on its cell enlarged at each
+    face by this share of its extent, and keeps what lies in its cell at the end. Needs `layers` off."""
+    exact: bool = False
+    """Exact joint training: every step trains all blocks, one at a time on the device, each drawn twice.
+    Slow; the reference for gradients. There are no visits, so what concerns them has no effect."""
     ownership: Literal["auto", "fragments", "means"] = "auto"
     """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
     paper). `auto` takes fragments where the rasterizer can mask by depth."""
@@ -30,6 +36,18 @@ class TrainingConfig:
     """Uses of each of these views in a visit of the first sweep."""
     last_passes: int = 8
     """Uses of each of these views in a visit of late sweeps; one more with each sweep until then."""
+    visit_steps: int = 0
+    """Steps of every visit, whatever the views that see its block, as the paper has; 0 shares steps out by
+    views."""
+    keep_moments: bool = True
+    """A block keeps Adam's moments and densification's statistics from visit to visit. Off, as in the paper,
+    every visit begins with new ones."""
+    sh_restart: bool = False
+    """The degree of spherical harmonics rises from 0 in every visit, over `sh_ramp` of its steps, as in the
+    paper; frozen blocks are then drawn with the highest."""
+    migrate: bool = True
+    """Gaussians that left their cell by the end of a visit move to the block that holds them. Off, as in the
+    paper, they are deleted."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
     sh_degree: int = 3
@@ -37,7 +55,9 @@ class TrainingConfig:
     sh_ramp: float = 0.1
     """Share of the run over which the degree rises from 0 to the highest."""
     ssim_lambda: float = 0.2
-    """Weight of 1 - SSIM in the loss; the rest is L1."""
+    """Weight of 1 - SSIM in the loss; the rest is `pixel_loss`."""
+    pixel_loss: Literal["l1", "l2"] = "l1"
+    """Mean absolute difference, as 3DGS, or mean squared difference, as the paper with `ssim_lambda` 0."""
     antialiased: bool = False
     """Scale opacities by gsplat's compensation for its low-pass filter."""
     background: Literal["random", "black", "white"] = "random"

@@ -24,7 +24,7 @@ from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
-from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
+from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.scaffold import WHOLE, join, part
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
@@ -38,15 +38,13 @@ from abcd_ns.engine.schedule import (
     views_per_visit,
     visit_views,
 )
-from abcd_ns.engine.settle import has_reserve, settle_block, settle_scaffold
+from abcd_ns.engine.settle import has_reserve, settle
 from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
-UNLIMITED = 2**31
-"""Steps of a visit that something else ends."""
 
 
 class Coordinator:
@@ -137,13 +135,14 @@ class Coordinator:
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
+        changes = self._active.is_whole or self.config.sh_restart
         rasters = self._rasterizer.draw(
             live_gaussians(self.params),
             [
                 Shot(sample.view, sample.crop, sample.near, None if sample.near is None else sample.window)
                 for sample in batch.samples
             ],
-            sh_degree=self.sh_degree if self._active.is_whole else self._active.sh_degree,
+            sh_degree=self.sh_degree if changes else self._active.sh_degree,
             antialiased=self.config.antialiased,
             absgrad=self.density.absgrad,
         )
@@ -175,6 +174,7 @@ class Coordinator:
                 full_pixels=view.width * view.height,
                 full_windows=ssim_windows(view.height, view.width),
                 ssim_lambda=self.config.ssim_lambda,
+                pixel_loss=self.config.pixel_loss,
             )
         photometric = total / len(batch.samples)
         if self.config.density.strategy != "mcmc":
@@ -198,18 +198,20 @@ class Coordinator:
             self._end_visit()
 
     def _refine(self, rendered: Rendered, taken: int) -> None:
-        active = self._active
+        clock = self._density_clock(taken)
+        self._growth = self.density.after_step(
+            self.params, self.optimizers, self._growth, rendered.infos, clock
+        )
+
+    def _density_clock(self, taken: int) -> DensityClock:
         limit = self.config.density.limit
-        clock = DensityClock(
+        return DensityClock(
             progress=self.progress,
             steps=self._clocks.steps,
             taken=taken,
-            views=len(active.geometry.views),
+            views=len(self._active.geometry.views),
             room=None if limit is None else limit - self.count(),
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
-        )
-        self._growth = self.density.after_step(
-            self.params, self.optimizers, self._growth, rendered.infos, clock
         )
 
     # -- at rest -------------------------------------------------------------------------------------
@@ -221,7 +223,9 @@ class Coordinator:
     @property
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use."""
-        return sh_degree_at(self.progress, self.config.sh_ramp, self.config.sh_degree)
+        active = self.state.active
+        share = active.done / active.steps if self.config.sh_restart and active else self.progress
+        return sh_degree_at(share, self.config.sh_ramp, self.config.sh_degree)
 
     def save(self, pin: str | None = None) -> None:
         """Commit everything, the live block in the middle of its visit included.
@@ -273,7 +277,7 @@ class Coordinator:
         return ActiveVisit(
             number=self.state.visit,
             geometry=geometry,
-            sh_degree=self.sh_degree,
+            sh_degree=self.config.sh_degree if self.config.sh_restart else self.sh_degree,
             steps=plan.steps,
             views=visit_views(geometry.views, used, earlier, self.config.seed),
             began=began,
@@ -294,19 +298,23 @@ class Coordinator:
         rows = torch.tensor([len(state) for state in states])
         self._owner = torch.tensor(list(blocks)).repeat_interleave(rows).to(self.device)
         rest = join(states).to(self.device)
+        if active.done == 0 and not self.config.keep_moments:
+            rest = rest.forgetful()
         attach(rest, self.params, self.optimizers)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
         self.scene.lay_over(
             None if active.is_whole else active.geometry.block, lambda: live_gaussians(self.params)
         )
-        if not active.is_whole:
-            taken = active.steps * self.batch
-            self._order = view_order(active.views, taken, active.number, self.config.seed)
+        self._order = self._order_of(active)
         seen, block = len(active.geometry.views), None if active.is_whole else active.geometry.block
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
         self._layers = self._draw_layers(active)
         active.layer_seconds += self.stopwatch.seconds - before
+
+    def _order_of(self, active: ActiveVisit) -> tuple[int, ...]:
+        taken = 0 if active.is_whole else active.steps * self.batch
+        return view_order(active.views, taken, active.number, self.config.seed)
 
     def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
         if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
@@ -330,10 +338,7 @@ class Coordinator:
         active = self._active
         self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
         state = self._detached()
-        if active.is_whole:
-            updates = settle_scaffold(self.scene, state)
-        else:
-            updates = settle_block(self.scene, active.geometry.block, state)
+        updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
         self.scene.lift()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
@@ -365,7 +370,8 @@ class Coordinator:
             remaining = None if self.budget.steps is None else self.budget.steps - state.step
             passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
             used = {block: self._views_used(seen) for block, seen in state.views.items()}
-            state.queue = list(plan_sweep(state.sweep, used, passes / self.batch, remaining, config.seed))
+            steps = (passes / self.batch, remaining, config.seed, config.visit_steps)
+            state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
                 raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
         return state.queue.pop(0)

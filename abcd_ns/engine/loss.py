@@ -1,7 +1,7 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -35,6 +35,7 @@ def photometric_loss(
     full_pixels: int,
     full_windows: int,
     ssim_lambda: float = 0.2,
+    pixel_loss: Literal["l1", "l2"] = "l1",
 ) -> Float[Tensor, ""]:
     """(1 - lambda) L1 + lambda (1 - SSIM), summed over the crop and divided by the full image's counts.
 
@@ -45,13 +46,20 @@ def photometric_loss(
     Args:
         full_pixels: H W of the full image.
         full_windows: (H - 10)(W - 10) of the full image, or 0 where it is too small for one window.
+        pixel_loss: l2 takes the squared difference in L1's place.
     """
     height, width = rendered.shape[:2]
-    if full_windows == 0 or min(height, width) < SSIM_WINDOW:
-        return (1 - ssim_lambda) * (rendered - photo).abs().sum() / (3 * full_pixels)
-    weights = rendered.new_tensor([(1 - ssim_lambda) / (3 * full_pixels), ssim_lambda / (3 * full_windows)])
+    by_pixel = (1 - ssim_lambda) / (3 * full_pixels)
+    has_windows = ssim_lambda > 0 and full_windows > 0 and min(height, width) >= SSIM_WINDOW
+    difference = rendered - photo
+    if not has_windows:
+        summed = difference.abs().sum() if pixel_loss == "l1" else difference.square().sum()
+        return by_pixel * summed
+    in_kernel = by_pixel if pixel_loss == "l1" else 0.0
+    weights = rendered.new_tensor([in_kernel, ssim_lambda / (3 * full_windows)])
     planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
-    return _Photometric.apply(*planes, weights)
+    loss = _Photometric.apply(*planes, weights)
+    return loss if pixel_loss == "l1" else loss + by_pixel * difference.square().sum()
 
 
 def ssim_windows(height: int, width: int) -> int:

@@ -70,7 +70,7 @@ class Painter:
         self.ownership = ownership
         self.device = torch.device(device)
         self._pass_gaussians = pass_gaussians
-        self._optics = _Optics(views)
+        self._optics = Optics(views)
 
     @property
     def tree(self) -> BlockTree:
@@ -198,7 +198,7 @@ def default_pass(scene: BlockScene) -> int:
     return max(2 * max(map(scene.count, range(scene.tree.num_blocks))), 200_000)
 
 
-class _Optics:
+class Optics:
     """Bounds over all views, for a test of reach that does not depend on the view."""
 
     def __init__(self, views: list[View]) -> None:

@@ -8,7 +8,6 @@ taken as one long row of pixels, as loops that end with each row spend much of t
 import math
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -26,7 +25,7 @@ _TAPS = [tap / sum(_BELL) for tap in _BELL]
 
 
 def slide_rows(pixels: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n-10"]]:
-    """SSIM's window slid over all rows of images as if they were one; what it says across row ends is void."""
+    """SSIM's window slid over all rows of images as if they were one; void across row ends."""
     count = pixels.shape[0] - REACH
     return (sum(tap * pixels[k : k + count] for k, tap in enumerate(_TAPS)),)
 
@@ -99,7 +98,7 @@ def photometric_sums(
     inside = rendered.new_zeros((height - REACH, width))
     inside[:, : width - REACH] = 1.0
     unlike, by_moment = DISSIMILARITY(rows.view(15, height, width), inside)
-    # The window's way back. Columns that were void are 0 and keep rows apart; rows of zeros keep images apart.
+    # The way back. Columns that were void are 0 and keep rows apart, rows of zeros keep images apart.
     spread = rendered.new_zeros(REACH + 9 * (height + REACH) * width)
     spread[REACH:].view(9, -1, width)[:, REACH:height].copy_(by_moment)
     (rows,) = SLIDE_ROWS(spread)

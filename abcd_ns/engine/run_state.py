@@ -8,6 +8,9 @@ from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
 from abcd_ns.engine.visit import VisitGeometry
 
+UNLIMITED = 2**31
+"""Steps of a visit that something else ends."""
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -45,6 +48,10 @@ class ActiveVisit:
     """Training time that went into drawing F and B."""
     began: float = 0.0
     """Training time when the visit began."""
+    since: float = 0.0
+    """Share of the run that was done then."""
+    until: float = 1.0
+    """Share of the run at which the visit ends, whatever its steps."""
 
     @property
     def is_whole(self) -> bool:

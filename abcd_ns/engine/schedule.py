@@ -26,7 +26,12 @@ def passes_of_sweep(sweep: int, first: int, last: int) -> int:
 
 
 def plan_sweep(
-    sweep: int, views: Mapping[int, int], passes: int | float, remaining: int | None, seed: int
+    sweep: int,
+    views: Mapping[int, int],
+    passes: int | float,
+    remaining: int | None,
+    seed: int,
+    each: int = 0,
 ) -> tuple[VisitPlan, ...]:
     """The visits of one sweep, in a random order that depends on `seed` and `sweep` alone.
 
@@ -35,10 +40,13 @@ def plan_sweep(
         passes: steps of a visit = passes x views, rounded up; less than 1 where a step draws several views.
         remaining: steps left in the budget, or None without one. Where they do not suffice for the sweep,
             or would leave less than half a sweep behind, all visits are scaled to use up exactly these.
+        each: steps of every visit, whatever its views; 0 shares them out by views.
     """
     seen = {block: count for block, count in sorted(views.items()) if count > 0}
     order = list(seen)
     random.Random(f"sweep {seed} {sweep}").shuffle(order)
+    if each > 0:
+        seen, passes = dict.fromkeys(seen, 1), each
     steps = {block: math.ceil(passes * count) for block, count in seen.items()}
     full = sum(steps.values())
     if remaining is None or remaining >= full + full // 2:

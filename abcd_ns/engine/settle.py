@@ -5,8 +5,21 @@ from dataclasses import replace
 from torch import Tensor
 
 from abcd_ns.engine.block_state import BlockState
-from abcd_ns.engine.scaffold import part, reserve_of, revealed
+from abcd_ns.engine.scaffold import WHOLE, part, reserve_of, revealed
 from abcd_ns.engine.scene import StoredScene
+
+
+def settle(scene: StoredScene, block: int, state: BlockState, migrate: bool = True) -> dict[int, BlockState]:
+    """The blocks that change when `block`, or with WHOLE the scaffold of all, has been trained.
+
+    Args:
+        migrate: False drops the Gaussians that left their cell.
+    """
+    if block == WHOLE:
+        return settle_scaffold(scene, state)
+    if not migrate:
+        return {block: state[_owner(scene, state) == block]}
+    return settle_block(scene, block, state)
 
 
 def settle_block(scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:

@@ -81,6 +81,23 @@ class AbcdModelConfig(SplatfactoModelConfig):
             setattr(self, name, value)
 
 
+def check_training(training: TrainingConfig) -> None:
+    """Look for options that contradict each other.
+
+    Raises:
+        UserError: two do, or one is out of range.
+    """
+    if training.overlap < 0:
+        raise UserError(f"--pipeline.training.overlap must be 0 or more, not {training.overlap}.")
+    if training.overlap > 0 and training.exact:
+        raise UserError("--pipeline.training.overlap and exact exclude each other: choose one.")
+    if training.overlap > 0 and training.layers:
+        raise UserError(
+            "--pipeline.training.overlap is for blocks that are trained without layers: set "
+            "--pipeline.training.layers False."
+        )
+
+
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam as 3DGS uses it, one pass over memory for each parameter."""
@@ -140,6 +157,7 @@ class AbcdTrainerConfig(TrainerConfig):
                 raise UserError("ABCD trains on one device; leave out --machine.num-devices.")
             if self.pipeline.blocks < 1:
                 raise UserError(f"--pipeline.blocks must be 1 or more, not {self.pipeline.blocks}.")
+            check_training(self.pipeline.training)
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")
             self.pipeline.model.mirror(self.pipeline.training)

@@ -9,7 +9,10 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.exact import ExactCoordinator
+from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
 from abcd_ns.engine.initialize import thin_out
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget
@@ -92,7 +95,7 @@ class AbcdPipeline(VanillaPipeline):
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer)
         tree = BlockTree.from_json(store.header["tree"])
-        coordinator = Coordinator(
+        coordinator = coordinator_for(config.training)(
             config.training,
             Budget(trainer.total_steps, config.max_seconds),
             StoredScene(tree, store),
@@ -125,10 +128,21 @@ class AbcdPipeline(VanillaPipeline):
             )
         tree = cut_space(gaussians, self.config.blocks, self.config.partition)
         store = ParameterStore.create(folder, {"tree": tree.to_json()})
+        if training.overlap > 0:
+            store.commit(independent_at_rest(tree, gaussians))
+            return store, False
         largest = -(-len(gaussians) // tree.num_blocks)
-        keep = largest if training.warmup > 0 and tree.num_blocks > 1 else None
+        warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.exact
+        keep = largest if warms_up else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
+
+
+def coordinator_for(training: TrainingConfig) -> type[Coordinator]:
+    """Who runs a training by these options."""
+    if training.exact:
+        return ExactCoordinator
+    return IndependentCoordinator if training.overlap > 0 else Coordinator
 
 
 def cut_space(gaussians: Gaussians, blocks: int, partition: str) -> BlockTree:

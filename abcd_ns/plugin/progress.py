@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.events import Event, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.run_state import UNLIMITED
 
 SECONDS_BETWEEN_LINES = 10.0
 """Where the output is no terminal (a log file, say), a line is printed this often."""
@@ -62,8 +63,8 @@ class ProgressReport:
         before = event.psnr if self._psnr is None else self._psnr
         self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
         steps = self._visit.steps if self._visit else 0
-        whole = self._visit is not None and self._visit.block is None
-        self._show(f"step {event.visit_step}" if whole else f"step {event.visit_step}/{steps}")
+        endless = not 0 < steps < UNLIMITED or (self._visit is not None and self._visit.block is None)
+        self._show(f"step {event.visit_step}" if endless else f"step {event.visit_step}/{steps}")
 
     def _end_sweep(self, event: SweepEnded) -> None:
         if self._coordinator.scene.tree.num_blocks > 1:

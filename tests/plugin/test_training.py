@@ -134,11 +134,23 @@ def test_more_steps_go_on_from_where_a_run_ended(data, tmp_path, trained):
     assert longer.pipeline.coordinator.state.step == STEPS + 8
 
 
-@pytest.mark.parametrize("method", [methods.abcd_ablated, methods.abcd_monolithic])
+@pytest.mark.parametrize(
+    "method",
+    [
+        methods.abcd_ablated,
+        methods.abcd_monolithic,
+        methods.abcd_partition,
+        methods.abcd_exact,
+        methods.abcd_paper,
+    ],
+    ids=lambda method: method.config.method_name,
+)
 def test_the_other_methods_train_and_load(data, tmp_path, method):
     trainer = run(configure(data, tmp_path, method, steps=12))
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
-    assert pipeline.model.tree.num_blocks == (1 if method is methods.abcd_monolithic else 3)
+    # A grid has at least as many cells as asked for: here 2 x 2.
+    blocks = {"abcd-monolithic": 1, "abcd-paper": 4}
+    assert pipeline.model.tree.num_blocks == blocks.get(method.config.method_name, 3)
     assert np.isfinite(pipeline.get_average_eval_image_metrics()["psnr"])
 
 
@@ -187,6 +199,8 @@ def test_the_saved_config_is_the_config(trained):
         (lambda c: setattr(c.machine, "num_devices", 2), "one device"),
         (lambda c: setattr(c, "mixed_precision", True), "float32"),
         (lambda c: setattr(c.pipeline, "blocks", 0), "--pipeline.blocks"),
+        (lambda c: setattr(c.pipeline.training, "overlap", 0.2), "--pipeline.training.overlap"),
+        (lambda c: setattr(c.pipeline.training, "overlap", -0.2), "--pipeline.training.overlap"),
         (lambda c: setattr(c.pipeline.datamanager, "data", Path("nowhere")), "nowhere"),
     ],
 )

@@ -1,6 +1,7 @@
 """Small scenes for tests: Gaussians in a box, cameras around it, photos drawn from a known truth."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -97,6 +98,8 @@ def make_coordinator(
     resume: bool = False,
     bits: int = 32,
     scaffold: int | None = None,
+    kind: type[Coordinator] = Coordinator,
+    content: Callable = blocks_at_rest,
     **training,
 ) -> Coordinator:
     """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is."""
@@ -106,11 +109,11 @@ def make_coordinator(
     else:
         tree = tree or build_kd(gaussians.means, blocks)
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-        store.commit(blocks_at_rest(tree, gaussians, scaffold))
+        store.commit(content(tree, gaussians, *([] if scaffold is None else [scaffold])))
     empty = Gaussians.empty(gaussians.sh_degree)
     params = {name: torch.nn.Parameter(value) for name, value in empty.items()}
     config = TrainingConfig(sh_degree=gaussians.sh_degree, **training)
-    coordinator = Coordinator(
+    coordinator = kind(
         config,
         Budget(steps=steps),
         StoredScene(tree, store),

@@ -1,6 +1,7 @@
 """Made-up runs for tests of what `abcd compare` writes. No number here was ever measured."""
 
 from abcd_ns.tools.compare.results import SCHEMA, LeftOut, Protocol, Results
+from abcd_ns.tools.runs.job import METHODS
 from abcd_ns.tools.runs.machine import Machine, Versions
 from abcd_ns.tools.runs.run import CurvePoint, Failure, Run, ViewScore
 
@@ -44,14 +45,13 @@ def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, speed: 
 
 def made_up_results(*runs: Run, seeds: tuple[int, ...] = (0,), **fields) -> Results:
     """Results with these runs."""
-    methods = ("abcd-monolithic", "abcd", "abcd-ablated", "splatfacto")
     protocol = Protocol(
         scene="made-up",
         downscale=4,
         held_out="every 8th view",
         seconds=60.0,
         steps=None,
-        methods=methods,
+        methods=METHODS,
         seeds=seeds,
         blocks=8,
         evals=6,

@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from abcd_ns.errors import UserError
 from abcd_ns.tools.compare.protocol import Options, make_plan, read_options
+from abcd_ns.tools.runs.configs import trainer_config
 from abcd_ns.tools.runs.job import METHODS, Settings
 
-CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("compare-*.toml"))
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.toml"))
 
 
 def options(scene: Path, **given) -> Options:
@@ -36,6 +37,18 @@ def test_every_method_runs_with_every_seed_in_its_own_folder(tmp_path):
     assert len({job.folder(plan.out) for job in plan.jobs}) == 4
 
 
+@pytest.mark.parametrize("method", [method for method in METHODS if method != "splatfacto"])
+def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, method):
+    (job,) = make_plan(options(tmp_path, methods=(method,), steps=90, blocks=4)).jobs
+    config = trainer_config(job, tmp_path)
+    training = config.pipeline.training
+    assert config.method_name == method
+    assert config.pipeline.blocks == (1 if method == "abcd-monolithic" else 4)
+    assert (training.overlap > 0) == (method == "abcd-partition")
+    assert training.exact == (method == "abcd-exact")
+    assert training.visit_steps == (23 if method == "abcd-paper" else 0)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -53,6 +66,7 @@ def test_every_method_runs_with_every_seed_in_its_own_folder(tmp_path):
         ({"max_gaussians": -1}, "--max-gaussians is -1"),
         ({"methods": ("nerfacto",)}, "no method 'nerfacto'"),
         ({"methods": ()}, "at least one"),
+        ({"methods": ("abcd-paper",), "steps": None, "seconds": 9.0}, "abcd-paper .* use --steps"),
         ({"seeds": (1, 1)}, "different numbers"),
         ({"seeds": (-1,)}, "different numbers"),
     ],

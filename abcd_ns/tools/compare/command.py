@@ -56,12 +56,13 @@ def compare(
     Args:
         data: The scene: a folder with a COLMAP model or transforms.json, as for `ns-train abcd --data`.
         out: Folder for the results; absent, empty, or one of an earlier comparison under the same protocol.
-        methods: Of abcd-monolithic, abcd, abcd-ablated (these are the default) and splatfacto (needs CUDA).
+        methods: Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-exact,
+            abcd-paper (needs steps) and splatfacto (needs CUDA).
         seconds: Budget of a run: seconds of training; evaluation, saving and compiling do not count.
         steps: Budget of a run: optimisation steps. Give either this or seconds.
         seeds: One run of every method for each. Default: 0.
         downscale: Divides the photos' width and height. Default: 1.
-        blocks: Blocks of abcd and abcd-ablated. Default: 8.
+        blocks: Blocks of every method that has any. Default: 8.
         evals: Points of the curve of held-out PSNR over time, the last at the end. Default: 8.
         max_gaussians: In the whole scene; 0 for no limit. Default: 0.
         no_densify: Train the initial Gaussians only: none are added or pruned.

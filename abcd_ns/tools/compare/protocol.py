@@ -115,6 +115,10 @@ def _check_lists(given: Options) -> None:
     for method in given.methods:
         if method not in METHODS:
             raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
+    if "abcd-paper" in given.methods and given.steps is None:
+        raise UserError(
+            "abcd-paper gives each cell a fixed number of steps: use --steps instead of --seconds."
+        )
     if not given.methods or not given.seeds:
         raise UserError("Give at least one of --methods and one of --seeds.")
     check_numbers("--seeds", given.seeds, 0)

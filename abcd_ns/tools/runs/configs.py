@@ -24,6 +24,9 @@ ENDLESS = 10**9
 _REGISTERED = {
     "abcd": methods.abcd,
     "abcd-ablated": methods.abcd_ablated,
+    "abcd-partition": methods.abcd_partition,
+    "abcd-exact": methods.abcd_exact,
+    "abcd-paper": methods.abcd_paper,
     "abcd-monolithic": methods.abcd_monolithic,
 }
 
@@ -81,6 +84,9 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
     pipeline.datamanager.dataparser = _parser(job)
     if job.method != "abcd-monolithic":
         pipeline.blocks = settings.blocks
+    if job.method == "abcd-paper":
+        # One visit to each cell; cells that no view sees leave their steps to the others.
+        pipeline.training.visit_steps = -(-settings.steps // settings.blocks)
     pipeline.max_seconds = settings.seconds
     pipeline.training.seed = job.seed
     pipeline.training.density.max_gaussians = settings.max_gaussians

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol, get_args
 
-Method = Literal["abcd-monolithic", "abcd", "abcd-ablated", "splatfacto"]
+Method = Literal[
+    "abcd-monolithic", "abcd", "abcd-ablated", "abcd-partition", "abcd-exact", "abcd-paper", "splatfacto"
+]
 METHODS: tuple[str, ...] = get_args(Method)
 """In the order in which tables and charts show them."""
 HELD_OUT_EVERY = 8

@@ -11,10 +11,21 @@ COLORS = {
     "abcd-monolithic": "#D55E00",
     "abcd": "#0072B2",
     "abcd-ablated": "#8A5A83",
+    "abcd-partition": "#8A6A00",
+    "abcd-exact": "#B3306B",
+    "abcd-paper": "#7A3E00",
     "splatfacto": "#007A5A",
 }
 """After Okabe and Ito 2008, told apart with every kind of colour blindness; darkened where text needs it."""
-MARKERS = {"abcd-monolithic": "s", "abcd": "o", "abcd-ablated": "^", "splatfacto": "D"}
+MARKERS = {
+    "abcd-monolithic": "s",
+    "abcd": "o",
+    "abcd-ablated": "^",
+    "abcd-partition": "v",
+    "abcd-exact": "X",
+    "abcd-paper": "P",
+    "splatfacto": "D",
+}
 """For print without colour."""
 STYLE = {
     "font.family": "sans-serif",

@@ -95,9 +95,9 @@ class GaussiansStudy(Common):
         "abcd",
         "abcd-monolithic",
     )
-    """Of abcd, abcd-ablated and abcd-monolithic; a curve for each."""
+    """Of the abcd methods; a curve for each."""
     blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 8
-    """Blocks of abcd and abcd-ablated."""
+    """Blocks of all but abcd-monolithic."""
 
     def plan(self) -> StudyPlan:
         """All runs, checked."""
@@ -115,7 +115,7 @@ class OptionsStudy(Common):
     method: AbcdMethod = "abcd"
     """What is changed."""
     blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 8
-    """Blocks of abcd and abcd-ablated, unless varied."""
+    """Blocks of all but abcd-monolithic, unless varied."""
     max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """In the whole scene, unless varied; 0 for no limit."""
 

@@ -9,7 +9,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.tools.runs.checks import check_budget, check_numbers, check_places, check_ranges
 from abcd_ns.tools.runs.job import AS_IT_IS, METHODS, Change, Job, Settings, Variant
 
-AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
+AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic", "abcd-partition", "abcd-exact", "abcd-paper"]
 Study = Literal["blocks", "gaussians", "options"]
 BLOCKS, LIMIT = "blocks", "training.density.max_gaussians"
 """The options that the first two studies vary."""
