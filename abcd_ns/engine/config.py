@@ -30,6 +30,9 @@ class TrainingConfig:
     batch: int = 0
     """Views drawn in one step; learning rates grow with its square root. 0 takes 1 where the scene is one
     block, which is 3DGS, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
+    influence_share: float = 0.98
+    """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
+    the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
     visit_views: int = 32
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
     first_passes: int = 2

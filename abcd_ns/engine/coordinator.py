@@ -5,7 +5,6 @@ sample, renders it, steps its optimizers, and reports back. The coordinator deci
 everything else at rest in the store, and tells its listeners what happens.
 """
 
-import math
 import random
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,28 +19,20 @@ from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
 from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.influence import DIGITS, Influence, influence, weights
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
+from abcd_ns.engine.planner import Planner
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
-from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.scaffold import WHOLE, join, part
+from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
+from abcd_ns.engine.scaffold import join, part
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.schedule import (
-    VisitPlan,
-    endless_order,
-    exponential_decay,
-    passes_of_sweep,
-    plan_sweep,
-    sh_degree_at,
-    view_order,
-    views_per_visit,
-    visit_views,
-)
+from abcd_ns.engine.schedule import endless_order, exponential_decay, sh_degree_at, view_order
 from abcd_ns.engine.settle import has_reserve, settle
 from abcd_ns.engine.storage import LayerCache
-from abcd_ns.engine.types import View
-from abcd_ns.engine.visit import VisitGeometry, VisitLayers, survey
+from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.visit import VisitLayers
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
@@ -83,6 +74,16 @@ class Coordinator:
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
         self.batch = config.batch or (1 if scene.tree.num_blocks == 1 else DEFAULT_BATCH)
+        self._planner = Planner(
+            config,
+            budget,
+            scene,
+            self.views,
+            rasterizer,
+            batch=self.batch,
+            windows=config.layers and self._ownership == "fragments" and scene.tree.num_blocks > 1,
+            device=self.device,
+        )
         self._pace = Pace(optimizers)
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
@@ -133,15 +134,15 @@ class Coordinator:
             background=background(self.config, self.state.step, place).to(self.device),
         )
 
+    def _shot(self, sample: Sample) -> Shot:
+        return Shot(sample.view, sample.crop, sample.near, None if sample.near is None else sample.window)
+
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
         changes = self._active.is_whole or self.config.sh_restart
         rasters = self._rasterizer.draw(
             live_gaussians(self.params),
-            [
-                Shot(sample.view, sample.crop, sample.near, None if sample.near is None else sample.window)
-                for sample in batch.samples
-            ],
+            [self._shot(sample) for sample in batch.samples],
             sh_degree=self.sh_degree if changes else self._active.sh_degree,
             antialiased=self.config.antialiased,
             absgrad=self.density.absgrad,
@@ -209,7 +210,7 @@ class Coordinator:
             progress=self.progress,
             steps=self._clocks.steps,
             taken=taken,
-            views=len(self._active.geometry.views),
+            views=self.state.views.get(self._active.geometry.block, len(self._active.geometry.views)),
             room=None if limit is None else limit - self.count(),
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
         )
@@ -257,40 +258,13 @@ class Coordinator:
         return self.state.active
 
     def _begin_visit(self) -> None:
-        began = self.stopwatch.seconds
+        degree, began = self.sh_degree, self.stopwatch.seconds
         if self.state.visit == 0 and has_reserve(self.scene) and self.progress < self.config.warmup:
-            self.state.active = self._scaffold_visit(began)
+            self.state.active = self._planner.warm_up(degree, began)
         else:
-            self.state.active = self._block_visit(began)
+            self.state.active = self._planner.next_visit(self.state, degree, began)
         self.state.visit += 1
         self._attach(self.state.active)
-
-    def _scaffold_visit(self, began: float) -> ActiveVisit:
-        geometry = VisitGeometry(WHOLE, {index: view.full for index, view in self.views.items()}, None)
-        steps = UNLIMITED if self.budget.steps is None else math.ceil(self.budget.steps * self.config.warmup)
-        return ActiveVisit(0, geometry, self.sh_degree, steps, geometry.views, began=began)
-
-    def _block_visit(self, began: float) -> ActiveVisit:
-        plan, geometry = self._next_visit()
-        earlier = BlockState.from_tensors(*self.scene.store.load(plan.block)).clocks.visits
-        used = self._views_used(len(geometry.views))
-        return ActiveVisit(
-            number=self.state.visit,
-            geometry=geometry,
-            sh_degree=self.config.sh_degree if self.config.sh_restart else self.sh_degree,
-            steps=plan.steps,
-            views=visit_views(geometry.views, used, earlier, self.config.seed),
-            began=began,
-        )
-
-    def _next_visit(self) -> tuple[VisitPlan, VisitGeometry]:
-        """The next block that some view sees; blocks that none sees any more are passed over."""
-        while True:
-            plan = self._next_plan()
-            geometry = self._survey(plan.block, window=self._uses_windows)
-            self.state.views[plan.block] = len(geometry.views)
-            if geometry.views:
-                return plan, geometry
 
     def _attach(self, active: ActiveVisit) -> None:
         blocks = range(self.scene.tree.num_blocks) if active.is_whole else [active.geometry.block]
@@ -311,6 +285,22 @@ class Coordinator:
         before = self.stopwatch.seconds
         self._layers = self._draw_layers(active)
         active.layer_seconds += self.stopwatch.seconds - before
+        if active.done == 0:
+            self._look(active)
+
+    def _look(self, active: ActiveVisit) -> None:
+        """Find out how much the doubtful views show of the block by now."""
+        for view in active.looked_at:
+            sample = self._sample(view, 0)
+            found = weights(
+                live_gaussians(self.params),
+                self._rasterizer,
+                self._shot(sample),
+                sample.layers and sample.layers.front.transmittance,
+                antialiased=self.config.antialiased,
+            )
+            share = float(found.sum()) / sample.view.full.pixels
+            self.state.influence[active.geometry.block][view] = round(share, DIGITS)
 
     def _order_of(self, active: ActiveVisit) -> tuple[int, ...]:
         taken = 0 if active.is_whole else active.steps * self.batch
@@ -338,6 +328,8 @@ class Coordinator:
         active = self._active
         self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
         state = self._detached()
+        if active.is_whole:
+            self.state.influence = self._influence_of_all(state.gaussians)
         updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
         self.scene.lift()
         self.state.active, self._layers = None, None
@@ -359,42 +351,10 @@ class Coordinator:
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
 
-    def _next_plan(self) -> VisitPlan:
-        state, config = self.state, self.config
-        if not state.queue:
-            if not state.views:
-                blocks = range(self.scene.tree.num_blocks)
-                state.views = {b: len(self._survey(b, window=False).views) for b in blocks}
-            else:
-                state.sweep += 1
-            remaining = None if self.budget.steps is None else self.budget.steps - state.step
-            passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
-            used = {block: self._views_used(seen) for block, seen in state.views.items()}
-            steps = (passes / self.batch, remaining, config.seed, config.visit_steps)
-            state.queue = list(plan_sweep(state.sweep, used, *steps))
-            if not state.queue:
-                raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
-        return state.queue.pop(0)
-
-    def _views_used(self, seen: int) -> int:
-        """Of the views that see a block, how many a visit uses."""
-        most = max(self.state.views.values())
-        return views_per_visit(seen, most, self.config.visit_views) if most else 0
-
-    @property
-    def _uses_windows(self) -> bool:
-        fragments = self._ownership == "fragments" and self.scene.tree.num_blocks > 1
-        return self.config.layers and fragments
-
-    def _survey(self, block: int, window: bool) -> VisitGeometry:
-        return survey(
-            self.scene.gaussians(block).to(self.device),
-            block,
-            self.views.values(),
-            self._rasterizer,
-            cell=self.scene.tree.cell(block) if window else None,
-            percentile=self.config.window_percentile,
-        )
+    def _influence_of_all(self, scaffold: Gaussians) -> Influence:
+        owner = self.scene.tree.assign(scaffold.means)
+        options = {"antialiased": self.config.antialiased}
+        return influence(scaffold, owner, self.views.values(), self._rasterizer, **options)
 
     def _detached(self) -> BlockState:
         return detach(self.params, self.optimizers, self._growth, self._clocks)

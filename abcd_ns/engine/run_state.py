@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+from abcd_ns.engine.influence import Influence
 from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
 from abcd_ns.engine.visit import VisitGeometry
@@ -43,6 +44,8 @@ class ActiveVisit:
     steps: int
     views: tuple[int, ...]
     """Indices of the views in use, of those that see the block."""
+    looked_at: tuple[int, ...] = ()
+    """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
     done: int = 0
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
@@ -71,7 +74,9 @@ class RunState:
     queue: list[VisitPlan] = field(default_factory=list)
     """Visits of this sweep still to come."""
     views: dict[int, int] = field(default_factory=dict)
-    """By block, how many views saw it when last looked at; 0 means that none does."""
+    """By block, how many views were worth training it on when last looked at; 0 means that none is."""
+    influence: Influence = field(default_factory=dict)
+    """As far as known; blocks that are missing are trained on all views that see them."""
     active: ActiveVisit | None = None
     seconds: float = 0.0
     """Training time up to the last save."""
@@ -82,10 +87,12 @@ class RunState:
             **vars(self.active),
             "geometry": self.active.geometry.to_json(),
             "views": list(self.active.views),
+            "looked_at": list(self.active.looked_at),
         }
         queue = [[plan.block, plan.steps] for plan in self.queue]
         views = {str(block): count for block, count in self.views.items()}
-        return {**vars(self), "queue": queue, "active": active, "views": views}
+        known = {str(b): {str(v): value for v, value in row.items()} for b, row in self.influence.items()}
+        return {**vars(self), "queue": queue, "active": active, "views": views, "influence": known}
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "RunState":
@@ -93,10 +100,12 @@ class RunState:
         active = data["active"]
         if active is not None:
             geometry = VisitGeometry.from_json(active["geometry"])
-            active = ActiveVisit(**{**active, "geometry": geometry, "views": tuple(active["views"])})
+            views = {name: tuple(active[name]) for name in ("views", "looked_at")}
+            active = ActiveVisit(**{**active, **views, "geometry": geometry})
         queue = [VisitPlan(*plan) for plan in data["queue"]]
         views = {int(block): count for block, count in data["views"].items()}
-        return RunState(**{**data, "queue": queue, "active": active, "views": views})
+        known = {int(b): {int(v): value for v, value in row.items()} for b, row in data["influence"].items()}
+        return RunState(**{**data, "queue": queue, "active": active, "views": views, "influence": known})
 
 
 class Stopwatch:

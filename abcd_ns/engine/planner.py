@@ -1,0 +1,130 @@
+"""Which block is trained next, on which views, and for how many steps."""
+
+import math
+from collections.abc import Mapping
+
+import torch
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.influence import worth_training
+from abcd_ns.engine.rasterizer import Rasterizer
+from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, Budget, RunState
+from abcd_ns.engine.scaffold import WHOLE
+from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.schedule import VisitPlan, passes_of_sweep, plan_sweep, views_per_visit, visit_views
+from abcd_ns.engine.types import View
+from abcd_ns.engine.visit import VisitGeometry, survey
+
+
+class Planner:
+    """Plans the visits of a run; all that it remembers is in the run's state.
+
+    Args:
+        views: the training views, by index.
+        batch: views in a step.
+        windows: whether frozen fragments near a block are sorted in with its own.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        budget: Budget,
+        scene: StoredScene,
+        views: Mapping[int, View],
+        rasterizer: Rasterizer,
+        *,
+        batch: int,
+        windows: bool,
+        device: torch.device,
+    ) -> None:
+        self._config, self._budget, self._scene = config, budget, scene
+        self._views, self._rasterizer, self._device = views, rasterizer, device
+        self._batch, self._windows = batch, windows
+
+    def warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
+        """The visit in which the scaffold of all blocks is trained."""
+        crops = {index: view.full for index, view in self._views.items()}
+        geometry, steps = VisitGeometry(WHOLE, crops, None), self._budget.steps
+        taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
+        return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
+
+    def next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
+        """A visit to the next block that some view sees; blocks that none sees any more are passed over.
+
+        Raises:
+            RuntimeError: no view sees any block.
+        """
+        while True:
+            plan = self._next_plan(state)
+            geometry = self._survey(plan.block, self._windows)
+            kept = self._worth_training(state, geometry)
+            state.views[plan.block] = len(kept)
+            if kept:
+                return self._visit(state, plan, geometry, kept, sh_degree, began)
+
+    def _visit(
+        self,
+        state: RunState,
+        plan: VisitPlan,
+        geometry: VisitGeometry,
+        kept: tuple[int, ...],
+        sh_degree: int,
+        began: float,
+    ) -> ActiveVisit:
+        seed, used = self._config.seed, self._views_used(state, len(kept))
+        earlier = BlockState.from_tensors(*self._scene.store.load(plan.block)).clocks.visits
+        doubtful = tuple(view for view in geometry.views if view not in set(kept))
+        looked_at = visit_views(doubtful, 1, earlier, seed) if doubtful else ()
+        return ActiveVisit(
+            number=state.visit,
+            geometry=geometry,
+            sh_degree=self._config.sh_degree if self._config.sh_restart else sh_degree,
+            steps=plan.steps,
+            views=(*visit_views(kept, used, earlier, seed), *looked_at),
+            looked_at=looked_at,
+            began=began,
+        )
+
+    def _worth_training(self, state: RunState, geometry: VisitGeometry) -> tuple[int, ...]:
+        """Of the views that see the block, those that show nearly all that is to be seen of it."""
+        known = state.influence.get(geometry.block)
+        if known is None or self._config.influence_share >= 1:
+            return geometry.views
+        seen = {view: known[view] for view in geometry.views if view in known}
+        return worth_training(seen, self._config.influence_share)
+
+    def _next_plan(self, state: RunState) -> VisitPlan:
+        config = self._config
+        if not state.queue:
+            if not state.views:
+                state.views = self._views_of_blocks(state)
+            else:
+                state.sweep += 1
+            remaining = None if self._budget.steps is None else self._budget.steps - state.step
+            passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
+            used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
+            steps = (passes / self._batch, remaining, config.seed, config.visit_steps)
+            state.queue = list(plan_sweep(state.sweep, used, *steps))
+            if not state.queue:
+                raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
+        return state.queue.pop(0)
+
+    def _views_of_blocks(self, state: RunState) -> dict[int, int]:
+        blocks = range(self._scene.tree.num_blocks)
+        return {b: len(self._worth_training(state, self._survey(b, windows=False))) for b in blocks}
+
+    def _views_used(self, state: RunState, seen: int) -> int:
+        """Of the views that see a block, how many a visit uses."""
+        most = max(state.views.values())
+        return views_per_visit(seen, most, self._config.visit_views) if most else 0
+
+    def _survey(self, block: int, windows: bool) -> VisitGeometry:
+        return survey(
+            self._scene.gaussians(block).to(self._device),
+            block,
+            self._views.values(),
+            self._rasterizer,
+            cell=self._scene.tree.cell(block) if windows else None,
+            percentile=self._config.window_percentile,
+        )
