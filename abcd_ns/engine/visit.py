@@ -21,6 +21,8 @@ from abcd_ns.engine.visibility import footprint, fragment_box_intersects, reach_
 Side = Literal["front", "back"]
 SIDES: tuple[Side, ...] = ("front", "back")
 """The two layers of a view, under the names of their fields in Parts."""
+AT_HAND_BYTES = 128 << 20
+"""Size of the layers that a visit keeps decoded, at most; the others are read from the cache for each step."""
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
 
@@ -103,6 +105,13 @@ class Surroundings:
     window: ZWindow | None
     """Where the fragments of `near` count."""
 
+    @property
+    def nbytes(self) -> int:
+        """Size of its images."""
+        images = [image for layer in vars(self.layers).values() for image in vars(layer).values()]
+        images += [] if self.window is None else [self.window.near, self.window.far]
+        return sum(image.nbytes for image in images)
+
 
 class VisitLayers:
     """F and B for the views of one visit, drawn once and kept in the layer cache.
@@ -129,6 +138,8 @@ class VisitLayers:
         self._units = painter.units(exclude=geometry.block)
         self._near = self._load_near()
         self._near_seen: dict[int, Splats] = {}
+        self._at_hand: dict[int, Surroundings] = {}
+        self._room = AT_HAND_BYTES
 
     def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Parts]]:
         """Draw what the cache lacks for these views; yields each view with its layers when they are ready.
@@ -158,11 +169,16 @@ class VisitLayers:
         """
         if self._frozen_versions() != self._versions:
             raise StaleLayerError(f"a frozen block changed during the visit of block {self._geometry.block}")
-        crop = self._geometry.crops[view]
+        if view in self._at_hand:
+            return self._at_hand[view]
         layers = self._cached(view)
         if layers is None:  # never drawn, or the disposable cache has lost it
             ((_, layers),) = self.draw([view])
-        return Surroundings(layers, self._near_of(view), self._window(view, crop))
+        around = Surroundings(layers, self._near_of(view), self._window(view, self._geometry.crops[view]))
+        if around.nbytes <= self._room:
+            self._at_hand[view] = around
+            self._room -= around.nbytes
+        return around
 
     def _frozen_versions(self) -> dict[int, int]:
         scene = self._painter.scene
