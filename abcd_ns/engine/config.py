@@ -35,7 +35,7 @@ class TrainingConfig:
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
     visit_views: int = 32
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
-    first_passes: int = 2
+    first_passes: int = 4
     """Uses of each of these views in a visit of the first sweep."""
     last_passes: int = 8
     """Uses of each of these views in a visit of late sweeps; one more with each sweep until then."""

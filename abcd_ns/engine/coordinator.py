@@ -17,7 +17,7 @@ from abcd_ns.engine.batch import Batch, Rendered, Sample, background
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
-from abcd_ns.engine.density import DensityClock, DensityControl
+from abcd_ns.engine.density import DensityClock, DensityControl, for_blocks
 from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.influence import DIGITS, Influence, influence, weights
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
@@ -29,7 +29,7 @@ from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.scaffold import join, part
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import endless_order, exponential_decay, sh_degree_at, view_order
-from abcd_ns.engine.settle import has_reserve, settle
+from abcd_ns.engine.settle import had_reserve, has_reserve, settle
 from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.engine.visit import VisitLayers
@@ -68,7 +68,7 @@ class Coordinator:
         self.device = torch.device(device)
         self.announce = Announcer()
         self.stopwatch = Stopwatch()
-        self.density = DensityControl(config.density)
+        self.density = DensityControl(for_blocks(config.density, scene.tree.num_blocks))
         self.state = RunState()
         self._scene_key = scene_key
         self._rasterizer = rasterizer
@@ -204,10 +204,16 @@ class Coordinator:
             self.params, self.optimizers, self._growth, rendered.infos, clock
         )
 
+    @property
+    def _progress_of_blocks(self) -> float:
+        """Share of the run, its warm-up left out, that is done."""
+        before = self.config.warmup if had_reserve(self.scene) else 0.0
+        return max(self.progress - before, 0.0) / (1 - before)
+
     def _density_clock(self, taken: int) -> DensityClock:
         limit = self.config.density.limit
         return DensityClock(
-            progress=self.progress,
+            progress=self._progress_of_blocks,
             steps=self._clocks.steps,
             taken=taken,
             views=self.state.views.get(self._active.geometry.block, len(self._active.geometry.views)),
@@ -286,9 +292,9 @@ class Coordinator:
         self._layers = self._draw_layers(active)
         active.layer_seconds += self.stopwatch.seconds - before
         if active.done == 0:
-            self._look(active)
+            self._measure_influence(active)
 
-    def _look(self, active: ActiveVisit) -> None:
+    def _measure_influence(self, active: ActiveVisit) -> None:
         """Find out how much the doubtful views show of the block by now."""
         for view in active.looked_at:
             sample = self._sample(view, 0)

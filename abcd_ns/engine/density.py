@@ -7,7 +7,7 @@ step number they are given, either to gather statistics or to refine now.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -23,6 +23,7 @@ from abcd_ns.engine.relocation import binomials, compute_relocation, covariances
 GATHER, REFINE = 1, 6
 BEFORE_RESET, AFTER_RESET = 7, 4
 
+REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 50
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 
@@ -38,12 +39,14 @@ class DensityConfig:
     strategy: Literal["default", "mcmc", "off"] = "default"
     """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""
     refine_start: float = 1 / 60
-    """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
+    """Share of the run, its warm-up left out, before the first refinement (500 of 30,000 steps in
+    splatfacto)."""
     refine_stop: float = 0.5
-    """Share of the run after which the number of Gaussians no longer changes."""
-    refine_every: int = 100
-    """A block's own steps between refinements; never fewer than the views that see the block."""
-    warmup_passes: int = 4
+    """Share of the run, its warm-up left out, after which the number of Gaussians no longer changes."""
+    refine_every: int = 0
+    """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
+    where the scene is one block, as splatfacto, and 50 elsewhere: a block sees fewer steps than a scene."""
+    warmup_passes: int = 2
     """Times that each of a block's views is used before the block's first refinement."""
     reset_every: int = 3000
     """A block's own steps between opacity resets (`default` strategy); 0 means never."""
@@ -75,12 +78,18 @@ class DensityConfig:
         return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
 
 
+def for_blocks(config: DensityConfig, blocks: int) -> DensityConfig:
+    """The options of a scene of so many blocks: nothing is left to choose."""
+    chosen = REFINE_EVERY_SCENE if blocks == 1 else REFINE_EVERY_BLOCK
+    return replace(config, refine_every=config.refine_every or chosen)
+
+
 @dataclass(frozen=True)
 class DensityClock:
     """Where the run and the active block stand; all that decides whether to refine."""
 
     progress: float
-    """Share of the whole run that is done, 0..1."""
+    """Share of the run, its warm-up left out, that is done: 0..1."""
     steps: int
     """Views that were drawn to train the block so far, this step's included."""
     taken: int

@@ -48,10 +48,14 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
     return {**settled, reserve_of(scene.tree): waiting[:0]}
 
 
+def had_reserve(scene: StoredScene) -> bool:
+    """Whether the run began with a scaffold."""
+    return reserve_of(scene.tree) in scene.store.blocks
+
+
 def has_reserve(scene: StoredScene) -> bool:
     """Whether Gaussians wait for the scaffold to be done."""
-    number = reserve_of(scene.tree)
-    return number in scene.store.blocks and scene.store.counts(number) > 0
+    return had_reserve(scene) and scene.store.counts(reserve_of(scene.tree)) > 0
 
 
 def _at_rest(scene: StoredScene, block: int) -> BlockState:

@@ -10,6 +10,9 @@ from torch import Tensor
 PARAM_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 """A Gaussian's parameters, under the names of nerfstudio's parameter groups, optimizers and checkpoints."""
 
+NEAR_PLANE = 0.01
+"""gsplat's near plane; world units."""
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -110,6 +113,8 @@ class View:
     height: int
     index: int = 0
     """Which camera of the training set this is; names its layers and its photo."""
+    near: float = NEAR_PLANE
+    """Gaussians whose mean has a smaller camera z are not drawn; world units."""
 
     @property
     def full(self) -> Crop:

@@ -22,7 +22,7 @@ Side = Literal["front", "back"]
 SIDES: tuple[Side, ...] = ("front", "back")
 """The two layers of a view, under the names of their fields in Parts."""
 AT_HAND_BYTES = 128 << 20
-"""Size of the layers that a visit keeps decoded, at most; the others are read from the cache for each step."""
+"""Size of the layers that a visit keeps decoded, at most; others are read from the cache for each step."""
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
 

@@ -119,6 +119,9 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Number of blocks that space is cut into; 1 is ordinary 3DGS."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
+    near_plane: float = 0.0
+    """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
+    the nearest distance at which a photo shows a point."""
     layer_bits: Literal[16, 32] = 16
     """Bits of a colour or transmittance in cached layers."""
     max_seconds: float | None = None

@@ -1,5 +1,6 @@
 """Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -21,7 +22,7 @@ from abcd_ns.engine.param_swap import live_gaussians
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.scene import BlockScene, MemoryScene
-from abcd_ns.engine.types import Gaussians, Layer, View
+from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.plugin.datamanager import BATCH
 from abcd_ns.plugin.metrics import image_metrics
 from abcd_ns.plugin.views import view_of
@@ -52,6 +53,7 @@ class AbcdModel(SplatfactoModel):
             num_cameras=self.num_train_data, device="cpu"
         )
         self.tree = build_kd(torch.zeros(0, 3), 1)
+        self.near = NEAR_PLANE
         self.step = 0
         self.crop_box: OrientedBox | None = None
         random = self.config.background_color == "random"
@@ -105,13 +107,14 @@ class AbcdModel(SplatfactoModel):
             state.update({f"{prefix}gauss_params.{n}": value for n, value in self.merged().items()})
         return state
 
-    def get_extra_state(self) -> dict[str, str]:
-        """How space is cut, which the merged list of Gaussians does not tell."""
-        return {"tree": self.tree.to_json()}
+    def get_extra_state(self) -> dict[str, Any]:
+        """What the merged list of Gaussians does not tell: how space is cut, and the near plane."""
+        return {"tree": self.tree.to_json(), "near": self.near}
 
-    def set_extra_state(self, state: dict[str, str]) -> None:
-        """Take over the cut of space from a checkpoint."""
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take over the cut of space and the near plane from a checkpoint."""
         self.tree = BlockTree.from_json(state["tree"])
+        self.near = state.get("near", NEAR_PLANE)
 
     # -- pictures ------------------------------------------------------------------------------------
 
@@ -120,7 +123,11 @@ class AbcdModel(SplatfactoModel):
         batch = (camera.metadata or {}).get(BATCH)
         if self.training and batch is not None:
             return self._batch_outputs(batch)
-        return self._whole_outputs(view_of(camera.to(self.device)))
+        return self._whole_outputs(self.view(camera))
+
+    def view(self, camera: Cameras) -> View:
+        """The camera as the engine draws it: on the model's device, from the scene's near plane on."""
+        return replace(view_of(camera.to(self.device)), near=self.near)
 
     def _batch_outputs(self, batch: Batch) -> dict[str, Any]:
         if self._coordinator is None:

@@ -1,9 +1,11 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -14,6 +16,7 @@ from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.exact import ExactCoordinator
 from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
 from abcd_ns.engine.initialize import thin_out
+from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
@@ -91,7 +94,7 @@ class AbcdPipeline(VanillaPipeline):
 
     def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Coordinator:
         config, folder = self.config, trainer.base_dir / "abcd"
-        views = views_of(self.datamanager.train_dataset.cameras)
+        views = self._views()
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer)
         tree = BlockTree.from_json(store.header["tree"])
@@ -110,6 +113,13 @@ class AbcdPipeline(VanillaPipeline):
         if resumed:
             coordinator.restore()
         return coordinator
+
+    def _views(self) -> list[View]:
+        """The training views; from now on the model draws from their near plane on."""
+        views, points = views_of(self.datamanager.train_dataset.cameras), self.model.seed_points
+        known = torch.zeros(0, 3) if points is None else points[0].cpu()
+        self.model.near = self.config.near_plane or near_plane(known, views)
+        return [replace(view, near=self.model.near) for view in views]
 
     def _open_store(self, folder: Path, trainer: "AbcdTrainer") -> tuple[ParameterStore, bool]:
         """The run's own store: a copy of the one it goes on from, or a new one."""

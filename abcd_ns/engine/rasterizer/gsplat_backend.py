@@ -63,6 +63,7 @@ def _project(gaussians: Gaussians, view: View, sh_degree: int, antialiased: bool
         K[None],
         view.width,
         view.height,
+        near_plane=view.near,
         packed=False,
         calc_compensations=antialiased,
     )

@@ -92,7 +92,7 @@ def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) 
     degrees = like.new_tensor([float(degree < sh_degree) for degree in range(MAX_SH_DEGREE)])
     pinhole = (K[0, 0, None], K[1, 1, None], K[:2, 2])
     pose = (viewmat[:3, :3].reshape(-1), viewmat[:3, 3])
-    return torch.cat((*pose, *pinhole, options, view.center.to(like), degrees))
+    return torch.cat((*pose, *pinhole, options, view.center.to(like), like.new_tensor([view.near]), degrees))
 
 
 def project_packed(

@@ -18,8 +18,6 @@ from abcd_ns.engine.rasterizer.spherical_harmonics import (
     sh_degree_of,
 )
 
-NEAR_PLANE = 0.01
-"""Gaussians with a smaller camera z are not drawn; world units."""
 FAR_PLANE = 1e10
 """Gaussians with a larger camera z are not drawn; world units."""
 EPS_2D = 0.3
@@ -38,9 +36,10 @@ REACH_MARGIN = 0.01
 PARAMETERS = 14 + 3 * BASES
 """Rows that `splat` takes: means x y z, log scales 3, quaternion w x y z, logit of the opacity, spherical
 harmonics of degree 0 (red, green, blue), then of degrees 1 to 3 (red, green, blue of each)."""
-CAMERA = 22 + MAX_SH_DEGREE
+CAMERA = 23 + MAX_SH_DEGREE
 """Numbers of a camera: world-to-camera rotation 9 and translation 3, fx fy cx cy, width and height, 1 where
-opacities are compensated (antialiased) else 0, camera centre 3, 1 for each degree of harmonics in use."""
+opacities are compensated (antialiased) else 0, camera centre 3, near plane, 1 for each degree of harmonics in
+use."""
 X, Y, DEPTH, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE = range(10)
 """Rows that `splat` gives: what is drawn, with gradients,"""
 GRADED = BLUE + 1
@@ -71,11 +70,12 @@ def _graded_rows(parameters: Tensor, camera: Tensor, bounds: bool) -> list[Tenso
     number = camera.unbind(0)
     rotation, (tx, ty, tz) = number[:9], number[9:12]
     fx, fy, cx, cy, width, height, antialiased = number[12:19]
+    near = number[22]
     mx = rotation[0] * x + rotation[1] * y + rotation[2] * z + tx
     my = rotation[3] * x + rotation[4] * y + rotation[5] * z + ty
     depth = rotation[6] * x + rotation[7] * y + rotation[8] * z + tz
     # What lies behind the camera is projected as if at z = 1: any finite value will do, its radius is 0.
-    inverse_z = 1.0 / torch.where(depth >= NEAR_PLANE, depth, 1.0)
+    inverse_z = 1.0 / torch.where(depth >= near, depth, 1.0)
     slope_x, slope_y = mx * inverse_z, my * inverse_z
     u, v = fx * slope_x + cx, fy * slope_y + cy
 
@@ -98,9 +98,9 @@ def _graded_rows(parameters: Tensor, camera: Tensor, bounds: bool) -> list[Tenso
     opacity = opacity * torch.where(antialiased > 0, _safe_sqrt(det_sharp / det), 1.0)
     away = [x - number[19], y - number[20], z - number[21]]
     per_length = torch.rsqrt(_dot(away, away).clamp_min(TINY))
-    colors = _colors(parameters[11:], [value * per_length for value in away], number[22:])
+    colors = _colors(parameters[11:], [value * per_length for value in away], number[23:])
     rows = [u, v, depth, yy / det, -xy / det, xx / det, opacity, *colors]
-    return [*rows, xx, xy, yy, _radius(u, v, depth, xx, yy, det, width, height)] if bounds else rows
+    return [*rows, xx, xy, yy, _radius(u, v, depth, xx, yy, det, width, height, near)] if bounds else rows
 
 
 def _camera_axes(
@@ -143,11 +143,11 @@ def _safe_sqrt(x: Tensor) -> Tensor:
     return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)
 
 
-def _radius(u, v, depth, xx, yy, det, width, height) -> Tensor:
+def _radius(u, v, depth, xx, yy, det, width, height, near) -> Tensor:
     """3 sigma along the longer axis, rounded up; 0 for what no pixel sees."""
     mid = 0.5 * (xx + yy)
     radius = (3.0 * (mid + (mid * mid - det).clamp_min(0.01).sqrt()).sqrt()).ceil()
-    drawn = (depth >= NEAR_PLANE) & (depth <= FAR_PLANE) & (det > 0)
+    drawn = (depth >= near) & (depth <= FAR_PLANE) & (det > 0)
     drawn = drawn & (u + radius > 0) & (u - radius < width) & (v + radius > 0) & (v - radius < height)
     return torch.where(drawn, radius.clamp_max(MAX_RADIUS), 0.0)
 

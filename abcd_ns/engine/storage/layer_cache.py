@@ -23,9 +23,9 @@ class StaleLayerError(RuntimeError):
 
 
 def view_fingerprint(view: View) -> str:
-    """A hexadecimal digest of the pose, K and size of a camera; its index does not matter."""
+    """A hexadecimal digest of the pose, K, size and near plane of a camera; its index does not matter."""
     digest = hashlib.blake2b(digest_size=16)
-    digest.update(f"{view.width} {view.height} {view.viewmat.dtype} {view.K.dtype}".encode())
+    digest.update(f"{view.width} {view.height} {view.viewmat.dtype} {view.K.dtype} {view.near!r}".encode())
     for matrix in (view.viewmat, view.K):
         digest.update(matrix.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -16,7 +16,6 @@ from abcd_ns.engine.loss import psnr
 from abcd_ns.engine.types import Layer
 from abcd_ns.plugin.metrics import image_metrics
 from abcd_ns.plugin.model import AbcdModel
-from abcd_ns.plugin.views import view_of
 from abcd_ns.tools.runs.run import ViewScore
 
 Picture = Float[Tensor, "h w 3"]
@@ -55,14 +54,14 @@ def held_out_views(pipeline: VanillaPipeline) -> Iterator[HeldOutView]:
 def merged_drawer(model: SplatfactoModel) -> Drawer:
     """Draws all Gaussians at once, as any viewer does."""
     if isinstance(model, AbcdModel):
-        return lambda camera: _on_background(model.draw_merged(_view(model, camera)).layer, model)
+        return lambda camera: _on_background(model.draw_merged(model.view(camera)).layer, model)
     return lambda camera: model.get_outputs_for_camera(camera)["rgb"]
 
 
 def composited_drawer(model: SplatfactoModel) -> Drawer:
     """Draws block by block, through layers; a model without blocks has one way to be drawn only."""
     if isinstance(model, AbcdModel):
-        return lambda camera: _on_background(model.draw_composited(_view(model, camera)), model)
+        return lambda camera: _on_background(model.draw_composited(model.view(camera)), model)
     return merged_drawer(model)
 
 
@@ -134,10 +133,6 @@ def undisturbed(pipeline: VanillaPipeline) -> Iterator[None]:
             yield
     finally:
         pipeline.train(was_training)
-
-
-def _view(model: AbcdModel, camera: Cameras):
-    return view_of(camera.to(model.device))
 
 
 def _on_background(layer: Layer, model: AbcdModel) -> Picture:

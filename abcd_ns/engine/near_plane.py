@@ -1,0 +1,45 @@
+"""From where on a scene is drawn: no nearer than any photo shows anything.
+
+Gaussians right before a camera cover all of its picture. In a view that is trained on they are soon gone; a
+view that is not, from a place that no photo was taken from, may be lost to a handful of them, though each
+is a fair guess at what other views show there. Photos do tell how near things come to a camera.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.types import NEAR_PLANE, View
+
+SHARE = 0.5
+"""The near plane, as a share of the distance of the nearest point that a view sees."""
+OUTLIERS = 0.001
+"""Share of the points that a view sees which may be nearer: wrong matches."""
+MOST_POINTS, MOST_VIEWS = 20_000, 500
+"""Of more than these, an evenly spaced choice is looked at."""
+
+
+def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
+    """A near plane for all views of a scene: half the nearest distance at which any sees a point.
+
+    Args:
+        points: of the sparse reconstruction, world units.
+
+    Returns:
+        Camera z, world units; gsplat's own where there is nothing to tell by, and never less.
+    """
+    points = points[:: -(-len(points) // MOST_POINTS) or 1].double()
+    nearest = [_nearest(points, view) for view in views[:: -(-len(views) // MOST_VIEWS) or 1]]
+    seen = [depth for depth in nearest if depth is not None]
+    return max(SHARE * min(seen), NEAR_PLANE) if seen else NEAR_PLANE
+
+
+def _nearest(points: Float[Tensor, "n 3"], view: View) -> float | None:
+    matrix, K = view.viewmat.to(points), view.K.to(points)
+    x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).unbind(1)
+    ahead = z > NEAR_PLANE
+    u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    seen = z[ahead & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)]
+    return float(torch.quantile(seen, OUTLIERS)) if len(seen) else None
