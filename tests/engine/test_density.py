@@ -1,13 +1,14 @@
 """Growing and pruning: gsplat's strategies on a block's own clock."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
 
 from abcd_ns.engine.block_state import BlockState
-from abcd_ns.engine.density import DensityClock, DensityConfig, DensityControl
+from abcd_ns.engine.density import DensityClock, DensityConfig, DensityControl, for_blocks
 from abcd_ns.engine.param_swap import attach, live_gaussians, make_adam
 from abcd_ns.engine.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -166,3 +167,9 @@ def test_covariances_against_the_definition():
     eigenvalues = torch.linalg.eigvalsh(found)
     assert torch.allclose(eigenvalues, (scales**2).sort(dim=1).values)
     assert torch.allclose(found, found.transpose(1, 2))
+
+
+@pytest.mark.parametrize(("blocks", "given", "expected"), [(1, 0, 100), (8, 0, 50), (1, 7, 7), (8, 7, 7)])
+def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given, expected):
+    config = DensityConfig(refine_every=given, refine_stop=0.3)
+    assert for_blocks(config, blocks) == replace(config, refine_every=expected)

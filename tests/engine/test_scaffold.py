@@ -102,3 +102,19 @@ def test_no_more_is_live_than_in_the_largest_block(tmp_path, views, photos, star
         train_step(coordinator, photos)
         most = max(most, len(coordinator.params["means"]))
     assert most <= 32  # a migrant or two
+
+
+def test_density_controls_clock_starts_when_the_warm_up_is_over(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.5, density=STILL
+    )
+    found = []
+    watched = coordinator.density.after_step
+
+    def watch(params, optimizers, growth, infos, clock):
+        found.append(clock.progress)
+        return watched(params, optimizers, growth, infos, clock)
+
+    coordinator.density.after_step = watch
+    train(coordinator, photos)
+    assert found == pytest.approx([(step + 1) / 20 for step in range(20)])
