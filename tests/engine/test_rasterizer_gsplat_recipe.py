@@ -5,6 +5,7 @@ are compared under tests/gpu.
 """
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -26,13 +27,14 @@ from tests.engine.rasterizer_scenes import (
 VIEW = small_view(70, 45)
 
 
-def fake_projection(means, covars, quats, scales, viewmats, Ks, width, height, packed, calc_compensations):
+def fake_projection(
+    means, covars, quats, scales, viewmats, Ks, width, height, near_plane, packed, calc_compensations
+):
     assert covars is None
     assert not packed
     covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    return _torch_impl._fully_fused_projection(
-        means, covars, viewmats, Ks, width, height, calc_compensations=calc_compensations
-    )
+    options = {"near_plane": near_plane, "calc_compensations": calc_compensations}
+    return _torch_impl._fully_fused_projection(means, covars, viewmats, Ks, width, height, **options)
 
 
 def fake_harmonics(degree, dirs, coeffs, masks):
@@ -108,6 +110,17 @@ def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_de
     torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
     for name in PARAM_NAMES:
         assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
+
+
+def test_the_near_plane_is_the_views(backend):
+    gaussians = random_gaussians(40)
+    near = 1.001 * float(backend.project(gaussians, VIEW).depths.median())
+    cut = replace(VIEW, near=near)
+    found, expected = (
+        draw(gaussians, cut, sh_degree=0).color for draw in (backend, TorchRasterizer("never"))
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
+    assert not torch.allclose(found, backend(gaussians, VIEW, sh_degree=0).color)
 
 
 @pytest.mark.parametrize("crop", [None, Crop(19, 5, 30, 31)])
