@@ -45,7 +45,7 @@ class DensityConfig:
     """Share of the run, its warm-up left out, after which the number of Gaussians no longer changes."""
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
-    where the scene is one block, as splatfacto, and 50 elsewhere: a block sees fewer steps than a scene."""
+    where a block sees every step, as splatfacto has it, and 50 elsewhere."""
     warmup_passes: int = 2
     """Times that each of a block's views is used before the block's first refinement."""
     reset_every: int = 3000

@@ -27,7 +27,7 @@ from abcd_ns.engine.batch import Batch, Rendered, Sample, background
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
 from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.density import DensityClock
+from abcd_ns.engine.density import DensityClock, DensityControl, for_blocks
 from abcd_ns.engine.events import StepTaken
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.ordering import front_to_back
@@ -80,6 +80,8 @@ class ExactCoordinator(Coordinator):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.batch = self.config.batch or 1
+        # Every block sees every step.
+        self.density = DensityControl(for_blocks(self.config.density, 1))
         self._optics = Optics(list(self.views.values()))
         self._batch: Batch | None = None
         self._degree = 0

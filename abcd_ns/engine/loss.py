@@ -51,15 +51,20 @@ def photometric_loss(
     height, width = rendered.shape[:2]
     by_pixel = (1 - ssim_lambda) / (3 * full_pixels)
     has_windows = ssim_lambda > 0 and full_windows > 0 and min(height, width) >= SSIM_WINDOW
-    difference = rendered - photo
     if not has_windows:
-        summed = difference.abs().sum() if pixel_loss == "l1" else difference.square().sum()
-        return by_pixel * summed
+        return by_pixel * _by_pixels(rendered, photo, pixel_loss)
     in_kernel = by_pixel if pixel_loss == "l1" else 0.0
     weights = rendered.new_tensor([in_kernel, ssim_lambda / (3 * full_windows)])
     planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
     loss = _Photometric.apply(*planes, weights)
-    return loss if pixel_loss == "l1" else loss + by_pixel * difference.square().sum()
+    return loss if pixel_loss == "l1" else loss + by_pixel * _by_pixels(rendered, photo, pixel_loss)
+
+
+def _by_pixels(
+    rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], pixel_loss: Literal["l1", "l2"]
+) -> Float[Tensor, ""]:
+    difference = rendered - photo
+    return difference.abs().sum() if pixel_loss == "l1" else difference.square().sum()
 
 
 def ssim_windows(height: int, width: int) -> int:

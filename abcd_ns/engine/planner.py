@@ -92,7 +92,8 @@ class Planner:
         if known is None or self._config.influence_share >= 1:
             return geometry.views
         seen = {view: known[view] for view in geometry.views if view in known}
-        return worth_training(seen, self._config.influence_share)
+        # What a block has got since, Gaussians from the reserve say, may be seen where it was not before.
+        return worth_training(seen, self._config.influence_share) or geometry.views
 
     def _next_plan(self, state: RunState) -> VisitPlan:
         config = self._config

@@ -87,6 +87,12 @@ def check_training(training: TrainingConfig) -> None:
     Raises:
         UserError: two do, or one is out of range.
     """
+    if not 0 <= training.warmup < 1:
+        raise UserError(f"--pipeline.training.warmup must be from 0 to below 1, not {training.warmup}.")
+    if not training.influence_share > 0:
+        raise UserError(
+            f"--pipeline.training.influence-share must be above 0, not {training.influence_share}."
+        )
     if training.overlap < 0:
         raise UserError(f"--pipeline.training.overlap must be 0 or more, not {training.overlap}.")
     if training.overlap > 0 and training.exact:
@@ -160,6 +166,8 @@ class AbcdTrainerConfig(TrainerConfig):
                 raise UserError("ABCD trains on one device; leave out --machine.num-devices.")
             if self.pipeline.blocks < 1:
                 raise UserError(f"--pipeline.blocks must be 1 or more, not {self.pipeline.blocks}.")
+            if not self.pipeline.near_plane >= 0:
+                raise UserError(f"--pipeline.near-plane must be 0 or more, not {self.pipeline.near_plane}.")
             check_training(self.pipeline.training)
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")

@@ -148,3 +148,9 @@ def test_a_run_that_stops_goes_on(tmp_path, views, photos):
     found, expected = by_rotation(whole_scene(again)), by_rotation(whole_scene(whole))
     for name, value in expected.items():
         assert torch.allclose(getattr(found, name), value, rtol=1e-4, atol=1e-4), name
+
+
+def test_every_block_sees_every_step_and_so_refines_as_one(tmp_path, views, start):
+    for blocks in (1, 4):
+        coordinator = exact(tmp_path / str(blocks), start, views, blocks=blocks)
+        assert coordinator.density.config.refine_every == 100

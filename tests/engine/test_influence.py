@@ -125,3 +125,19 @@ def test_influence_survives_a_save(tmp_path, views, photos, start):
     again = RunState.from_json(coordinator.state.to_json())
     assert again.influence == coordinator.state.influence
     assert again.active.looked_at == coordinator.state.active.looked_at
+
+
+def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views)
+    train(coordinator, photos, steps=12)
+    coordinator.state.influence = {0: {}, 1: {99: 0.5}}
+    visited = {}
+
+    def note(event):
+        if isinstance(event, VisitBegan):
+            visited.setdefault(event.block, coordinator.state.active.views)
+
+    coordinator.announce.subscribe(note)
+    train(coordinator, photos)
+    assert sorted(visited) == [0, 1, 2, 3]
+    assert all(sorted(used) == [0, 1, 2, 3, 4] for used in visited.values())

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from abcd_ns.tools.runs.machine import Machine, Versions
-from abcd_ns.tools.runs.records import RecordError, decode, encode, read_json, write_json
+from abcd_ns.tools.runs.records import encode, read_record, write_json
 from abcd_ns.tools.runs.run import Failure, Run
 
 SCHEMA = 1
@@ -77,8 +77,4 @@ def read_results(path: Path) -> Results:
     Raises:
         RecordError: it is absent, of another schema, or does not fit the schema.
     """
-    data = read_json(path)
-    schema = data.get("schema") if isinstance(data, dict) else None
-    if schema != SCHEMA:
-        raise RecordError(f"{path} has schema {schema!r}; this version of abcd reads schema {SCHEMA}.")
-    return decode(Results, data, str(path))
+    return read_record(path, Results, SCHEMA)

@@ -89,6 +89,19 @@ def read_json(path: Path) -> Any:
         raise RecordError(f"{path} is not JSON ({error}); delete it and run again.") from None
 
 
+def read_record(path: Path, cls: type[R], schema: int) -> R:
+    """A record with a field `schema`, as `write_json` wrote it.
+
+    Raises:
+        RecordError: the file is absent, of another schema, or does not fit the schema.
+    """
+    data = read_json(path)
+    found = data.get("schema") if isinstance(data, dict) else None
+    if found != schema:
+        raise RecordError(f"{path} has schema {found!r}; this version of abcd reads schema {schema}.")
+    return decode(cls, data, str(path))
+
+
 def _is_required(field: dataclasses.Field) -> bool:
     return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 

@@ -1,8 +1,8 @@
 """Tables of runs: what is measured, in which words and with how many digits."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean, stdev
 
 from rich import box
 from rich.console import Console
@@ -59,12 +59,8 @@ def cell(runs: Sequence[Run], measure: Measure) -> str:
     values = [measure.value(run) for run in runs]
     if not values or any(value is None for value in values):
         return NOTHING
-    mean = sum(values) / len(values)
-    text = f"{mean:,.{measure.digits}f}"
-    if len(values) == 1:
-        return text
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1))
-    return f"{text} ± {deviation:,.{measure.digits}f}"
+    text = f"{fmean(values):,.{measure.digits}f}"
+    return text if len(values) == 1 else f"{text} ± {stdev(values):,.{measure.digits}f}"
 
 
 def budget_of(seconds: float | None, steps: int | None) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import fmean
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -19,7 +20,7 @@ from abcd_ns.tools.study.findings import (
     find_gap,
     find_knee,
 )
-from abcd_ns.tools.study.results import Arm, StudyResults, average
+from abcd_ns.tools.study.results import Arm, StudyResults
 
 BAND = "#ececec"
 KNEE_LINE = 0.065
@@ -136,7 +137,7 @@ def _draw_line(
     if seeds and any(len(arm.runs) > 1 for arm in arms):
         points = [(arm.value, value(run)) for arm in arms for run in arm.runs]
         axes.scatter(*zip(*points, strict=True), s=9, color=color, alpha=0.4, linewidths=0)
-    heights = [average([value(run) for run in arm.runs]) for arm in arms]
+    heights = [fmean(value(run) for run in arm.runs) for arm in arms]
     (line,) = axes.plot(
         [arm.value for arm in arms],
         heights,

@@ -1,10 +1,10 @@
 """What a study says: the gap between best and worst, the knee of a curve, differences to the default."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean, stdev
 
-from abcd_ns.tools.study.results import Arm, StudyResults, average
+from abcd_ns.tools.study.results import Arm, StudyResults
 
 GOAL_DB = 0.5
 """Between the best and the worst number of blocks, no more than this: no cliff."""
@@ -34,15 +34,12 @@ class Difference:
     @property
     def mean(self) -> float:
         """Over the seeds that both have."""
-        return average(self.by_seed)
+        return fmean(self.by_seed)
 
     @property
     def deviation(self) -> float | None:
         """Standard deviation over the seeds (n - 1); None for a single one."""
-        if len(self.by_seed) < 2:
-            return None
-        squares = sum((value - self.mean) ** 2 for value in self.by_seed)
-        return math.sqrt(squares / (len(self.by_seed) - 1))
+        return None if len(self.by_seed) < 2 else stdev(self.by_seed)
 
 
 def find_gap(arms: Sequence[Arm]) -> Gap | None:

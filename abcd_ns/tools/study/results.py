@@ -1,11 +1,11 @@
 """results.json of a study: every run, and what is needed to make them again."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 
 from abcd_ns.tools.runs.machine import Machine, Versions
-from abcd_ns.tools.runs.records import RecordError, decode, encode, read_json, write_json
+from abcd_ns.tools.runs.records import encode, read_record, write_json
 from abcd_ns.tools.runs.run import Failure, Run
 
 SCHEMA = 1
@@ -27,12 +27,12 @@ class Arm:
     @property
     def psnr(self) -> float:
         """Held out, merged, dB; mean over the seeds."""
-        return average([run.psnr_merged for run in self.runs])
+        return fmean(run.psnr_merged for run in self.runs)
 
     @property
     def gaussians(self) -> float:
         """At the end, mean over the seeds."""
-        return average([run.gaussians for run in self.runs])
+        return fmean(run.gaussians for run in self.runs)
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,6 @@ class StudyResults:
         return tuple(method for method in self.protocol.methods if self.of(method))
 
 
-def average(values: Sequence[float]) -> float:
-    """The mean of at least one value."""
-    return sum(values) / len(values)
-
-
 def write_study(path: Path, results: StudyResults) -> None:
     """Write results.json.
 
@@ -102,8 +97,4 @@ def read_study(path: Path) -> StudyResults:
     Raises:
         RecordError: it is absent, of another schema, or does not fit the schema.
     """
-    data = read_json(path)
-    schema = data.get("schema") if isinstance(data, dict) else None
-    if schema != SCHEMA:
-        raise RecordError(f"{path} has schema {schema!r}; this version of abcd reads schema {SCHEMA}.")
-    return decode(StudyResults, data, str(path))
+    return read_record(path, StudyResults, SCHEMA)
