@@ -26,7 +26,7 @@ from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, 
 from abcd_ns.engine.planner import Planner
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.scaffold import join, part
+from abcd_ns.engine.scaffold import join, live_of, part
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import endless_order, exponential_decay, sh_degree_at, view_order
 from abcd_ns.engine.settle import had_reserve, has_reserve, settle
@@ -81,7 +81,6 @@ class Coordinator:
             self.views,
             rasterizer,
             batch=self.batch,
-            windows=config.layers and self._ownership == "fragments" and scene.tree.num_blocks > 1,
             device=self.device,
         )
         self._pace = Pace(optimizers)
@@ -242,9 +241,10 @@ class Coordinator:
         """
         updates = {}
         if (active := self.state.active) is not None:
-            block, state = active.geometry.block, self._detached()
-            held = part(state, self._owner) if active.is_whole else {block: state}
+            state, live = self._detached(), live_of(self.scene.tree)
+            held = part(state, self._owner) if active.is_whole else {live: state}
             updates = {block: state.to_tensors() for block, state in held.items()}
+            active.saved = not active.is_whole
         self.state.seconds = self.stopwatch.seconds
         self.scene.store.commit(updates, state=self.state.to_json())
         if pin is not None:
@@ -273,7 +273,9 @@ class Coordinator:
         self._attach(self.state.active)
 
     def _attach(self, active: ActiveVisit) -> None:
-        blocks = range(self.scene.tree.num_blocks) if active.is_whole else [active.geometry.block]
+        tree = self.scene.tree
+        alone = live_of(tree) if active.saved else active.geometry.block
+        blocks = range(tree.num_blocks) if active.is_whole else [alone]
         states = [BlockState.from_tensors(*self.scene.store.load(block)) for block in blocks]
         rows = torch.tensor([len(state) for state in states])
         self._owner = torch.tensor(list(blocks)).repeat_interleave(rows).to(self.device)
@@ -324,7 +326,16 @@ class Coordinator:
             device=self.device,
         )
         settings = PaintSettings(active.sh_degree, self.config.antialiased)
-        layers = VisitLayers(painter, self.cache, active.geometry, self.views, settings, self._scene_key)
+        layers = VisitLayers(
+            painter,
+            self.cache,
+            active.geometry,
+            self.scene.at_rest(active.geometry.block).to(self.device),
+            self.views,
+            settings,
+            window_weight=self.config.window_weight,
+            scene_key=self._scene_key,
+        )
         wanted = dict.fromkeys(self._order[active.done * self.batch :])
         for done, _ in enumerate(layers.draw(wanted), start=1):
             self.announce(LayersDrawn(active.number, done, len(wanted)))
@@ -337,6 +348,8 @@ class Coordinator:
         if active.is_whole:
             self.state.influence = self._influence_of_all(state.gaussians)
         updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
+        if active.saved:
+            updates[live_of(self.scene.tree)] = state[:0]
         self.scene.lift()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds

@@ -20,6 +20,7 @@ from abcd_ns.engine.compositing import empty_layer, fold
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.ordering import node_children_in_order, split_around
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
+from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 from abcd_ns.engine.visibility import blur_reach, reaches, widest_slant
@@ -37,10 +38,22 @@ class PaintSettings:
 
 @dataclass(frozen=True)
 class Parts:
-    """A unit's layer, cut by the active block's window: what lies in front of it and what lies behind."""
+    """What one view sees of a unit, cut by the active block's window."""
 
     front: Layer
     back: Layer
+    inside: Splats | None = None
+    """The unit's own Gaussians that have fragments in the window; None by means."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A unit's Gaussians on the device."""
+
+    gaussians: Gaussians
+    """Its own, then those of other units that reach into it."""
+    own: int
+    """How many are its own."""
 
 
 class Painter:
@@ -80,14 +93,15 @@ class Painter:
         """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass."""
         return tuple(self._descend(0, exclude))
 
-    def load(self, unit: int, exclude: int | None = None) -> Gaussians:
+    def load(self, unit: int, exclude: int | None = None) -> Loaded:
         """On the device: the Gaussians of the unit's blocks and, by fragments, all others that reach in."""
         inside = [b for b in self.tree.leaves(unit) if b != exclude]
         parts = [self.scene.gaussians(block) for block in inside]
+        own = sum(map(len, parts))
         if self.ownership == "fragments" and unit != 0:
             outside = [b for b in range(self.tree.num_blocks) if b not in inside and b != exclude]
             parts += [self.reaching(block, self.tree.box(unit)) for block in outside]
-        return Gaussians.cat(parts).to(self.device)
+        return Loaded(Gaussians.cat(parts).to(self.device), own)
 
     def reaching(self, block: int, box: Box) -> Gaussians:
         """The block's Gaussians that some view may see inside `box`."""
@@ -98,7 +112,7 @@ class Painter:
     def paint(
         self,
         unit: int,
-        gaussians: Gaussians,
+        loaded: Loaded,
         view: View,
         crop: Crop,
         settings: PaintSettings,
@@ -108,31 +122,30 @@ class Painter:
     ) -> Parts:
         """Draw a unit, loaded by `load`, cut by the window of the active block (by fragments) or put
         whole before or behind the active block (by means). Without an active block all is in front."""
+        gaussians, nothing = loaded.gaussians, self._nothing(view, crop)
         if self.ownership == "means":
             layer = self._draw(gaussians, view, crop, settings, None)
-            nothing = empty_layer(crop.height, crop.width, self.device, layer.color.dtype)
             front = active is None or self._is_in_front(unit, active, view)
             return Parts(layer, nothing) if front else Parts(nothing, layer)
         span = ray_interval(self.tree.box(unit), view, crop) if unit != 0 else _everywhere(crop, self.device)
         if window is None:
-            return Parts(
-                self._draw(gaussians, view, crop, settings, span),
-                empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype),
-            )
+            return Parts(self._draw(gaussians, view, crop, settings, span), nothing)
         before = ZWindow(span.near, torch.minimum(span.far, window.near))
         behind = ZWindow(torch.maximum(span.near, window.far), span.far)
         if len(gaussians) == 0:
-            nothing = empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
             return Parts(nothing, nothing)
-        layers = self.rasterizer.layers(
+        cut = self.rasterizer.cut(
             gaussians,
             view,
-            (before, behind),
-            sh_degree=settings.sh_degree,
+            front=before,
+            inside=window,
+            back=behind,
             crop=crop,
+            sh_degree=settings.sh_degree,
             antialiased=settings.antialiased,
         )
-        return Parts(*layers)
+        # What reaches in from another unit is inside that one's.
+        return Parts(cut.front, cut.back, cut.inside[torch.where(cut.members < loaded.own)[0]])
 
     def order(self, units: tuple[int, ...], view: View) -> tuple[int, ...]:
         """The units front to back, as `view` sees them."""
@@ -140,12 +153,15 @@ class Painter:
         return tuple(node for node in self._walk(0, center) if node in set(units))
 
     def fold(self, parts: dict[int, Parts], view: View, crop: Crop) -> Parts:
-        """All units' parts collapsed into one layer in front of the active block and one behind."""
+        """All units' parts collapsed into one layer in front of the active block and one behind, and what
+        is inside in one."""
         ordered = [parts[unit] for unit in self.order(tuple(parts), view)]
-        nothing = empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
+        nothing = self._nothing(view, crop)
+        planes = [part.inside.planes for part in ordered if part.inside is not None and len(part.inside)]
         return Parts(
             fold([nothing, *(part.front for part in ordered)]),
             fold([nothing, *(part.back for part in ordered)]),
+            Splats(torch.cat(planes, dim=1)) if planes else None,
         )
 
     def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
@@ -158,7 +174,7 @@ class Painter:
         self, gaussians: Gaussians, view: View, crop: Crop, settings: PaintSettings, window: ZWindow | None
     ) -> Layer:
         if len(gaussians) == 0 or (window is not None and not bool((window.near < window.far).any())):
-            return empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
+            return self._nothing(view, crop)
         with torch.no_grad():
             return self.rasterizer(
                 gaussians,
@@ -168,6 +184,9 @@ class Painter:
                 antialiased=settings.antialiased,
                 z_window=window,
             ).layer
+
+    def _nothing(self, view: View, crop: Crop) -> Layer:
+        return empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
 
     def _descend(self, node: int, exclude: int | None) -> Iterator[int]:
         blocks = [block for block in self.tree.leaves(node) if block != exclude]

@@ -23,7 +23,6 @@ class Planner:
     Args:
         views: the training views, by index.
         batch: views in a step.
-        windows: whether frozen fragments near a block are sorted in with its own.
     """
 
     def __init__(
@@ -35,17 +34,16 @@ class Planner:
         rasterizer: Rasterizer,
         *,
         batch: int,
-        windows: bool,
         device: torch.device,
     ) -> None:
         self._config, self._budget, self._scene = config, budget, scene
         self._views, self._rasterizer, self._device = views, rasterizer, device
-        self._batch, self._windows = batch, windows
+        self._batch = batch
 
     def warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the scaffold of all blocks is trained."""
         crops = {index: view.full for index, view in self._views.items()}
-        geometry, steps = VisitGeometry(WHOLE, crops, None), self._budget.steps
+        geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
@@ -57,7 +55,7 @@ class Planner:
         """
         while True:
             plan = self._next_plan(state)
-            geometry = self._survey(plan.block, self._windows)
+            geometry = self._survey(plan.block)
             kept = self._worth_training(state, geometry)
             state.views[plan.block] = len(kept)
             if kept:
@@ -113,19 +111,13 @@ class Planner:
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
         blocks = range(self._scene.tree.num_blocks)
-        return {b: len(self._worth_training(state, self._survey(b, windows=False))) for b in blocks}
+        return {b: len(self._worth_training(state, self._survey(b))) for b in blocks}
 
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
         most = max(state.views.values())
         return views_per_visit(seen, most, self._config.visit_views) if most else 0
 
-    def _survey(self, block: int, windows: bool) -> VisitGeometry:
-        return survey(
-            self._scene.gaussians(block).to(self._device),
-            block,
-            self._views.values(),
-            self._rasterizer,
-            cell=self._scene.tree.cell(block) if windows else None,
-            percentile=self._config.window_percentile,
-        )
+    def _survey(self, block: int) -> VisitGeometry:
+        gaussians = self._scene.gaussians(block).to(self._device)
+        return survey(gaussians, block, self._views.values(), self._rasterizer)

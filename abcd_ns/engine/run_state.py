@@ -47,6 +47,8 @@ class ActiveVisit:
     looked_at: tuple[int, ...] = ()
     """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
     done: int = 0
+    saved: bool = False
+    """Whether the store holds the live block as it was in the middle of the visit, see scaffold.live_of."""
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
     began: float = 0.0

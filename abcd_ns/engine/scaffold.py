@@ -30,6 +30,12 @@ def reserve_of(tree: BlockTree) -> int:
     return tree.num_blocks
 
 
+def live_of(tree: BlockTree) -> int:
+    """Under which number the store keeps a block that a save found in the middle of its visit. Under its own
+    number it stays as the visit found it: its layers hang on that."""
+    return tree.num_blocks + 1
+
+
 def revealed(waiting: BlockState) -> BlockState:
     """The reserve as it joins a trained scaffold: faint and small."""
     old = waiting.gaussians

@@ -73,6 +73,10 @@ class StoredScene:
             return everything[self.tree.assign(everything.means) == block]
         if self._live is not None and self._live[0] == block:
             return self._live[1]().detach()
+        return self.at_rest(block)
+
+    def at_rest(self, block: int) -> Gaussians:
+        """The block as it is stored, whatever is live."""
         key = (block, self.version(block))
         if key not in self._ram:
             self._ram[key] = Gaussians(**self.store.load_names(block, PARAM_NAMES))

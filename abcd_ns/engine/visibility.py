@@ -46,39 +46,6 @@ def footprint(
     return Crop(x, y, width, height)
 
 
-def fragment_box_intersects(
-    depths: Float[Tensor, "n"],
-    means2d: Float[Tensor, "n 2"],
-    radii: Real[Tensor, "n"],
-    view: View,
-    box: Box,
-    crop: Crop | None = None,
-) -> Bool[Tensor, "n"]:
-    """Whether any fragment of each Gaussian may lie in `box`: False is certain, True may be cautious.
-
-    A Gaussian's fragments lie at its mean's camera z, within its square on the screen: in the world, a
-    parallelogram parallel to the image plane. It is tested by the bounds of its four corners.
-
-    Args:
-        depths: camera z of the means, world units.
-        means2d: centres in the full image, px.
-        radii: gsplat's 3 sigma radii, px; 0 where culled.
-        crop: only fragments at these pixels count; None means the whole image.
-    """
-    crop = crop or view.full
-    reach = radii.to(means2d.dtype)[:, None] * (DRAWN_SIGMAS / 3)
-    first = means2d.new_tensor([crop.x, crop.y])
-    last = means2d.new_tensor([crop.x + crop.width, crop.y + crop.height])
-    low, high = torch.maximum(means2d - reach, first), torch.minimum(means2d + reach, last)
-    drawn = (radii > 0) & (low <= high).all(dim=1)
-    u = torch.stack([low[:, 0], high[:, 0], low[:, 0], high[:, 0]])
-    v = torch.stack([low[:, 1], low[:, 1], high[:, 1], high[:, 1]])
-    corners = _unproject(torch.stack([u, v], dim=-1), depths.expand(4, -1), view)
-    lower, upper = box.lower.to(corners), box.upper.to(corners)
-    touches = (corners.amin(dim=0) <= upper) & (corners.amax(dim=0) >= lower)
-    return drawn & touches.all(dim=1)
-
-
 def reach_radius(scales: Float[Tensor, "n 3"], sigma: float = DRAWN_SIGMAS) -> Float[Tensor, "n"]:
     """`sigma` standard deviations along each Gaussian's longest axis, world units; `scales` are logs."""
     return sigma * scales.amax(dim=1).exp()
@@ -132,13 +99,3 @@ def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -
     stop = -((-math.ceil(min(high, float(size))) - margin) // align) * align
     start, stop = max(start, 0), min(stop, size)
     return start, stop - start
-
-
-def _unproject(
-    means2d: Float[Tensor, "*batch 2"], depths: Float[Tensor, "*batch"], view: View
-) -> Float[Tensor, "*batch 3"]:
-    """World-space points at given pixels and camera z."""
-    x = (means2d[..., 0] - view.K[0, 2]) / view.K[0, 0] * depths
-    y = (means2d[..., 1] - view.K[1, 2]) / view.K[1, 1] * depths
-    camera = torch.stack([x, y, depths], dim=-1)
-    return (camera - view.viewmat[:3, 3]) @ view.viewmat[:3, :3]

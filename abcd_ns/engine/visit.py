@@ -7,16 +7,14 @@ from typing import Any, Literal
 
 import torch
 
-from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.compositing import empty_layer
-from abcd_ns.engine.intervals import ray_interval
-from abcd_ns.engine.painter import Painter, PaintSettings, Parts
+from abcd_ns.engine.painter import Loaded, Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
-from abcd_ns.engine.visibility import footprint, fragment_box_intersects, reach_radius
+from abcd_ns.engine.visibility import footprint
 
 Side = Literal["front", "back"]
 SIDES: tuple[Side, ...] = ("front", "back")
@@ -34,8 +32,6 @@ class VisitGeometry:
     block: int
     crops: dict[int, Crop]
     """By view index, the pixels to train on; views that do not see the block are missing."""
-    window: Box | None
-    """The box in which frozen fragments are sorted in with the active ones; None by means."""
 
     @property
     def views(self) -> tuple[int, ...]:
@@ -45,32 +41,20 @@ class VisitGeometry:
     def to_json(self) -> dict[str, Any]:
         """As JSON; numbers survive exactly."""
         crops = {str(i): [c.x, c.y, c.width, c.height] for i, c in self.crops.items()}
-        window = self.window and [self.window.lower.tolist(), self.window.upper.tolist()]
-        return {"block": self.block, "crops": crops, "window": window}
+        return {"block": self.block, "crops": crops}
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "VisitGeometry":
         """The inverse of `to_json`."""
-        crops = {int(i): Crop(*crop) for i, crop in data["crops"].items()}
-        window = data["window"] and Box(*(torch.tensor(side, dtype=torch.float64) for side in data["window"]))
-        return VisitGeometry(data["block"], crops, window)
+        return VisitGeometry(data["block"], {int(i): Crop(*crop) for i, crop in data["crops"].items()})
 
 
 def survey(
-    gaussians: Gaussians,
-    block: int,
-    views: Iterable[View],
-    rasterizer: Rasterizer,
-    *,
-    cell: Box | None,
-    percentile: float = 0.9,
-    align: int = 16,
+    gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: Rasterizer, *, align: int = 16
 ) -> VisitGeometry:
     """Which views see the block's Gaussians, and where in the image.
 
     Args:
-        cell: the block's cell; the window is this, grown to hold the given share of the block's extents
-            at each face. None for no window.
         align: crops begin and end on multiples of this, pixels (or at the image's edge).
     """
     crops = {}
@@ -80,18 +64,7 @@ def survey(
             crop = footprint(seen.means2d, seen.radii, view, margin=CROP_MARGIN, align=align)
             if crop is not None:
                 crops[view.index] = crop
-    return VisitGeometry(block, crops, cell and grow_to_extents(cell, gaussians, percentile))
-
-
-def grow_to_extents(cell: Box, gaussians: Gaussians, percentile: float) -> Box:
-    """The cell, grown at each face until the given share of the Gaussians' extents does not reach past it."""
-    if len(gaussians) == 0:
-        return cell
-    extent = reach_radius(gaussians.scales)[:, None].double()
-    means = gaussians.means.double()
-    lower = torch.quantile(means - extent, 1 - percentile, dim=0).cpu()
-    upper = torch.quantile(means + extent, percentile, dim=0).cpu()
-    return Box(torch.minimum(cell.lower, lower), torch.maximum(cell.upper, upper))
+    return VisitGeometry(block, crops)
 
 
 @dataclass(frozen=True)
@@ -103,12 +76,12 @@ class Surroundings:
     near: Splats | None
     """Frozen Gaussians to be sorted in with the active ones, as this view sees them."""
     window: ZWindow | None
-    """Where the fragments of `near` count."""
+    """Where the fragments of `near` count; None by means."""
 
     @property
     def nbytes(self) -> int:
         """Size of its images."""
-        images = [image for layer in vars(self.layers).values() for image in vars(layer).values()]
+        images = [image for side in SIDES for image in vars(getattr(self.layers, side)).values()]
         images += [] if self.window is None else [self.window.near, self.window.far]
         return sum(image.nbytes for image in images)
 
@@ -117,7 +90,8 @@ class VisitLayers:
     """F and B for the views of one visit, drawn once and kept in the layer cache.
 
     Args:
-        geometry: crops and window.
+        own: the block's Gaussians when the visit began; they decide the windows.
+        window_weight: see TrainingConfig.
         views: all views, by index.
         scene_key: fingerprint of all else that changes a pixel, for the cache's keys.
     """
@@ -127,17 +101,21 @@ class VisitLayers:
         painter: Painter,
         cache: LayerCache,
         geometry: VisitGeometry,
+        own: Gaussians,
         views: Mapping[int, View],
         settings: PaintSettings,
+        *,
+        window_weight: float,
         scene_key: str,
     ) -> None:
         self._painter, self._cache = painter, cache
         self._geometry, self._views, self._settings = geometry, views, settings
-        self._scene_key = scene_key
+        self._window_weight, self._scene_key = window_weight, scene_key
         self._versions = self._frozen_versions()
         self._units = painter.units(exclude=geometry.block)
-        self._near = self._load_near()
-        self._near_seen: dict[int, Splats] = {}
+        self._own = own if painter.ownership == "fragments" and self._units else None
+        self._near: dict[int, Splats | None] = {}
+        self._windows: dict[int, ZWindow] = {}
         self._at_hand: dict[int, Surroundings] = {}
         self._room = AT_HAND_BYTES
 
@@ -155,9 +133,9 @@ class VisitLayers:
                 yield view, layers
         parts: dict[int, dict[int, Parts]] = {view: {} for view in missing}
         for unit in self._units:
-            gaussians = self._painter.load(unit, exclude=self._geometry.block)
+            loaded = self._painter.load(unit, exclude=self._geometry.block)
             for view in missing:
-                parts[view][unit] = self._paint(unit, gaussians, view)
+                parts[view][unit] = self._paint(unit, loaded, view)
                 if unit == self._units[-1]:
                     yield view, self._keep(view, parts.pop(view))
 
@@ -174,7 +152,7 @@ class VisitLayers:
         layers = self._cached(view)
         if layers is None:  # never drawn, or the disposable cache has lost it
             ((_, layers),) = self.draw([view])
-        around = Surroundings(layers, self._near_of(view), self._window(view, self._geometry.crops[view]))
+        around = Surroundings(layers, self._near.get(view), self._window(view))
         if around.nbytes <= self._room:
             self._at_hand[view] = around
             self._room -= around.nbytes
@@ -184,26 +162,34 @@ class VisitLayers:
         scene = self._painter.scene
         return {b: scene.version(b) for b in range(scene.tree.num_blocks) if b != self._geometry.block}
 
-    def _window(self, view: int, crop: Crop) -> ZWindow | None:
-        if self._geometry.window is None:
+    def _window(self, view: int) -> ZWindow | None:
+        if self._own is None:
             return None
-        return ray_interval(self._geometry.window, self._views[view], crop)
+        if view not in self._windows:
+            self._windows[view] = self._painter.rasterizer.depth_window(
+                self._own,
+                self._views[view],
+                crop=self._geometry.crops[view],
+                visible=self._window_weight,
+                antialiased=self._settings.antialiased,
+            )
+        return self._windows[view]
 
-    def _paint(self, unit: int, gaussians: Gaussians, view: int) -> Parts:
-        crop = self._geometry.crops[view]
+    def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts:
         return self._painter.paint(
             unit,
-            gaussians,
+            loaded,
             self._views[view],
-            crop,
+            self._geometry.crops[view],
             self._settings,
             active=self._geometry.block,
-            window=self._window(view, crop),
+            window=self._window(view),
         )
 
     def _keep(self, view: int, parts: dict[int, Parts]) -> Parts:
         """Fold and cache; what comes back went through the codec, whether or not the cache had room."""
         folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
+        self._near[view] = folded.inside
         self._cache.put_many((self._key(view, side), getattr(folded, side)) for side in SIDES)
         return Parts(*(self._on_device(through_codec(getattr(folded, s), self._cache.bits)) for s in SIDES))
 
@@ -212,6 +198,8 @@ class VisitLayers:
             crop, matrix = self._geometry.crops[view], self._views[view].viewmat
             nothing = empty_layer(crop.height, crop.width, self._painter.device, matrix.dtype)
             return Parts(nothing, nothing)
+        if self._own is not None and view not in self._near:
+            return None  # after a resume: what is near was never written down
         found = [self._cache.get(self._key(view, side)) for side in SIDES]
         if any(layer is None for layer in found):
             return None
@@ -222,8 +210,9 @@ class VisitLayers:
         return Layer(layer.color.to(device, dtype), layer.transmittance.to(device, dtype))
 
     def _key(self, view: int, side: Side) -> LayerKey:
-        geometry = self._geometry
-        cut = json.dumps([side, geometry.block, geometry.to_json()["window"], self._painter.ownership])
+        geometry, scene = self._geometry, self._painter.scene
+        window = None if self._own is None else [scene.version(geometry.block), self._window_weight]
+        cut = json.dumps([side, geometry.block, window, self._painter.ownership])
         return LayerKey(
             scene=self._scene_key,
             view=view_fingerprint(self._views[view]),
@@ -235,27 +224,3 @@ class VisitLayers:
             bits=self._cache.bits,
             prefix=f"block-{geometry.block}",
         )
-
-    def _load_near(self) -> Gaussians | None:
-        window, scene = self._geometry.window, self._painter.scene
-        if window is None or not self._versions:
-            return None
-        near = [self._painter.reaching(block, window) for block in self._versions if scene.count(block) > 0]
-        return Gaussians.cat(near).to(self._painter.device) if near else None
-
-    def _near_of(self, view: int) -> Splats | None:
-        """Of the frozen Gaussians that reach into the window, those that this view sees there."""
-        if self._near is None or self._geometry.window is None:
-            return None
-        if view not in self._near_seen:
-            camera, crop = self._views[view], self._geometry.crops[view]
-            settings = self._settings
-            seen = self._painter.rasterizer.project(
-                self._near, camera, sh_degree=settings.sh_degree, antialiased=settings.antialiased
-            )
-            hit = fragment_box_intersects(
-                seen.depths, seen.means2d, seen.radii, camera, self._geometry.window, crop
-            )
-            self._near_seen[view] = seen[torch.where(hit)[0]]
-        seen = self._near_seen[view]
-        return seen if len(seen) else None

@@ -4,12 +4,21 @@ from typing import Literal
 
 import torch
 
-from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot, ZWindow
+from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.rasterizer.chunk_kernels import CompilePolicy
 from abcd_ns.engine.rasterizer.self_check import self_check
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 
-__all__ = ["Raster", "Rasterizer", "Shot", "TorchRasterizer", "ZWindow", "make_rasterizer", "self_check"]
+__all__ = [
+    "Cut",
+    "Raster",
+    "Rasterizer",
+    "Shot",
+    "TorchRasterizer",
+    "ZWindow",
+    "make_rasterizer",
+    "self_check",
+]
 
 
 def make_rasterizer(

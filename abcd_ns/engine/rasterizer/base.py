@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.projection import Splats
@@ -53,6 +53,18 @@ class Shot:
     """What occludes and is occluded, without gradients: projected into `view` by the same rasterizer."""
     z_window: ZWindow | None = None
     """Masks the fragments of `frozen` where it is given, else those of the Gaussians; of the crop's size."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Gaussians as one view sees them, cut by windows."""
+
+    front: Layer
+    back: Layer
+    inside: Splats
+    """Those that have any fragment in the middle, in the Gaussians' order."""
+    members: Int[Tensor, "m"]
+    """Which of the Gaussians they are."""
 
 
 @runtime_checkable
@@ -125,17 +137,36 @@ class Rasterizer(Protocol):
         options = {"sh_degree": sh_degree, "antialiased": antialiased, "absgrad": absgrad}
         return self.draw(gaussians, [shot], **options)[0]
 
-    def layers(
+    def cut(
         self,
         gaussians: Gaussians,
         view: View,
-        windows: Sequence[ZWindow],
         *,
-        sh_degree: int,
+        front: ZWindow,
+        inside: ZWindow,
+        back: ZWindow,
         crop: Crop,
+        sh_degree: int,
         antialiased: bool = False,
-    ) -> list[Layer]:
-        """The Gaussians through each of several windows, as that many calls would draw them; no gradients.
+    ) -> Cut:
+        """The fragments in two windows as layers, and what has fragments in a third; no gradients.
+
+        Raises:
+            ValueError: for a backend whose `supports_z_window` is False.
+        """
+        ...
+
+    def depth_window(
+        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
+    ) -> ZWindow:
+        """In each small tile of the crop the range of camera z in which the Gaussians show; no gradients.
+
+        Args:
+            visible: fragments count where the Gaussian's weight alpha T, with nothing else in the scene, is
+                at least this, as a mean over the tile; 0 counts all.
+
+        Returns:
+            A window that holds these fragments. Where there are none it is empty, and lies in their midst.
 
         Raises:
             ValueError: for a backend whose `supports_z_window` is False.

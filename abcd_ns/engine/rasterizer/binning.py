@@ -195,6 +195,12 @@ class Candidates:
             pairs = _within_window(pairs, self.depths, windowed.index_select(0, self.rows), window)
         return _lay_out(pairs, self.rows, self.sheet, chunk)
 
+    def touching(self, window: Float[Tensor, "2 p t"]) -> Int[Tensor, "k"]:
+        """Indices of the splats that have a fragment in the window, as far as tiles can tell; ascending."""
+        everyone = torch.ones_like(self.rows, dtype=torch.bool)
+        inside = _within_window(self.pairs, self.depths, everyone, window)
+        return self.rows.index_select(0, inside.rank.unique()).sort().values
+
 
 @torch.no_grad()
 def find_candidates(

@@ -12,7 +12,13 @@ from torch.autograd.function import once_differentiable
 from abcd_ns.engine.rasterizer.binning import TileLists
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels
 from abcd_ns.engine.rasterizer.splat_kernels import CONIC_XX, OPACITY
-from abcd_ns.engine.rasterizer.torch_kernels import ALL_GRADIENTS, GRADIENTS, STATE_PLANES, gather_params
+from abcd_ns.engine.rasterizer.torch_kernels import (
+    ALL_GRADIENTS,
+    GRADIENTS,
+    MOMENTS,
+    STATE_PLANES,
+    gather_params,
+)
 
 COMPACT = 0.75
 """Tiles whose pixels are all finished are dropped once fewer than this share is left."""
@@ -127,9 +133,7 @@ class Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "5 p t"]:
         lists, sheet = job.lists, job.lists.sheet
-        # The last column, for empty slots, has opacity 0.
-        table = F.pad(torch.cat((drawn, job.always[None])), (0, 1))
-        origins = sheet.origins(table).index_select(1, lists.tiles)
+        table, origins = _table(drawn, job)
         final, trace = _composite(job, table, origins, keep_states=any(ctx.needs_input_grad))
         planes = final.new_zeros((STATE_PLANES, sheet.pixels_per_tile, sheet.tiles))
         planes[0] = 1.0
@@ -173,6 +177,25 @@ def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> 
             lanes = torch.arange(lists.chunk, device=columns.device) * level.width
             per_slot.index_copy_(0, (level.start + lanes[:, None] + columns).view(-1), by_slot)
     return per_slot
+
+
+def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
+    """For each pair of the job's lists the sum of the Gaussian's weight alpha T over the tile's pixels.
+
+    It is the gradient of the picture's sum by the Gaussian's colour.
+    """
+    lists = job.lists
+    table, origins = _table(drawn, job)
+    final, trace = _composite(job, table, origins, keep_states=True)
+    upstream = torch.zeros_like(final)
+    upstream[0] = 1.0
+    return _slot_gradients(job, table, origins, upstream, trace.columns, trace.states)[lists.slots, MOMENTS]
+
+
+def _table(drawn: Float[Tensor, "d m"], job: Job) -> tuple[Float[Tensor, "c n"], Float[Tensor, "2 a"]]:
+    """The kernels' parameters, with a last column of opacity 0 for empty slots, and the tiles' corners."""
+    table = F.pad(torch.cat((drawn, job.always[None])), (0, 1))
+    return table, job.lists.sheet.origins(table).index_select(1, job.lists.tiles)
 
 
 def sum_bags(

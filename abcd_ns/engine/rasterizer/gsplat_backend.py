@@ -20,7 +20,7 @@ from gsplat.cuda._wrapper import (
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot
+from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats, check_degree
 from abcd_ns.engine.rasterizer.splat_kernels import (
     CONIC_XX,
@@ -31,7 +31,7 @@ from abcd_ns.engine.rasterizer.splat_kernels import (
     RED,
     SPLAT_ROWS,
 )
-from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+from abcd_ns.engine.types import Crop, Gaussians, View
 
 TILE = 16
 """gsplat's tile size, pixels."""
@@ -161,8 +161,12 @@ class GsplatRasterizer(Rasterizer):
             raster.info["n_cameras"] = len(shots)
         return tuple(rasters)
 
-    def layers(self, *_args: Any, **_options: Any) -> list[Layer]:
-        """See Rasterizer.layers: stock gsplat cannot."""
+    def cut(self, *_args: Any, **_options: Any) -> Cut:
+        """See Rasterizer.cut: stock gsplat cannot."""
+        raise ValueError(NO_WINDOW)
+
+    def depth_window(self, *_args: Any, **_options: Any) -> ZWindow:
+        """See Rasterizer.depth_window: stock gsplat cannot."""
         raise ValueError(NO_WINDOW)
 
 

@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot, ZWindow
-from abcd_ns.engine.rasterizer.binning import TileLists, find_candidates, window_planes
+from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot, ZWindow
+from abcd_ns.engine.rasterizer.binning import Candidates, TileLists, find_candidates, window_planes
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.rasterizer.compositing_function import Composite, Job
+from abcd_ns.engine.rasterizer.depth_window import depth_window
 from abcd_ns.engine.rasterizer.projection import Splats, check_degree, pack, project_packed
 from abcd_ns.engine.rasterizer.splat_kernels import CONIC_XX, DEPTH, GRADED, OPACITY, RADIUS
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid, TileSheet
@@ -116,32 +117,50 @@ class TorchRasterizer(Rasterizer):
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
     @torch.no_grad()
-    def layers(
+    def cut(
         self,
         gaussians: Gaussians,
         view: View,
-        windows: Sequence[ZWindow],
         *,
-        sh_degree: int,
+        front: ZWindow,
+        inside: ZWindow,
+        back: ZWindow,
         crop: Crop,
+        sh_degree: int,
         antialiased: bool = False,
-    ) -> list[Layer]:
-        """See Rasterizer.layers."""
+    ) -> Cut:
+        """See Rasterizer.cut. Projected and binned once."""
+        for window in (front, inside, back):
+            _check_window(window, crop)
         splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
+        candidates = self._candidates(splats, crop)
+        members = candidates.touching(window_planes(candidates.sheet, [inside]))
+        layers = (self._layer(splats, candidates, window) for window in (front, back))
+        return Cut(*layers, splats[members], members)
+
+    @torch.no_grad()
+    def depth_window(
+        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
+    ) -> ZWindow:
+        """See Rasterizer.depth_window."""
+        splats = self.project(gaussians, view, antialiased=antialiased)
+        candidates = self._candidates(splats, crop)
+        job = self._job(candidates.lists(self.chunk), splats.planes, None, None, None)
+        return depth_window(candidates, splats.planes, job, visible)
+
+    def _candidates(self, splats: Splats, crop: Crop) -> Candidates:
         sheet = TileSheet((TileGrid(crop, self.tile_side),))
-        every = torch.ones(len(splats), dtype=torch.bool, device=gaussians.device)
-        candidates = find_candidates(splats, torch.zeros_like(every).long(), sheet, built=self.kernels.built)
+        grid_of = torch.zeros(len(splats), dtype=torch.long, device=splats.planes.device)
+        return find_candidates(splats, grid_of, sheet, built=self.kernels.built)
+
+    def _layer(self, splats: Splats, candidates: Candidates, z_window: ZWindow) -> Layer:
+        window = window_planes(candidates.sheet, [z_window])
+        every = torch.ones(len(splats), dtype=torch.bool, device=splats.planes.device)
+        lists = candidates.lists(self.chunk, every, window)
         drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
-        drawings = []
-        for z_window in windows:
-            _check_window(z_window, crop)
-            window = window_planes(sheet, [z_window])
-            lists = candidates.lists(self.chunk, every, window)
-            (image,) = sheet.to_images(
-                Composite.apply(drawn, self._job(lists, splats.planes, every, window, None))
-            )
-            drawings.append(Layer(image[1:4].permute(1, 2, 0), image[0]))
-        return drawings
+        job = self._job(lists, splats.planes, every, window, None)
+        (image,) = candidates.sheet.to_images(Composite.apply(drawn, job))
+        return Layer(image[1:4].permute(1, 2, 0), image[0])
 
     def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
         """`pack`, kept for the next view of the same Gaussians."""
