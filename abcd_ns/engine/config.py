@@ -22,7 +22,7 @@ class TrainingConfig:
     ownership: Literal["auto", "fragments", "means"] = "auto"
     """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
     paper). `auto` takes fragments where the rasterizer can mask by depth."""
-    window_weight: float = 0.01
+    window_weight: float = 0.03
     """Frozen fragments are sorted in with active ones where these have at least this weight in the picture of
     their block alone, as a mean over 4 x 4 pixels; 0 counts every fragment, which is exact and dear."""
     warmup: float = 0.2

@@ -20,7 +20,7 @@ Side = Literal["front", "back"]
 SIDES: tuple[Side, ...] = ("front", "back")
 """The two layers of a view, under the names of their fields in Parts."""
 AT_HAND_BYTES = 128 << 20
-"""Size of the layers that a visit keeps decoded, at most; others are read from the cache for each step."""
+"""Size of the layers that a visit keeps at hand, at most; others are read from the cache for each step."""
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
 
@@ -87,7 +87,7 @@ class Surroundings:
 
 
 class VisitLayers:
-    """F and B for the views of one visit, drawn once and kept in the layer cache.
+    """F and B for the views of one visit, drawn once and kept at hand or in the layer cache.
 
     Args:
         own: the block's Gaussians when the visit began; they decide the windows.
@@ -119,18 +119,18 @@ class VisitLayers:
         self._at_hand: dict[int, Surroundings] = {}
         self._room = AT_HAND_BYTES
 
-    def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Parts]]:
-        """Draw what the cache lacks for these views; yields each view with its layers when they are ready.
+    def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Surroundings]]:
+        """Draw what is missing for these views; yields each view when it is ready.
 
         Units are taken one after the other, each for all views, so that the device holds one at a time.
         """
         missing = []
         for view in dict.fromkeys(views):
-            layers = self._cached(view)
-            if layers is None:
+            found = self._found(view)
+            if found is None:
                 missing.append(view)
             else:
-                yield view, layers
+                yield view, found
         parts: dict[int, dict[int, Parts]] = {view: {} for view in missing}
         for unit in self._units:
             loaded = self._painter.load(unit, exclude=self._geometry.block)
@@ -147,16 +147,16 @@ class VisitLayers:
         """
         if self._frozen_versions() != self._versions:
             raise StaleLayerError(f"a frozen block changed during the visit of block {self._geometry.block}")
+        found = self._found(view)
+        if found is None:  # never drawn, or the disposable cache has lost it
+            ((_, found),) = self.draw([view])
+        return found
+
+    def _found(self, view: int) -> Surroundings | None:
         if view in self._at_hand:
             return self._at_hand[view]
         layers = self._cached(view)
-        if layers is None:  # never drawn, or the disposable cache has lost it
-            ((_, layers),) = self.draw([view])
-        around = Surroundings(layers, self._near.get(view), self._window(view))
-        if around.nbytes <= self._room:
-            self._at_hand[view] = around
-            self._room -= around.nbytes
-        return around
+        return layers and Surroundings(layers, self._near.get(view), self._window(view))
 
     def _frozen_versions(self) -> dict[int, int]:
         scene = self._painter.scene
@@ -165,17 +165,20 @@ class VisitLayers:
     def _window(self, view: int) -> ZWindow | None:
         if self._own is None:
             return None
-        if view not in self._windows:
-            self._windows[view] = self._painter.rasterizer.depth_window(
-                self._own,
-                self._views[view],
-                crop=self._geometry.crops[view],
-                visible=self._window_weight,
-                antialiased=self._settings.antialiased,
-            )
-        return self._windows[view]
+        if view in self._windows:
+            return self._windows[view]
+        return self._painter.rasterizer.depth_window(
+            self._own,
+            self._views[view],
+            crop=self._geometry.crops[view],
+            visible=self._window_weight,
+            antialiased=self._settings.antialiased,
+        )
 
     def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts:
+        window = self._window(view)
+        if window is not None:
+            self._windows[view] = window
         return self._painter.paint(
             unit,
             loaded,
@@ -183,15 +186,22 @@ class VisitLayers:
             self._geometry.crops[view],
             self._settings,
             active=self._geometry.block,
-            window=self._window(view),
+            window=window,
         )
 
-    def _keep(self, view: int, parts: dict[int, Parts]) -> Parts:
-        """Fold and cache; what comes back went through the codec, whether or not the cache had room."""
+    def _keep(self, view: int, parts: dict[int, Parts]) -> Surroundings:
+        """Fold, and put at hand or into the cache; what comes back went through the codec either way."""
         folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
         self._near[view] = folded.inside
-        self._cache.put_many((self._key(view, side), getattr(folded, side)) for side in SIDES)
-        return Parts(*(self._on_device(through_codec(getattr(folded, s), self._cache.bits)) for s in SIDES))
+        stored = (through_codec(getattr(folded, side), self._cache.bits) for side in SIDES)
+        window = self._windows.pop(view, None)
+        around = Surroundings(Parts(*map(self._on_device, stored)), folded.inside, window)
+        if around.nbytes <= self._room:
+            self._at_hand[view] = around
+            self._room -= around.nbytes
+        else:
+            self._cache.put_many((self._key(view, side), getattr(folded, side)) for side in SIDES)
+        return around
 
     def _cached(self, view: int) -> Parts | None:
         if not self._units:

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+import abcd_ns.engine.visit
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
 from abcd_ns.engine.config import resolve_ownership
@@ -323,3 +324,17 @@ def test_a_giant_is_trained_where_it_reaches_out_of_its_cell(tmp_path, views, st
                 seen += 1
         coordinator._end_visit()
     assert seen > 0
+
+
+def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start, monkeypatch):
+    results = []
+    for room, is_cached in ((2**30, False), (100_000, True), (0, True)):
+        monkeypatch.setattr(abcd_ns.engine.visit, "AT_HAND_BYTES", room)
+        folder = tmp_path / str(room)
+        folder.mkdir()
+        coordinator = make_coordinator(folder, start, views, blocks=3, steps=20)
+        train(coordinator, photos)
+        results.append(whole_scene(coordinator))
+        assert (coordinator.cache.hits > 0) == is_cached
+    assert equal(*results[:2])
+    assert equal(*results[1:])

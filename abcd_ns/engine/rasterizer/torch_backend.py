@@ -67,7 +67,8 @@ class TorchRasterizer(Rasterizer):
         self.kernels = ChunkKernels(compile, tile_side, chunk)
         self.tile_side = tile_side
         self.chunk = chunk
-        self._packed: tuple[weakref.ref[Gaussians], Tensor] | None = None
+        self._packed: list[tuple[weakref.ref[Gaussians], Tensor]] = []
+        """Two: a block and what is frozen around it are looked at in turn."""
 
     def warm_up(self) -> None:
         """See Rasterizer.warm_up."""
@@ -164,9 +165,12 @@ class TorchRasterizer(Rasterizer):
 
     def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
         """`pack`, kept for the next view of the same Gaussians."""
-        if self._packed is None or self._packed[0]() is not gaussians:
-            self._packed = (weakref.ref(gaussians), pack(gaussians))
-        return self._packed[1]
+        for known, packed in self._packed:
+            if known() is gaussians:
+                return packed
+        packed = pack(gaussians)
+        self._packed = [(weakref.ref(gaussians), packed), *self._packed[:1]]
+        return packed
 
     def _job(
         self,

@@ -40,19 +40,25 @@ def encode(layer: Layer, bits: Literal[16, 32]) -> bytes:
     height, width = layer.transmittance.shape
     if height * width > MAX_PIXELS:
         raise ValueError(f"A layer of {width} x {height} pixels exceeds the limit of {MAX_PIXELS} pixels.")
-    color = layer.color.detach().to("cpu", torch.float32)
-    transmittance = layer.transmittance.detach().to("cpu", torch.float32)
-    if not (np.isfinite(color.numpy()).all() and np.isfinite(transmittance.numpy()).all()):
-        raise ValueError("A layer with NaN or infinite pixels is not stored; its block has diverged.")
-    if bits == 16:  # torch converts to float16 a hundred times faster than numpy
-        largest = torch.finfo(torch.float16).max
-        color = color.clamp(-largest, largest).to(torch.float16)
-        transmittance = (transmittance.clamp(0, 1) * _FULL).round()
+    color, transmittance = _rounded(layer, bits)
     color_dtype, transmittance_dtype = _DTYPES[bits]
     raw = _split_bytes(color, color_dtype) + _split_bytes(transmittance, transmittance_dtype)
     payload = zstandard.ZstdCompressor(level=1).compress(raw)
     header = _HEADER.pack(_MAGIC, FORMAT_VERSION, bits, height, width, len(payload))
     return header + _checksum(header, payload) + payload
+
+
+def _rounded(layer: Layer, bits: Literal[16, 32]) -> tuple[Tensor, Tensor]:
+    """Colour and transmittance on the CPU as they are stored; with 16 bits transmittance counts 1 / _FULL."""
+    color = layer.color.detach().to("cpu", torch.float32)
+    transmittance = layer.transmittance.detach().to("cpu", torch.float32)
+    if not (np.isfinite(color.numpy()).all() and np.isfinite(transmittance.numpy()).all()):
+        raise ValueError("A layer with NaN or infinite pixels is not stored; its block has diverged.")
+    if bits == 32:
+        return color, transmittance
+    # torch converts to float16 a hundred times faster than numpy
+    largest = torch.finfo(torch.float16).max
+    return color.clamp(-largest, largest).to(torch.float16), (transmittance.clamp(0, 1) * _FULL).round()
 
 
 def decode(data: bytes | memoryview) -> Layer:
@@ -126,5 +132,10 @@ def _join_bytes(raw: np.ndarray, dtype: np.dtype) -> Tensor:
 
 
 def through_codec(layer: Layer, bits: Literal[16, 32]) -> Layer:
-    """What `layer` is after it has been packed and unpacked: float32, on the CPU."""
-    return decode(encode(layer, bits))
+    """What `layer` would be after it was packed and unpacked: float32, on the CPU.
+
+    Raises:
+        ValueError: NaN or infinity in the layer.
+    """
+    color, transmittance = _rounded(layer, bits)
+    return Layer(color.to(torch.float32), transmittance / _FULL if bits == 16 else transmittance)
