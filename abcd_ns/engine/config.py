@@ -22,9 +22,10 @@ class TrainingConfig:
     ownership: Literal["auto", "fragments", "means"] = "auto"
     """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
     paper). `auto` takes fragments where the rasterizer can mask by depth."""
-    window_weight: float = 0.03
-    """Frozen fragments are sorted in with active ones where these have at least this weight in the picture of
-    their block alone, as a mean over 4 x 4 pixels; 0 counts every fragment, which is exact and dear."""
+    window_weight: float = 0.06
+    """Frozen fragments between a block's nearest and farthest ones are sorted in with these, in each 4 x 4
+    pixels. This much of their weight, in a picture of the block alone, may be nearer than the nearest that
+    counts, and as much farther than the farthest; 0 counts all, which is exact and dear."""
     warmup: float = 0.2
     """Share of the run for which a scaffold, no larger than a block but all over the scene, is trained before
     blocks are; 0 for none."""

@@ -330,7 +330,7 @@ class Coordinator:
             painter,
             self.cache,
             active.geometry,
-            self.scene.at_rest(active.geometry.block).to(self.device),
+            self.scene.at_rest(active.geometry.block),
             self.views,
             settings,
             window_weight=self.config.window_weight,
@@ -351,6 +351,8 @@ class Coordinator:
         if active.saved:
             updates[live_of(self.scene.tree)] = state[:0]
         self.scene.lift()
+        if self._layers is not None:
+            self._layers.forget()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
         self.scene.store.commit({b: s.to_tensors() for b, s in updates.items()}, state=self.state.to_json())

@@ -23,7 +23,7 @@ from abcd_ns.engine.relocation import binomials, compute_relocation, covariances
 GATHER, REFINE = 1, 6
 BEFORE_RESET, AFTER_RESET = 7, 4
 
-REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 25
+REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 
@@ -45,7 +45,7 @@ class DensityConfig:
     """Share of the run, its warm-up left out, after which the number of Gaussians no longer changes."""
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
-    where a block sees every step, as splatfacto has it, and 25 elsewhere."""
+    where a block sees every step, as splatfacto has it, and 30 elsewhere."""
     warmup_passes: int = 1
     """Times that each of a block's views is used before the block's first refinement."""
     reset_every: int = 3000

@@ -34,7 +34,7 @@ from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.param_swap import live_gaussians
 from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
-from abcd_ns.engine.scaffold import blocks_at_rest, join, live_of
+from abcd_ns.engine.scaffold import blocks_at_rest, join
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import endless_order, exponential_decay, plan_sweep, sh_degree_at
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -49,8 +49,8 @@ BEYOND = 1e30
 
 
 def initial_of(tree: BlockTree, block: int) -> int:
-    """Under which number the store keeps a block as it began: after the reserve and the live block."""
-    return live_of(tree) + 1 + block
+    """Under which number the store keeps a block as it began; the first is left to the reserve."""
+    return tree.num_blocks + 1 + block
 
 
 def independent_at_rest(

@@ -43,7 +43,7 @@ class Parts:
     front: Layer
     back: Layer
     inside: Splats | None = None
-    """The unit's own Gaussians that have fragments in the window; None by means."""
+    """The unit's own Gaussians that have fragments in the window, if there are any; None by means."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,11 @@ class Painter:
         return self.scene.tree
 
     def units(self, exclude: int | None = None) -> tuple[int, ...]:
-        """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass."""
+        """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass.
+
+        By fragments they tile space: where no other node holds the cell of `exclude` it is one of them, for
+        what reaches into it.
+        """
         return tuple(self._descend(0, exclude))
 
     def load(self, unit: int, exclude: int | None = None) -> Loaded:
@@ -191,6 +195,9 @@ class Painter:
     def _descend(self, node: int, exclude: int | None) -> Iterator[int]:
         blocks = [block for block in self.tree.leaves(node) if block != exclude]
         if not blocks:
+            # What others' Gaussians do in the active cell, before or behind the window, is no other unit's.
+            if self.ownership == "fragments" and node != 0:
+                yield node
             return
         # By means, a node around the active block would be neither in front of it nor behind it.
         whole = self.ownership == "fragments" or len(blocks) == len(self.tree.leaves(node))

@@ -32,8 +32,8 @@ def reserve_of(tree: BlockTree) -> int:
 
 def live_of(tree: BlockTree) -> int:
     """Under which number the store keeps a block that a save found in the middle of its visit. Under its own
-    number it stays as the visit found it: its layers hang on that."""
-    return tree.num_blocks + 1
+    number it stays as the visit found it: its layers hang on that. After those that `independent` keeps."""
+    return 2 * tree.num_blocks + 1
 
 
 def revealed(waiting: BlockState) -> BlockState:

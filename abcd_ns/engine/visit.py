@@ -11,6 +11,7 @@ from abcd_ns.engine.compositing import empty_layer
 from abcd_ns.engine.painter import Loaded, Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
+from abcd_ns.engine.rasterizer.base import DepthWindow
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
@@ -80,10 +81,11 @@ class Surroundings:
 
     @property
     def nbytes(self) -> int:
-        """Size of its images."""
-        images = [image for side in SIDES for image in vars(getattr(self.layers, side)).values()]
-        images += [] if self.window is None else [self.window.near, self.window.far]
-        return sum(image.nbytes for image in images)
+        """Its size."""
+        held = [image for side in SIDES for image in vars(getattr(self.layers, side)).values()]
+        held += [] if self.window is None else [self.window.near, self.window.far]
+        held += [] if self.near is None else [self.near.planes]
+        return sum(tensor.nbytes for tensor in held)
 
 
 class VisitLayers:
@@ -115,9 +117,10 @@ class VisitLayers:
         self._units = painter.units(exclude=geometry.block)
         self._own = own if painter.ownership == "fragments" and self._units else None
         self._near: dict[int, Splats | None] = {}
-        self._windows: dict[int, ZWindow] = {}
+        self._windows: dict[int, DepthWindow] = {}
         self._at_hand: dict[int, Surroundings] = {}
         self._room = AT_HAND_BYTES
+        self._uses_cache = False
 
     def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Surroundings]]:
         """Draw what is missing for these views; yields each view when it is ready.
@@ -131,6 +134,7 @@ class VisitLayers:
                 missing.append(view)
             else:
                 yield view, found
+        self._find_windows(missing)
         parts: dict[int, dict[int, Parts]] = {view: {} for view in missing}
         for unit in self._units:
             loaded = self._painter.load(unit, exclude=self._geometry.block)
@@ -152,33 +156,42 @@ class VisitLayers:
             ((_, found),) = self.draw([view])
         return found
 
+    def forget(self) -> None:
+        """Give back the room in the cache: when the block has changed, nothing of it will be found again."""
+        if self._uses_cache:
+            self._cache.drop(self._prefix)
+
     def _found(self, view: int) -> Surroundings | None:
         if view in self._at_hand:
             return self._at_hand[view]
         layers = self._cached(view)
-        return layers and Surroundings(layers, self._near.get(view), self._window(view))
+        if layers is None:
+            return None
+        near = self._near.get(view)
+        return Surroundings(layers, near and Splats(near.planes.to(self._painter.device)), self._window(view))
 
     def _frozen_versions(self) -> dict[int, int]:
         scene = self._painter.scene
         return {b: scene.version(b) for b in range(scene.tree.num_blocks) if b != self._geometry.block}
 
-    def _window(self, view: int) -> ZWindow | None:
+    def _find_windows(self, views: Iterable[int]) -> None:
         if self._own is None:
-            return None
-        if view in self._windows:
-            return self._windows[view]
-        return self._painter.rasterizer.depth_window(
-            self._own,
-            self._views[view],
-            crop=self._geometry.crops[view],
-            visible=self._window_weight,
-            antialiased=self._settings.antialiased,
-        )
+            return
+        own = self._own.to(self._painter.device)
+        for view in views:
+            if view not in self._windows:
+                self._windows[view] = self._painter.rasterizer.depth_window(
+                    own,
+                    self._views[view],
+                    crop=self._geometry.crops[view],
+                    visible=self._window_weight,
+                    antialiased=self._settings.antialiased,
+                )
+
+    def _window(self, view: int) -> ZWindow | None:
+        return None if self._own is None else self._windows[view].by_pixel()
 
     def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts:
-        window = self._window(view)
-        if window is not None:
-            self._windows[view] = window
         return self._painter.paint(
             unit,
             loaded,
@@ -186,21 +199,24 @@ class VisitLayers:
             self._geometry.crops[view],
             self._settings,
             active=self._geometry.block,
-            window=window,
+            window=self._window(view),
         )
 
     def _keep(self, view: int, parts: dict[int, Parts]) -> Surroundings:
         """Fold, and put at hand or into the cache; what comes back went through the codec either way."""
         folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
-        self._near[view] = folded.inside
         stored = (through_codec(getattr(folded, side), self._cache.bits) for side in SIDES)
-        window = self._windows.pop(view, None)
-        around = Surroundings(Parts(*map(self._on_device, stored)), folded.inside, window)
+        around = Surroundings(
+            Parts(*map(self._on_device, stored)), near=folded.inside, window=self._window(view)
+        )
+        self._near[view] = folded.inside
         if around.nbytes <= self._room:
             self._at_hand[view] = around
             self._room -= around.nbytes
         else:
+            self._near[view] = folded.inside and Splats(folded.inside.planes.cpu())
             self._cache.put_many((self._key(view, side), getattr(folded, side)) for side in SIDES)
+            self._uses_cache = True
         return around
 
     def _cached(self, view: int) -> Parts | None:
@@ -232,5 +248,9 @@ class VisitLayers:
             raster_mode="antialiased" if self._settings.antialiased else "classic",
             rasterizer=self._painter.rasterizer.name,
             bits=self._cache.bits,
-            prefix=f"block-{geometry.block}",
+            prefix=self._prefix,
         )
+
+    @property
+    def _prefix(self) -> str:
+        return f"block-{self._geometry.block}"

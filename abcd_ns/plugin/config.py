@@ -93,6 +93,10 @@ def check_training(training: TrainingConfig) -> None:
         raise UserError(
             f"--pipeline.training.influence-share must be above 0, not {training.influence_share}."
         )
+    if not 0 <= training.window_weight < 1:
+        raise UserError(
+            f"--pipeline.training.window-weight must be from 0 to below 1, not {training.window_weight}."
+        )
     if training.overlap < 0:
         raise UserError(f"--pipeline.training.overlap must be 0 or more, not {training.overlap}.")
     if training.overlap > 0 and training.exact:

@@ -328,13 +328,12 @@ def test_a_giant_is_trained_where_it_reaches_out_of_its_cell(tmp_path, views, st
 
 def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start, monkeypatch):
     results = []
-    for room, is_cached in ((2**30, False), (100_000, True), (0, True)):
+    for room, is_cached in ((2**30, False), (100_000, True)):
         monkeypatch.setattr(abcd_ns.engine.visit, "AT_HAND_BYTES", room)
         folder = tmp_path / str(room)
         folder.mkdir()
-        coordinator = make_coordinator(folder, start, views, blocks=3, steps=20)
+        coordinator = make_coordinator(folder, start, views, blocks=2, steps=10, bits=16)
         train(coordinator, photos)
         results.append(whole_scene(coordinator))
         assert (coordinator.cache.hits > 0) == is_cached
-    assert equal(*results[:2])
-    assert equal(*results[1:])
+    assert equal(*results)

@@ -169,7 +169,7 @@ def test_covariances_against_the_definition():
     assert torch.allclose(found, found.transpose(1, 2))
 
 
-@pytest.mark.parametrize(("blocks", "given", "expected"), [(1, 0, 100), (8, 0, 25), (1, 7, 7), (8, 7, 7)])
+@pytest.mark.parametrize(("blocks", "given", "expected"), [(1, 0, 100), (8, 0, 30), (1, 7, 7), (8, 7, 7)])
 def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given, expected):
     config = DensityConfig(refine_every=given, refine_stop=0.3)
     assert for_blocks(config, blocks) == replace(config, refine_every=expected)

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.projection import Splats
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 
@@ -21,6 +23,21 @@ class ZWindow:
 
     near: Float[Tensor, "h w"]
     far: Float[Tensor, "h w"]
+
+
+@dataclass(frozen=True)
+class DepthWindow:
+    """A range of camera z for each tile of a crop: near <= z < far."""
+
+    grid: TileGrid
+    near: Float[Tensor, "t"]
+    far: Float[Tensor, "t"]
+
+    def by_pixel(self) -> ZWindow:
+        """The same for each pixel."""
+        tiles = torch.stack((self.near, self.far))[:, None]
+        image = self.grid.to_image(tiles.expand(-1, self.grid.pixels_per_tile, -1))
+        return ZWindow(*image.contiguous())
 
 
 @dataclass(frozen=True)
@@ -158,15 +175,16 @@ class Rasterizer(Protocol):
 
     def depth_window(
         self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
-    ) -> ZWindow:
+    ) -> DepthWindow:
         """In each small tile of the crop the range of camera z in which the Gaussians show; no gradients.
 
         Args:
-            visible: fragments count where the Gaussian's weight alpha T, with nothing else in the scene, is
-                at least this, as a mean over the tile; 0 counts all.
+            visible: what is in front of the range, and what is behind it, has less weight alpha T than this,
+                together, with nothing else in the scene, as a mean over the tile; 0 leaves nothing out.
 
         Returns:
-            A window that holds these fragments. Where there are none it is empty, and lies in their midst.
+            A window that holds all else. Where there is nothing it is empty, and lies in the midst of what
+            the crop shows.
 
         Raises:
             ValueError: for a backend whose `supports_z_window` is False.

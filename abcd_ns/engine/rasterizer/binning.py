@@ -199,7 +199,7 @@ class Candidates:
         """Indices of the splats that have a fragment in the window, as far as tiles can tell; ascending."""
         everyone = torch.ones_like(self.rows, dtype=torch.bool)
         inside = _within_window(self.pairs, self.depths, everyone, window)
-        return self.rows.index_select(0, inside.rank.unique()).sort().values
+        return self.rows.index_select(0, inside.rank.unique_consecutive()).sort().values
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from gsplat.cuda._wrapper import (
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot, ZWindow
+from abcd_ns.engine.rasterizer.base import Cut, DepthWindow, Raster, Rasterizer, Shot
 from abcd_ns.engine.rasterizer.projection import Splats, check_degree
 from abcd_ns.engine.rasterizer.splat_kernels import (
     CONIC_XX,
@@ -165,7 +165,7 @@ class GsplatRasterizer(Rasterizer):
         """See Rasterizer.cut: stock gsplat cannot."""
         raise ValueError(NO_WINDOW)
 
-    def depth_window(self, *_args: Any, **_options: Any) -> ZWindow:
+    def depth_window(self, *_args: Any, **_options: Any) -> DepthWindow:
         """See Rasterizer.depth_window: stock gsplat cannot."""
         raise ValueError(NO_WINDOW)
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot, ZWindow
+from abcd_ns.engine.rasterizer.base import Cut, DepthWindow, Raster, Rasterizer, Shot, ZWindow
 from abcd_ns.engine.rasterizer.binning import Candidates, TileLists, find_candidates, window_planes
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.rasterizer.compositing_function import Composite, Job
@@ -49,7 +49,7 @@ class TorchRasterizer(Rasterizer):
         compile: whether float32 on the CPU runs on kernels built ahead of time (see kernels): "auto" if they
             are found, "always" building them now if need be, "never" not at all. Built and eager kernels
             agree to rounding only: use "never" where last bits must not depend on the machine.
-        tile_side: pixels along a tile's side; a divisor of 16. Speed only.
+        tile_side: pixels along a tile's side; a divisor of 16. Speed only, but for depth windows.
         chunk: Gaussians per kernel call and tile. Speed and memory only.
 
     Raises:
@@ -67,8 +67,7 @@ class TorchRasterizer(Rasterizer):
         self.kernels = ChunkKernels(compile, tile_side, chunk)
         self.tile_side = tile_side
         self.chunk = chunk
-        self._packed: list[tuple[weakref.ref[Gaussians], Tensor]] = []
-        """Two: a block and what is frozen around it are looked at in turn."""
+        self._packed: tuple[weakref.ref[Gaussians], Tensor] | None = None
 
     def warm_up(self) -> None:
         """See Rasterizer.warm_up."""
@@ -142,7 +141,7 @@ class TorchRasterizer(Rasterizer):
     @torch.no_grad()
     def depth_window(
         self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
-    ) -> ZWindow:
+    ) -> DepthWindow:
         """See Rasterizer.depth_window."""
         splats = self.project(gaussians, view, antialiased=antialiased)
         candidates = self._candidates(splats, crop)
@@ -165,12 +164,9 @@ class TorchRasterizer(Rasterizer):
 
     def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
         """`pack`, kept for the next view of the same Gaussians."""
-        for known, packed in self._packed:
-            if known() is gaussians:
-                return packed
-        packed = pack(gaussians)
-        self._packed = [(weakref.ref(gaussians), packed), *self._packed[:1]]
-        return packed
+        if self._packed is None or self._packed[0]() is not gaussians:
+            self._packed = (weakref.ref(gaussians), pack(gaussians))
+        return self._packed[1]
 
     def _job(
         self,

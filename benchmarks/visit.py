@@ -1,0 +1,190 @@
+"""Where the time of a visit goes: a run of several blocks and one of a single block, stage by stage.
+
+    python -m benchmarks.visit --data DIR --downscale 4
+
+Both runs train in this process, one after the other, by the engine alone. Stages are summed over the second
+half of each run and divided by the views that were drawn to train in it.
+"""
+
+import os
+import platform
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import tyro
+from torch.nn import Parameter, ParameterDict
+
+from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.events import VisitEnded
+from abcd_ns.engine.initialize import gaussians_from_points
+from abcd_ns.engine.loss import mean_psnr
+from abcd_ns.engine.near_plane import near_plane
+from abcd_ns.engine.param_swap import make_adam
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.rasterizer import make_rasterizer
+from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.scaffold import blocks_at_rest
+from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.training_loop import PhotoReader
+from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.methods import LEARNING_RATES
+from abcd_ns.plugin.config import AbcdDataManagerConfig
+from abcd_ns.plugin.dataparser import AbcdDataParserConfig
+from abcd_ns.plugin.views import views_of
+
+STAGES = (
+    "plan and attach",
+    "layers",
+    "photos",
+    "render",
+    "loss",
+    "backward",
+    "optimizers",
+    "density and settling",
+)
+
+
+@dataclass
+class Args:
+    """What to measure."""
+
+    data: Path
+    """The scene, as for `ns-train abcd --data`."""
+    downscale: int = 1
+    """Divides the photos' width and height."""
+    blocks: int = 8
+    """Of the run with several."""
+    seconds: float = 30.0
+    """Of each run; the first half is not measured."""
+    seed: int = 0
+    """Of the runs."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What the runs train on."""
+
+    views: list[View]
+    photo: PhotoReader
+    gaussians: Gaussians
+
+
+class StageClock:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: Counter[str] = Counter()
+        self.views = 0
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] += time.perf_counter() - start
+
+
+def read(args: Args) -> Capture:
+    """The capture in RAM."""
+    parser = AbcdDataParserConfig(downscale_factor=args.downscale)
+    manager = AbcdDataManagerConfig(data=args.data, dataparser=parser).setup(device="cpu", test_mode="val")
+    dataset = manager.train_dataset
+    points = dataset.metadata["points3D_xyz"].float()
+    views = views_of(dataset.cameras)
+    near = near_plane(points, views)
+    views = [replace(view, near=near) for view in views]
+    photos = [dataset.photos.crop(view.index, view.full).float() / 255 for view in views]
+    start = gaussians_from_points(points, dataset.metadata["points3D_rgb"])
+    return Capture(views, lambda view, crop: photos[view][crop.slices], start)
+
+
+def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
+    """Train; the stages of the second half."""
+    tree = build_kd(capture.gaussians.means, blocks)
+    store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
+    keep = None if blocks == 1 else len(capture.gaussians) // blocks
+    store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=args.seed))
+    params = ParameterDict({name: Parameter(value) for name, value in Gaussians.empty(3).items()})
+    coordinator = Coordinator(
+        TrainingConfig(seed=args.seed),
+        Budget(seconds=args.seconds),
+        StoredScene(tree, store),
+        capture.views,
+        LayerCache(folder / "layers"),
+        make_rasterizer("torch", "cpu"),
+        params,
+        make_adam(params, LEARNING_RATES),
+    )
+    clock, layers = StageClock(), 0.0
+
+    def note(event: object) -> None:
+        nonlocal layers
+        if isinstance(event, VisitEnded):
+            layers += event.layer_seconds
+
+    coordinator.announce.subscribe(note)
+    began = 0.0
+    while not coordinator.finished:
+        if coordinator.progress < 0.5:
+            clock, began = StageClock(), layers
+        step(coordinator, capture.photo, clock)
+    clock.seconds["layers"] = layers - began
+    clock.seconds["plan and attach"] -= layers - began
+    coordinator.cache.close()
+    store.close()
+    return clock
+
+
+def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> None:
+    """training_loop.train_step with a clock."""
+    with clock.stage("plan and attach"):
+        batch = coordinator.next_batch()
+    with clock.stage("photos"):
+        photos = [photo(sample.view.index, sample.crop) for sample in batch.samples]
+    with clock.stage("render"):
+        rendered = coordinator.render(batch)
+    with clock.stage("loss"):
+        loss = coordinator.loss(batch, rendered.pictures, photos)
+    with clock.stage("backward"):
+        for optimizer in coordinator.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+        if loss.requires_grad:
+            loss.backward()
+    with clock.stage("optimizers"):
+        for optimizer in coordinator.optimizers.values():
+            optimizer.step()
+    with clock.stage("density and settling"):
+        coordinator.after_step(rendered, mean_psnr(rendered.pictures, photos))
+    clock.views += len(batch.samples)
+
+
+def main(args: Args) -> None:
+    """Run both and print the table."""
+    capture = read(args)
+    with tempfile.TemporaryDirectory() as folder:
+        one = run(capture, 1, args, Path(folder) / "one")
+        several = run(capture, args.blocks, args, Path(folder) / "several")
+    model = platform.processor() or platform.machine()
+    print(f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} threads, torch {torch.__version__}")
+    print(f"{args.data.name}, {len(capture.views)} views, {args.seconds:g} s a run; ms a view\n")
+    print(f"| stage | 1 block | {args.blocks} blocks |\n| --- | ---: | ---: |")
+    for stage in STAGES:
+        print(
+            f"| {stage} | "
+            + " | ".join(f"{1e3 * c.seconds[stage] / c.views:.2f}" for c in (one, several))
+            + " |"
+        )
+    totals = (sum(clock.seconds.values()) / clock.views for clock in (one, several))
+    print("| all | " + " | ".join(f"{1e3 * total:.2f}" for total in totals) + " |")
+    print(f"| views | {one.views} | {several.views} |")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
