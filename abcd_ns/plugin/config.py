@@ -133,7 +133,7 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
     the nearest distance at which a photo shows a point."""
     layer_bits: Literal[16, 32] = 16
-    """Bits of a colour or transmittance in cached layers."""
+    """Bits to which the colours and transmittances of layers are rounded."""
     max_seconds: float | None = None
     """Stop after this many seconds of training; evaluation and saving do not count."""
 

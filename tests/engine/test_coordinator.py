@@ -15,6 +15,7 @@ from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan
 from abcd_ns.engine.ordering import front_to_back
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import RunState
+from abcd_ns.engine.scaffold import live_of
 from abcd_ns.engine.storage import StaleLayerError
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
@@ -174,27 +175,35 @@ def test_migrants_take_their_moments_along(tmp_path, views, photos, start):
     assert float(arrived.exp_avg.scales[-1].abs().max()) > 0
 
 
-@pytest.mark.parametrize("stop", [3, 17, 26])
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop, blocks):
-    """Bit for bit, in the middle of a visit too (invariant 7), with 16-bit layers and densification."""
-    runs = {}
-    for name in ("whole", "stopped"):
-        (tmp_path / name).mkdir()
-        runs[name] = make_coordinator(
-            tmp_path / name, start, views, blocks=blocks, steps=40, density=GROWING, bits=16
-        )
-    train(runs["whole"], photos)
-    train(runs["stopped"], photos, steps=stop)
-    runs["stopped"].save(pin="here")
-    runs["stopped"].scene.store.close()
-    went_on = make_coordinator(
-        tmp_path / "stopped", start, views, steps=40, density=GROWING, bits=16, resume=True
-    )
-    assert went_on.state.step == stop
-    train(went_on, photos)
-    assert went_on.state.step == 40
-    assert equal(whole_scene(went_on), whole_scene(runs["whole"]))
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(
+    tmp_path, views, photos, start, blocks, monkeypatch
+):
+    """Bit for bit, in the middle of a visit too (invariant 7), with 16-bit layers and densification, and with
+    layers at hand and in the cache."""
+    monkeypatch.setattr(abcd_ns.engine.visit, "AT_HAND_BYTES", 100_000)
+    options = {"steps": 30, "density": GROWING, "bits": 16}
+    (tmp_path / "whole").mkdir()
+    whole = make_coordinator(tmp_path / "whole", start, views, blocks=blocks, **options)
+    train(whole, photos)
+    live, within_visits = live_of(whole.scene.tree), 0
+    for stop in (3, 14, 22):
+        folder = tmp_path / str(stop)
+        folder.mkdir()
+        stopped = make_coordinator(folder, start, views, blocks=blocks, **options)
+        train(stopped, photos, steps=stop)
+        active = stopped.state.active
+        within_visits += active is not None and active.done > 0
+        stopped.save()
+        stopped.save(pin="here")
+        stopped.scene.store.close()
+        went_on = make_coordinator(folder, start, views, resume=True, **options)
+        assert went_on.state.step == stop
+        train(went_on, photos)
+        assert went_on.state.step == 30
+        assert equal(whole_scene(went_on), whole_scene(whole))
+        assert live not in went_on.scene.store.blocks or went_on.scene.store.counts(live) == 0
+    assert within_visits > 0
 
 
 def test_the_same_seed_gives_the_same_run_and_another_another(tmp_path, views, photos, start):
@@ -286,9 +295,11 @@ def test_auto_ownership_is_what_the_rasterizer_can_do():
     assert resolve_ownership("means", TorchRasterizer(compile="never")) == "means"
 
 
-def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start):
+@pytest.mark.parametrize("pass_gaussians", [0, 30])
+def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start, pass_gaussians):
     """What a step sees of the scene, before any training, is what a viewer would see."""
-    coordinator = make_coordinator(tmp_path, start, views, blocks=4, window_weight=0.0)
+    options = {"window_weight": 0.0, "pass_gaussians": pass_gaussians}
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, **options)
     draw = TorchRasterizer(compile="never")
     scene = whole_scene(coordinator)
     for _ in range(4):

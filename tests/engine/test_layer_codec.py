@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from abcd_ns.engine.storage import layer_codec
-from abcd_ns.engine.storage.layer_codec import LayerDecodeError, decode, encode
+from abcd_ns.engine.storage.layer_codec import LayerDecodeError, decode, encode, through_codec
 from abcd_ns.engine.types import Layer
 
 HEADER = struct.Struct("<4sBBxxIIQ")
@@ -58,6 +58,23 @@ def test_16_bits_are_close(layer):
 def test_a_second_trip_changes_nothing(layer, bits):
     once = encode(decode(encode(layer, bits)), bits)
     assert encode(decode(once), bits) == once
+
+
+@given(layers(), st.sampled_from([16, 32]))
+def test_rounding_is_what_packing_and_unpacking_does(layer, bits):
+    rounded, back = through_codec(layer, bits), decode(encode(layer, bits))
+    assert torch.equal(rounded.color, back.color)
+    assert torch.equal(rounded.transmittance, back.transmittance)
+    assert rounded.color.dtype == rounded.transmittance.dtype == torch.float32
+
+
+@pytest.mark.parametrize("pack", [encode, through_codec])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_pixels_that_are_no_numbers_are_refused(pack, value):
+    layer = small_layer()
+    layer.color[1, 2, 0] = value
+    with pytest.raises(ValueError, match="diverged"):
+        pack(layer, 16)
 
 
 def test_16_bits_keep_the_ends_of_transmittance_and_bright_colours():

@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.compositing import fold
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.painter import Painter, PaintSettings
 from abcd_ns.engine.partition import build_grid, build_kd
+from abcd_ns.engine.rasterizer import Shot
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.scene import MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
@@ -99,28 +101,35 @@ def test_units_hold_every_block_but_the_active_one_exactly_once(ownership):
             assert sorted(held) == [b for b in range(11) if b != active]
 
 
-def test_front_and_back_around_a_window_leave_out_just_the_window():
-    """F over the window's own fragments over B is the merged picture, wherever the window lies."""
+@pytest.mark.parametrize("pass_gaussians", [0, 60, 10_000])
+def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussians):
+    """Wherever the window lies, and however many units share the frozen blocks."""
     gaussians = translucent(200)
     views = views_in_and_out(torch.float64)
     tree = build_kd(gaussians.means, 8)
-    for pass_gaussians in (0, 10_000):
-        paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians)
-        box = tree.cell(3).grown(0.2)
-        for view in views:
-            window = ray_interval(box, view, view.full)
+    owner = tree.assign(gaussians.means)
+    own, frozen = gaussians[owner == 3], gaussians[owner != 3]
+    paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians)
+    units = paint.units(exclude=3)
+    loaded = {unit: paint.load(unit, exclude=3) for unit in units}
+    assert sum(unit.own for unit in loaded.values()) == len(frozen)
+    for view in views:
+        windows = [
+            ray_interval(tree.cell(3).grown(0.2), view, view.full),
+            DRAW.depth_window(own, view, crop=view.full, visible=0.05).by_pixel(),
+        ]
+        for window in windows:
             parts = {
-                unit: paint.paint(unit, paint.load(unit), view, view.full, SETTINGS, active=3, window=window)
-                for unit in paint.units()
+                unit: paint.paint(unit, loaded[unit], view, view.full, SETTINGS, active=3, window=window)
+                for unit in units
             }
             cut = paint.fold(parts, view, view.full)
+            splats = cut.inside.planes if cut.inside is not None else torch.zeros(2, 0)
+            assert splats.unique(dim=1).shape == splats.shape
             with torch.no_grad():
-                inside = DRAW(gaussians, view, sh_degree=1, z_window=window)
-            color = cut.front.color + cut.front.transmittance[..., None] * (
-                inside.color + inside.transmittance[..., None] * cut.back.color
-            )
-            light = cut.front.transmittance * inside.transmittance * cut.back.transmittance
-            assert difference(Layer(color, light), merged(gaussians, view)) < 1e-12
+                (inside,) = DRAW.draw(own[:0], [Shot(view, view.full, cut.inside, window)], sh_degree=1)
+            layers = (cut.front, inside.layer, cut.back)
+            assert difference(fold(list(layers)), merged(frozen, view)) < 1e-12
 
 
 def test_the_picture_does_not_depend_on_names_order_or_empty_blocks():

@@ -12,6 +12,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from plyfile import PlyData
 
 from abcd_ns import methods
+from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.plugin.config import AbcdTrainerConfig
 from abcd_ns.plugin.trainer import AbcdTrainer
@@ -72,7 +73,9 @@ def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
     assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"
     state = torch.load(checkpoint, weights_only=True)
     store = ParameterStore.open(trained.base_dir / "abcd" / "store", read_only=True)
-    in_store = torch.cat([store.load_names(b, ["means"])["means"] for b in store.blocks])
+    tree = BlockTree.from_json(store.header["tree"])
+    in_store = torch.cat([store.load_names(b, ["means"])["means"] for b in range(tree.num_blocks)])
+    assert all(store.counts(other) == 0 for other in store.blocks if other >= tree.num_blocks)
     assert torch.equal(state["pipeline"]["_model.gauss_params.means"], in_store)
     assert len(in_store) >= 300
     assert store.pins == [checkpoint.stem]
