@@ -31,6 +31,10 @@ PAPER = TrainingConfig(
 """What Shiu and Subr 2026 did, as far as it is published; docs/method.md says where it is not."""
 
 
+PEER_BLOCKS = 8
+"""Of the methods to compare with: they are about blocks, needed or not."""
+
+
 def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
     return AbcdTrainerConfig(
         method_name=method_name,
@@ -61,19 +65,27 @@ abcd = MethodSpecification(
     description="ABCD: Gaussian Splatting block by block, each within alpha-composited frozen layers.",
 )
 abcd_ablated = MethodSpecification(
-    config=_quiet(_trainer("abcd-ablated", training=TrainingConfig(layers=False))),
+    config=_quiet(_trainer("abcd-ablated", blocks=PEER_BLOCKS, training=TrainingConfig(layers=False))),
     description="ABCD without its layers: each block alone against the photos (the paper's ablation).",
 )
 abcd_partition = MethodSpecification(
-    config=_quiet(_trainer("abcd-partition", training=TrainingConfig(layers=False, warmup=0.0, overlap=0.2))),
+    config=_quiet(
+        _trainer(
+            "abcd-partition",
+            blocks=PEER_BLOCKS,
+            training=TrainingConfig(layers=False, warmup=0.0, overlap=0.2),
+        )
+    ),
     description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
 )
 abcd_exact = MethodSpecification(
-    config=_quiet(_trainer("abcd-exact", training=TrainingConfig(exact=True, warmup=0.0))),
+    config=_quiet(
+        _trainer("abcd-exact", blocks=PEER_BLOCKS, training=TrainingConfig(exact=True, warmup=0.0))
+    ),
     description="Exact joint training over blocks, one on the device at a time: slow, the reference.",
 )
 abcd_paper = MethodSpecification(
-    config=_quiet(_trainer("abcd-paper", partition="grid", training=PAPER)),
+    config=_quiet(_trainer("abcd-paper", blocks=PEER_BLOCKS, partition="grid", training=PAPER)),
     description="ABCD by its paper's recipe: MSE, fixed steps for each cell, a new Adam at each visit.",
 )
 abcd_monolithic = MethodSpecification(

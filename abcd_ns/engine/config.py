@@ -53,6 +53,9 @@ class TrainingConfig:
     migrate: bool = True
     """Gaussians that left their cell by the end of a visit move to the block that holds them. Off, as in the
     paper, they are deleted."""
+    block_limit: int = 0
+    """Gaussians that a block may hold while it is trained; one that comes near it is cut in two when its
+    visit ends. 0 is none; `ns-train abcd` sets it by the device's memory."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
     sh_degree: int = 3

@@ -15,10 +15,19 @@ from torch import Tensor
 
 from abcd_ns.engine.batch import Batch, Rendered, Sample, background
 from abcd_ns.engine.block_state import BlockState, Clocks
+from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
 from abcd_ns.engine.density import DensityClock, DensityControl, for_blocks
-from abcd_ns.engine.events import Announcer, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import (
+    Announcer,
+    BlockSplit,
+    LayersDrawn,
+    StepTaken,
+    SweepEnded,
+    VisitBegan,
+    VisitEnded,
+)
 from abcd_ns.engine.influence import DIGITS, Influence, influence, weights
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
@@ -26,16 +35,20 @@ from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, 
 from abcd_ns.engine.planner import Planner
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.scaffold import join, live_of, part
+from abcd_ns.engine.scaffold import LIVE, join, part
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.schedule import endless_order, exponential_decay, sh_degree_at, view_order
+from abcd_ns.engine.schedule import (
+    endless_order,
+    exponential_decay,
+    sh_degree_at,
+    view_order,
+    views_per_step,
+)
 from abcd_ns.engine.settle import had_reserve, has_reserve, settle
+from abcd_ns.engine.splitting import split_full
 from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.engine.visit import VisitLayers
-
-DEFAULT_BATCH = 4
-"""Views in a step where there are several blocks."""
 
 
 class Coordinator:
@@ -68,19 +81,17 @@ class Coordinator:
         self.device = torch.device(device)
         self.announce = Announcer()
         self.stopwatch = Stopwatch()
-        self.density = DensityControl(for_blocks(config.density, scene.tree.num_blocks))
+        self.density = self._density_control()
         self.state = RunState()
         self._scene_key = scene_key
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
-        self.batch = config.batch or (1 if scene.tree.num_blocks == 1 else DEFAULT_BATCH)
         self._planner = Planner(
             config,
             budget,
             scene,
             self.views,
             rasterizer,
-            batch=self.batch,
             device=self.device,
         )
         self._pace = Pace(optimizers)
@@ -89,6 +100,14 @@ class Coordinator:
         self._layers: VisitLayers | None = None
         self._order: tuple[int, ...] = ()
         self._owner = torch.zeros(0, dtype=torch.int64)
+
+    @property
+    def batch(self) -> int:
+        """Views in a step, the warm-up's apart."""
+        return views_per_step(self.config.batch, self.scene.tree.num_blocks)
+
+    def _density_control(self) -> DensityControl:
+        return DensityControl(for_blocks(self.config.density, self.scene.tree.num_blocks))
 
     # -- the loop ------------------------------------------------------------------------------------
 
@@ -209,14 +228,21 @@ class Coordinator:
         before = self.config.warmup if had_reserve(self.scene) else 0.0
         return max(self.progress - before, 0.0) / (1 - before)
 
+    @property
+    def _room(self) -> int | None:
+        """Gaussians that may be added to the live block: as many as the scene and the block have room for."""
+        scene, block = self.config.density.limit, self.config.block_limit
+        rooms = [] if scene is None else [scene - self.count()]
+        rooms += [block - len(self.params["means"])] if block else []
+        return min(rooms, default=None)
+
     def _density_clock(self, taken: int) -> DensityClock:
-        limit = self.config.density.limit
         return DensityClock(
             progress=self._progress_of_blocks,
             steps=self._clocks.steps,
             taken=taken,
             views=self.state.views.get(self._active.geometry.block, len(self._active.geometry.views)),
-            room=None if limit is None else limit - self.count(),
+            room=self._room,
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
         )
 
@@ -241,8 +267,8 @@ class Coordinator:
         """
         updates = {}
         if (active := self.state.active) is not None:
-            state, live = self._detached(), live_of(self.scene.tree)
-            held = part(state, self._owner) if active.is_whole else {live: state}
+            state = self._detached()
+            held = part(state, self._owner) if active.is_whole else {LIVE: state}
             updates = {block: state.to_tensors() for block, state in held.items()}
             active.saved = not active.is_whole
         self.state.seconds = self.stopwatch.seconds
@@ -274,7 +300,7 @@ class Coordinator:
 
     def _attach(self, active: ActiveVisit) -> None:
         tree = self.scene.tree
-        alone = live_of(tree) if active.saved else active.geometry.block
+        alone = LIVE if active.saved else active.geometry.block
         blocks = range(tree.num_blocks) if active.is_whole else [alone]
         states = [BlockState.from_tensors(*self.scene.store.load(block)) for block in blocks]
         rows = torch.tensor([len(state) for state in states])
@@ -348,14 +374,16 @@ class Coordinator:
         if active.is_whole:
             self.state.influence = self._influence_of_all(state.gaussians)
         updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
+        tree, updates = self._split_full(updates)
         if active.saved:
-            updates[live_of(self.scene.tree)] = state[:0]
+            updates[LIVE] = state[:0]
         self.scene.lift()
         if self._layers is not None:
             self._layers.forget()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
-        self.scene.store.commit({b: s.to_tensors() for b, s in updates.items()}, state=self.state.to_json())
+        self.scene.rest(tree, {b: s.to_tensors() for b, s in updates.items()}, self.state.to_json())
+        self.density = self._density_control()
         block = None if active.is_whole else active.geometry.block
         staying = len(state) if block is None else len(updates[block])
         self.announce(
@@ -371,6 +399,16 @@ class Coordinator:
         )
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
+
+    def _split_full(self, updates: dict[int, BlockState]) -> tuple[BlockTree, dict[int, BlockState]]:
+        """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole."""
+        if not self.config.block_limit:
+            return self.scene.tree, updates
+        tree, updates, parents = split_full(self.scene.tree, updates, self.config.block_limit)
+        for new, parent in parents.items():
+            self.state.inherit(new, parent)
+            self.announce(BlockSplit(parent, new, len(updates[parent]), len(updates[new])))
+        return tree, updates
 
     def _influence_of_all(self, scaffold: Gaussians) -> Influence:
         owner = self.scene.tree.assign(scaffold.means)

@@ -62,7 +62,20 @@ class SweepEnded:
     step: int
 
 
-Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded
+@dataclass(frozen=True)
+class BlockSplit:
+    """A block had outgrown its limit and was cut in two; in the store as soon as its visit has ended."""
+
+    block: int
+    """It keeps its number and one part."""
+    new: int
+    """The number of the other part."""
+    gaussians: int
+    """In the part that stays."""
+    new_gaussians: int
+
+
+Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded | BlockSplit
 Listener = Callable[[Event], None]
 
 

@@ -27,15 +27,15 @@ from abcd_ns.engine.batch import Batch, Rendered, Sample, background
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.culling import Optics
 from abcd_ns.engine.density import DensityClock, DensityControl, for_blocks
 from abcd_ns.engine.events import StepTaken
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.ordering import front_to_back
-from abcd_ns.engine.painter import Optics
 from abcd_ns.engine.param_swap import attach, detach
 from abcd_ns.engine.rasterizer import Raster, Shot
 from abcd_ns.engine.scaffold import join, part
-from abcd_ns.engine.schedule import endless_order, exponential_decay
+from abcd_ns.engine.schedule import endless_order, exponential_decay, views_per_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer
 from abcd_ns.engine.visibility import reaches
 
@@ -79,15 +79,21 @@ class ExactCoordinator(Coordinator):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.batch = self.config.batch or 1
-        # Every block sees every step.
-        self.density = DensityControl(for_blocks(self.config.density, 1))
         self._optics = Optics(list(self.views.values()))
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []
         self._pictures: list[Tensor] = []
         self._take()
+
+    @property
+    def batch(self) -> int:
+        """Views in a step."""
+        return views_per_step(self.config.batch, 1)
+
+    def _density_control(self) -> DensityControl:
+        # Every block sees every step.
+        return DensityControl(for_blocks(self.config.density, 1))
 
     def next_batch(self) -> Batch:
         """Set the learning rate and say what to train on next: whole views."""

@@ -7,7 +7,7 @@ stock gsplat can draw.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,16 +16,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.blocks import BlockTree, Box
-from abcd_ns.engine.compositing import empty_layer, fold
+from abcd_ns.engine.compositing import empty_layer, over
+from abcd_ns.engine.culling import Frusta, Optics, intersection
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.ordering import node_children_in_order, split_around
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
-from abcd_ns.engine.visibility import blur_reach, reaches, widest_slant
+from abcd_ns.engine.visibility import reaches
 
 Ownership = Literal["fragments", "means"]
+LEAST_PASS = 200_000
+"""Gaussians: so many are drawn in one pass wherever blocks are small."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,12 @@ class Loaded:
     """Its own, then those of other units that reach into it."""
     own: int
     """How many are its own."""
+    seen: frozenset[int] | None = None
+    """Indices of the views that may see something of the unit, or None if that was not asked."""
+
+    def shows_in(self, view: View) -> bool:
+        """Whether `view` may see something of the unit; False is certain."""
+        return len(self.gaussians) > 0 and (self.seen is None or view.index in self.seen)
 
 
 class Painter:
@@ -97,15 +106,48 @@ class Painter:
         """
         return tuple(self._descend(0, exclude))
 
-    def load(self, unit: int, exclude: int | None = None) -> Loaded:
-        """On the device: the Gaussians of the unit's blocks and, by fragments, all others that reach in."""
+    def depth_of(self, unit: int) -> int:
+        """How many nodes are above a unit."""
+        depth = 0
+        while unit:
+            unit, depth = int(self.tree.parent[unit]), depth + 1
+        return depth
+
+    def load(self, unit: int, exclude: int | None = None, seen_by: Frusta | None = None) -> Loaded:
+        """On the device: the Gaussians of the unit's blocks and, by fragments, all others that reach in.
+
+        Args:
+            seen_by: keep to blocks of which something may show in these crops; others are not even read.
+        """
         inside = [b for b in self.tree.leaves(unit) if b != exclude]
+        outside: list[int] = []
+        if self.ownership == "fragments" and unit != 0:
+            outside = [b for b in range(self.tree.num_blocks) if b not in set(inside) and b != exclude]
+        seen = None
+        if seen_by is not None:
+            shown = self._shown(unit, [*inside, *outside], seen_by)
+            inside, outside = ([b for b in some if b in shown] for some in (inside, outside))
+            seen = frozenset(
+                view.index
+                for k, (view, _) in enumerate(seen_by.seen)
+                if any(row[k] for row in shown.values())
+            )
         parts = [self.scene.gaussians(block) for block in inside]
         own = sum(map(len, parts))
-        if self.ownership == "fragments" and unit != 0:
-            outside = [b for b in range(self.tree.num_blocks) if b not in inside and b != exclude]
-            parts += [self.reaching(block, self.tree.box(unit)) for block in outside]
-        return Loaded(Gaussians.cat(parts).to(self.device), own)
+        parts += [self.reaching(block, self.tree.box(unit)) for block in outside]
+        gaussians = Gaussians.cat(parts) if parts else Gaussians.empty()
+        return Loaded(gaussians.to(self.device), own, seen)
+
+    def _shown(self, unit: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
+        """Of these blocks, those with fragments in the unit that some crop may show, and which crops."""
+        known = ((b, self.scene.bounds(b)) for b in blocks)
+        boxes = {b: self._optics.drawn_within(bounds) for b, bounds in known if bounds is not None}
+        if self.ownership == "fragments":
+            space = self.tree.box(unit)
+            shared = {b: intersection(box, space) for b, box in boxes.items()}
+            boxes = {b: box for b, box in shared.items() if box is not None}
+        rows = seen_by.may_show(list(boxes.values())).tolist()
+        return {b: row for b, row in zip(boxes, rows, strict=True) if any(row)}
 
     def reaching(self, block: int, box: Box) -> Gaussians:
         """The block's Gaussians that some view may see inside `box`."""
@@ -123,10 +165,13 @@ class Painter:
         *,
         active: int | None = None,
         window: ZWindow | None = None,
-    ) -> Parts:
+    ) -> Parts | None:
         """Draw a unit, loaded by `load`, cut by the window of the active block (by fragments) or put
-        whole before or behind the active block (by means). Without an active block all is in front."""
+        whole before or behind the active block (by means). Without an active block all is in front.
+        None if the view sees nothing of it."""
         gaussians, nothing = loaded.gaussians, self._nothing(view, crop)
+        if not loaded.shows_in(view):
+            return None
         if self.ownership == "means":
             layer = self._draw(gaussians, view, crop, settings, None)
             front = active is None or self._is_in_front(unit, active, view)
@@ -136,8 +181,6 @@ class Painter:
             return Parts(self._draw(gaussians, view, crop, settings, span), nothing)
         before = ZWindow(span.near, torch.minimum(span.far, window.near))
         behind = ZWindow(torch.maximum(span.near, window.far), span.far)
-        if len(gaussians) == 0:
-            return Parts(nothing, nothing)
         cut = self.rasterizer.cut(
             gaussians,
             view,
@@ -151,27 +194,45 @@ class Painter:
         # What reaches in from another unit is inside that one's.
         return Parts(cut.front, cut.back, cut.inside[torch.where(cut.members < loaded.own)[0]])
 
-    def order(self, units: tuple[int, ...], view: View) -> tuple[int, ...]:
+    def order(self, units: Sequence[int], view: View) -> tuple[int, ...]:
         """The units front to back, as `view` sees them."""
-        center = view.center.double().cpu()
-        return tuple(node for node in self._walk(0, center) if node in set(units))
+        wanted, center = set(units), view.center.double().cpu()
+        return tuple(node for node in self._walk(0, center) if node in wanted)
 
-    def fold(self, parts: dict[int, Parts], view: View, crop: Crop) -> Parts:
-        """All units' parts collapsed into one layer in front of the active block and one behind, and what
-        is inside in one."""
-        ordered = [parts[unit] for unit in self.order(tuple(parts), view)]
+    def fold_up(self, parts: dict[int, Parts | None], unit: int, view: View) -> None:
+        """Collapse what has come in with `unit` and its neighbours in the tree, in place, as far as it goes.
+
+        Whatever lies under a node is a run of the front-to-back order, so it folds by itself. Done after
+        each unit, what is held grows with the depth of the tree and not with the number of units.
+
+        Args:
+            parts: by node; None for one that shows nothing.
+        """
+        center, node = view.center.double().cpu(), unit
+        while node:
+            node = int(self.tree.parent[node])
+            near, far = node_children_in_order(self.tree, node, center)
+            if near not in parts or far not in parts:
+                return
+            parts[node] = _over(parts.pop(near), parts.pop(far))
+
+    def fold(self, parts: dict[int, Parts | None], view: View, crop: Crop) -> Parts:
+        """All parts collapsed into one layer in front of the active block and one behind, and what is
+        inside in one."""
+        folded: Parts | None = None
+        for unit in self.order(tuple(parts), view):
+            folded = _over(folded, parts[unit])
         nothing = self._nothing(view, crop)
-        planes = [part.inside.planes for part in ordered if part.inside is not None and len(part.inside)]
-        return Parts(
-            fold([nothing, *(part.front for part in ordered)]),
-            fold([nothing, *(part.back for part in ordered)]),
-            Splats(torch.cat(planes, dim=1)) if planes else None,
-        )
+        return folded or Parts(nothing, nothing)
 
     def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
         """The whole scene through layers, unit by unit: the composited render."""
         crop = crop or view.full
-        parts = {unit: self.paint(unit, self.load(unit), view, crop, settings) for unit in self.units()}
+        parts: dict[int, Parts | None] = {}
+        for unit in self.units():
+            loaded = self.load(unit, seen_by=Frusta([(view, crop)]))
+            parts[unit] = self.paint(unit, loaded, view, crop, settings)
+            self.fold_up(parts, unit, view)
         return self.fold(parts, view, crop).front
 
     def _draw(
@@ -219,25 +280,21 @@ class Painter:
         return self.tree.leaves(unit)[0] in front
 
 
+def _over(front: Parts | None, behind: Parts | None) -> Parts | None:
+    """The parts of two units as one, `front` being the nearer; None shows nothing."""
+    if front is None or behind is None:
+        return behind if front is None else front
+    inside = [part.inside.planes for part in (front, behind) if part.inside is not None and len(part.inside)]
+    return Parts(
+        over(front.front, behind.front),
+        over(front.back, behind.back),
+        Splats(torch.cat(inside, dim=1)) if inside else None,
+    )
+
+
 def default_pass(scene: BlockScene) -> int:
     """Frozen Gaussians to draw in one pass: room for twice the largest block, and for any small scene."""
-    return max(2 * max(map(scene.count, range(scene.tree.num_blocks))), 200_000)
-
-
-class Optics:
-    """Bounds over all views, for a test of reach that does not depend on the view."""
-
-    def __init__(self, views: list[View]) -> None:
-        centers = torch.stack([view.center.double().cpu() for view in views])
-        self._middle = centers.mean(dim=0)
-        self._spread = float((centers - self._middle).norm(dim=1).max())
-        self._widest = min(views, key=lambda view: float(view.K.diagonal()[:2].min()))
-        self.slant = max(widest_slant(view) for view in views)
-
-    def blur(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """World size of the rasterizer's blur at each mean, as the farthest camera would see it."""
-        distance = (means - self._middle.to(means)).norm(dim=1) + self._spread
-        return blur_reach(distance, self._widest)
+    return max(2 * max(map(scene.count, range(scene.tree.num_blocks))), LEAST_PASS)
 
 
 def _everywhere(crop: Crop, device: torch.device) -> ZWindow:

@@ -7,12 +7,20 @@ import torch
 
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.culling import Frusta, Optics
 from abcd_ns.engine.influence import worth_training
 from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, Budget, RunState
 from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.schedule import VisitPlan, passes_of_sweep, plan_sweep, views_per_visit, visit_views
+from abcd_ns.engine.schedule import (
+    VisitPlan,
+    passes_of_sweep,
+    plan_sweep,
+    views_per_step,
+    views_per_visit,
+    visit_views,
+)
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, survey
 
@@ -22,7 +30,6 @@ class Planner:
 
     Args:
         views: the training views, by index.
-        batch: views in a step.
     """
 
     def __init__(
@@ -33,12 +40,12 @@ class Planner:
         views: Mapping[int, View],
         rasterizer: Rasterizer,
         *,
-        batch: int,
         device: torch.device,
     ) -> None:
         self._config, self._budget, self._scene = config, budget, scene
         self._views, self._rasterizer, self._device = views, rasterizer, device
-        self._batch = batch
+        self._frusta = Frusta((view, view.full) for view in views.values())
+        self._optics = Optics(list(views.values()))
 
     def warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the scaffold of all blocks is trained."""
@@ -103,7 +110,8 @@ class Planner:
             remaining = None if self._budget.steps is None else self._budget.steps - state.step
             passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
             used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
-            steps = (passes / self._batch, remaining, config.seed, config.visit_steps)
+            batch = views_per_step(config.batch, self._scene.tree.num_blocks)
+            steps = (passes / batch, remaining, config.seed, config.visit_steps)
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
                 raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
@@ -119,5 +127,9 @@ class Planner:
         return views_per_visit(seen, most, self._config.visit_views) if most else 0
 
     def _survey(self, block: int) -> VisitGeometry:
-        gaussians = self._scene.gaussians(block).to(self._device)
-        return survey(gaussians, block, self._views.values(), self._rasterizer)
+        bounds = self._scene.bounds(block)
+        if bounds is None:
+            return VisitGeometry(block, {})
+        (shows,) = self._frusta.may_show([self._optics.drawn_within(bounds)]).tolist()
+        near = [view for view, may in zip(self._views.values(), shows, strict=True) if may]
+        return survey(self._scene.gaussians(block).to(self._device), block, near, self._rasterizer)

@@ -1,5 +1,6 @@
 """Where a run stands: integers and plans, in JSON, so that a run can stop anywhere and go on exactly."""
 
+import copy
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -48,7 +49,7 @@ class ActiveVisit:
     """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
     done: int = 0
     saved: bool = False
-    """Whether the store holds the live block as it was in the middle of the visit, see scaffold.live_of."""
+    """Whether the store holds the live block as it was in the middle of the visit, see scaffold.LIVE."""
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
     began: float = 0.0
@@ -82,6 +83,15 @@ class RunState:
     active: ActiveVisit | None = None
     seconds: float = 0.0
     """Training time up to the last save."""
+
+    def inherit(self, new: int, parent: int) -> None:
+        """`new` was a part of `parent`: what is known of that holds for it too; it is visited next to it."""
+        for known in (self.views, self.influence):
+            if parent in known:
+                known[new] = copy.copy(known[parent])
+        places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
+        for place in reversed(places):
+            self.queue.insert(place + 1, VisitPlan(new, self.queue[place].steps))
 
     def to_json(self) -> dict[str, Any]:
         """As JSON; `from_json` gives an equal state."""

@@ -19,21 +19,15 @@ from abcd_ns.engine.types import Gaussians
 
 WHOLE = -1
 """Stands for all blocks at once where a visit names its block."""
+RESERVE = 1 << 20
+"""Under which number the store keeps the Gaussians that wait; no tree has so many blocks."""
+LIVE = RESERVE + 1
+"""Under which number it keeps a block that a save found in the middle of its visit. Under its own number that
+block stays as the visit found it: its layers hang on that."""
 REVEALED_OPACITY = 0.02
 """Of a Gaussian from the reserve: enough to be drawn and to learn, too little to spoil what is there."""
 REVEALED_SCALE = 0.5
 """Its size, as a share of the distance to its neighbours."""
-
-
-def reserve_of(tree: BlockTree) -> int:
-    """Under which number the store keeps the Gaussians that wait: the first that is no block's."""
-    return tree.num_blocks
-
-
-def live_of(tree: BlockTree) -> int:
-    """Under which number the store keeps a block that a save found in the middle of its visit. Under its own
-    number it stays as the visit found it: its layers hang on that. After those that `independent` keeps."""
-    return 2 * tree.num_blocks + 1
 
 
 def revealed(waiting: BlockState) -> BlockState:
@@ -72,4 +66,4 @@ def blocks_at_rest(
         return {b: at_rest.get(b, nobody).to_tensors() for b in range(tree.num_blocks)}
     scaffold, waiting = split_off(gaussians, keep, seed)
     reserve = BlockState.fresh(waiting).to_tensors()
-    return {**blocks_at_rest(tree, scaffold), reserve_of(tree): reserve}
+    return {**blocks_at_rest(tree, scaffold), RESERVE: reserve}

@@ -1,10 +1,13 @@
 """Where the blocks of a scene are to be found: at rest in the store, one of them live in parameters."""
 
 from collections import OrderedDict
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, runtime_checkable
 
-from abcd_ns.engine.blocks import BlockTree
+from torch import Tensor
+
+from abcd_ns.engine.blocks import BlockTree, Box
+from abcd_ns.engine.culling import bounds_of
 from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
@@ -27,6 +30,10 @@ class BlockScene(Protocol):
         """How many Gaussians the block has."""
         ...
 
+    def bounds(self, block: int) -> Box | None:
+        """`bounds_of` the block's Gaussians."""
+        ...
+
 
 class MemoryScene:
     """A scene that is one list of Gaussians in memory, parted by a tree."""
@@ -35,6 +42,7 @@ class MemoryScene:
         self.tree = tree
         owner = tree.assign(gaussians.means)
         self._blocks = [gaussians[owner == block] for block in range(tree.num_blocks)]
+        self._bounds = [bounds_of(block) for block in self._blocks]
 
     def gaussians(self, block: int) -> Gaussians:
         return self._blocks[block]
@@ -44,6 +52,9 @@ class MemoryScene:
 
     def count(self, block: int) -> int:
         return len(self._blocks[block])
+
+    def bounds(self, block: int) -> Box | None:
+        return self._bounds[block]
 
 
 class StoredScene:
@@ -57,7 +68,23 @@ class StoredScene:
         self.store = store
         self._ram_bytes = ram_bytes
         self._ram: OrderedDict[tuple[int, int], Gaussians] = OrderedDict()
+        self._bounds: dict[int, tuple[int, Box | None]] = {}
         self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
+
+    def rest(
+        self,
+        tree: BlockTree,
+        blocks: Mapping[int, tuple[dict[str, Tensor], dict[str, Any]]],
+        state: dict[str, Any],
+    ) -> None:
+        """Commit the blocks that changed, under `tree`, with the run's state.
+
+        Raises:
+            StoreError: the disk refused; the scene is as it was before.
+        """
+        header = None if tree is self.tree else {**self.store.header, "tree": tree.to_json()}
+        self.store.commit(blocks, header=header, state=state)
+        self.tree = tree
 
     def lay_over(self, block: int | None, live: Callable[[], Gaussians]) -> None:
         """From now on `block`, or with None the whole scene, is what `live` returns, not what is stored."""
@@ -96,6 +123,14 @@ class StoredScene:
         if self._live is not None and self._live[0] == block:
             return len(self._live[1]())
         return self.store.counts(block)
+
+    def bounds(self, block: int) -> Box | None:
+        if self._live is not None and self._live[0] in (None, block):
+            return bounds_of(self.gaussians(block))
+        version = self.version(block)
+        if block not in self._bounds or self._bounds[block][0] != version:
+            self._bounds[block] = (version, bounds_of(self.at_rest(block)))
+        return self._bounds[block][1]
 
 
 def _nbytes(gaussians: Gaussians) -> int:

@@ -11,6 +11,9 @@ import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+DEFAULT_BATCH = 4
+"""Views in a step where there are several blocks."""
+
 
 @dataclass(frozen=True)
 class VisitPlan:
@@ -55,6 +58,11 @@ def plan_sweep(
         return ()
     shares = _apportion(remaining, [seen[block] for block in order])
     return tuple(VisitPlan(block, share) for block, share in zip(order, shares, strict=True) if share > 0)
+
+
+def views_per_step(batch: int, blocks: int) -> int:
+    """`TrainingConfig.batch`, its 0 resolved."""
+    return batch or (1 if blocks == 1 else DEFAULT_BATCH)
 
 
 def views_per_visit(seen: int, most_seen: int, limit: int) -> int:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from abcd_ns.engine.block_state import BlockState
-from abcd_ns.engine.scaffold import WHOLE, part, reserve_of, revealed
+from abcd_ns.engine.scaffold import RESERVE, WHOLE, part, revealed
 from abcd_ns.engine.scene import StoredScene
 
 
@@ -38,24 +38,24 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
     Raises:
         KeyError: the store holds no reserve.
     """
-    waiting = _at_rest(scene, reserve_of(scene.tree)).to(state.gaussians.device)
+    waiting = _at_rest(scene, RESERVE).to(state.gaussians.device)
     trained, arrivals = part(state, _owner(scene, state)), part(revealed(waiting), _owner(scene, waiting))
     nobody = replace(waiting[:0], clocks=state.clocks)
     settled = {
         block: trained.get(block, nobody).joined_by(arrivals.get(block, nobody))
         for block in range(scene.tree.num_blocks)
     }
-    return {**settled, reserve_of(scene.tree): waiting[:0]}
+    return {**settled, RESERVE: waiting[:0]}
 
 
 def had_reserve(scene: StoredScene) -> bool:
     """Whether the run began with a scaffold."""
-    return reserve_of(scene.tree) in scene.store.blocks
+    return RESERVE in scene.store.blocks
 
 
 def has_reserve(scene: StoredScene) -> bool:
     """Whether Gaussians wait for the scaffold to be done."""
-    return had_reserve(scene) and scene.store.counts(reserve_of(scene.tree)) > 0
+    return had_reserve(scene) and scene.store.counts(RESERVE) > 0
 
 
 def _at_rest(scene: StoredScene, block: int) -> BlockState:

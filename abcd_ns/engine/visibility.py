@@ -15,6 +15,8 @@ skipped, and opacity is at most 1, so exp(-d^2 / 2) >= 1/255: d <= sqrt(2 ln 255
 
 BLUR_VARIANCE = 0.3
 """The variance that is added to every projected Gaussian (gsplat's eps2d), px^2."""
+BLUR_PIXELS = DRAWN_SIGMAS * math.sqrt(BLUR_VARIANCE)
+"""How far out it is drawn on that account alone, px."""
 
 
 def footprint(
@@ -54,10 +56,10 @@ def reach_radius(scales: Float[Tensor, "n 3"], sigma: float = DRAWN_SIGMAS) -> F
 def blur_reach(depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:
     """How much further than its own size a Gaussian at camera z = `depths` is drawn, world units.
 
-    DRAWN_SIGMAS sqrt(BLUR_VARIANCE) px, which is that many z / f; at most, as sqrt(a^2 + b^2) <= a + b.
+    BLUR_PIXELS px, which is that many z / f; at most, as sqrt(a^2 + b^2) <= a + b.
     """
     focal = torch.minimum(view.K[0, 0], view.K[1, 1])
-    return DRAWN_SIGMAS * math.sqrt(BLUR_VARIANCE) * depths / focal
+    return BLUR_PIXELS * depths / focal
 
 
 def widest_slant(view: View) -> float:

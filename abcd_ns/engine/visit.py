@@ -1,13 +1,14 @@
 """One visit: what a block looks like to its views, and the frozen layers around it."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 
 from abcd_ns.engine.compositing import empty_layer
+from abcd_ns.engine.culling import Frusta
 from abcd_ns.engine.painter import Loaded, Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
@@ -22,6 +23,10 @@ SIDES: tuple[Side, ...] = ("front", "back")
 """The two layers of a view, under the names of their fields in Parts."""
 AT_HAND_BYTES = 128 << 20
 """Size of the layers that a visit keeps at hand, at most; others are read from the cache for each step."""
+PARTS_BYTES = 256 << 20
+"""Size of the layers held while units are folded, at most, unless those of a single view are larger."""
+BYTES_PER_PIXEL = 32
+"""Of a front and a back layer in float32."""
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
 
@@ -116,6 +121,8 @@ class VisitLayers:
         self._versions = self._frozen_versions()
         self._units = painter.units(exclude=geometry.block)
         self._own = own if painter.ownership == "fragments" and self._units else None
+        # All views of the block, though few may be drawn: what is loaded must not depend on which.
+        self._seen_by = Frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
         self._near: dict[int, Splats | None] = {}
         self._windows: dict[int, DepthWindow] = {}
         self._at_hand: dict[int, Surroundings] = {}
@@ -123,10 +130,7 @@ class VisitLayers:
         self._uses_cache = False
 
     def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Surroundings]]:
-        """Draw what is missing for these views; yields each view when it is ready.
-
-        Units are taken one after the other, each for all views, so that the device holds one at a time.
-        """
+        """Draw what is missing for these views; yields each view when it is ready."""
         missing = []
         for view in dict.fromkeys(views):
             found = self._found(view)
@@ -134,12 +138,39 @@ class VisitLayers:
                 missing.append(view)
             else:
                 yield view, found
-        self._find_windows(missing)
-        parts: dict[int, dict[int, Parts]] = {view: {} for view in missing}
+        for group in self._groups(missing):
+            yield from self._draw_group(group)
+
+    def _groups(self, views: Sequence[int]) -> Iterator[Sequence[int]]:
+        """Views that are drawn together: as many as there is room for what their units are folded from."""
+        if len(self._units) == 1:
+            yield views
+            return
+        levels = max(map(self._painter.depth_of, self._units), default=0) + 1
+        group: list[int] = []
+        room = PARTS_BYTES
+        for view in views:
+            crop = self._geometry.crops[view]
+            room -= levels * BYTES_PER_PIXEL * crop.width * crop.height
+            if group and room < 0:
+                yield group
+                group, room = [], PARTS_BYTES
+            group.append(view)
+        if group:
+            yield group
+
+    def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Surroundings]]:
+        """All units one after the other, each for all of these views: the device holds one at a time."""
+        self._find_windows(views)
+        block = self._geometry.block
+        # By means no unit holds the active block's own place in the order; nothing stands there.
+        own_place = {} if self._own is not None else {self._painter.tree.node_of(block): None}
+        parts: dict[int, dict[int, Parts | None]] = {view: dict(own_place) for view in views}
         for unit in self._units:
-            loaded = self._painter.load(unit, exclude=self._geometry.block)
-            for view in missing:
+            loaded = self._painter.load(unit, exclude=block, seen_by=self._seen_by)
+            for view in views:
                 parts[view][unit] = self._paint(unit, loaded, view)
+                self._painter.fold_up(parts[view], unit, self._views[view])
                 if unit == self._units[-1]:
                     yield view, self._keep(view, parts.pop(view))
 
@@ -191,7 +222,7 @@ class VisitLayers:
     def _window(self, view: int) -> ZWindow | None:
         return None if self._own is None else self._windows[view].by_pixel()
 
-    def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts:
+    def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts | None:
         return self._painter.paint(
             unit,
             loaded,
@@ -202,7 +233,7 @@ class VisitLayers:
             window=self._window(view),
         )
 
-    def _keep(self, view: int, parts: dict[int, Parts]) -> Surroundings:
+    def _keep(self, view: int, parts: dict[int, Parts | None]) -> Surroundings:
         """Fold, and put at hand or into the cache; what comes back went through the codec either way."""
         folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
         stored = (through_codec(getattr(folded, side), self._cache.bits) for side in SIDES)

@@ -19,6 +19,7 @@ from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.pipeline import AbcdPipeline
+from abcd_ns.plugin.room import check_room, device_budget
 from abcd_ns.plugin.trainer import AbcdTrainer
 
 MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
@@ -125,8 +126,12 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     model: AbcdModelConfig = field(default_factory=AbcdModelConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """How blocks are trained."""
-    blocks: int = 8
-    """Number of blocks that space is cut into; 1 is ordinary 3DGS."""
+    blocks: int = 0
+    """Number of blocks that space is cut into; 1 is ordinary 3DGS. 0 takes as few as `device_budget_gb`
+    allows, one where the scene fits, and cuts blocks that outgrow it in two."""
+    device_budget_gb: float = 0.0
+    """Memory of the device that training may take, GB, by which `blocks` 0 is decided; 0 takes 0.9 of what is
+    free on a GPU, and a quarter of the machine's RAM on a CPU."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
     near_plane: float = 0.0
@@ -149,7 +154,7 @@ class AbcdTrainerConfig(TrainerConfig):
         pipeline = self.pipeline
         what = f"{self.method_name} on {pipeline.datamanager.data}"
         seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
-        blocks = "1 block" if pipeline.blocks == 1 else f"{pipeline.blocks} blocks"
+        blocks = {0: "as few blocks as fit", 1: "1 block"}.get(pipeline.blocks, f"{pipeline.blocks} blocks")
         CONSOLE.print(f"{what}: {blocks}, {self.max_num_iterations:,} steps{seconds}", highlight=False)
 
     def save_config(self) -> None:
@@ -168,8 +173,12 @@ class AbcdTrainerConfig(TrainerConfig):
         try:
             if self.machine.num_devices * self.machine.num_machines > 1:
                 raise UserError("ABCD trains on one device; leave out --machine.num-devices.")
-            if self.pipeline.blocks < 1:
-                raise UserError(f"--pipeline.blocks must be 1 or more, not {self.pipeline.blocks}.")
+            if self.pipeline.blocks < 0:
+                raise UserError(f"--pipeline.blocks must be 0 or more, not {self.pipeline.blocks}.")
+            if not self.pipeline.device_budget_gb >= 0:
+                raise UserError(
+                    f"--pipeline.device-budget-gb must be 0 or more, not {self.pipeline.device_budget_gb}."
+                )
             if not self.pipeline.near_plane >= 0:
                 raise UserError(f"--pipeline.near-plane must be 0 or more, not {self.pipeline.near_plane}.")
             check_training(self.pipeline.training)
@@ -179,7 +188,11 @@ class AbcdTrainerConfig(TrainerConfig):
             parser = self.pipeline.datamanager.dataparser
             if self.pipeline.datamanager.data is not None:
                 parser = dataclasses.replace(parser, data=self.pipeline.datamanager.data)
-            parser.setup().check()
+            parser = parser.setup()
+            parser.check()
+            if self.pipeline.blocks == 0:
+                budget = device_budget(self.pipeline.device_budget_gb, self.machine.device_type)
+                check_room(budget, parser.largest_image, self.pipeline.training)
         except UserError as error:
             CONSOLE.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
             raise SystemExit(2) from None

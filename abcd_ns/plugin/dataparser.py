@@ -110,6 +110,11 @@ class AbcdDataParser(DataParser):
         for split in ("train", "test"):
             split_rows(len(self._load().sources), split, self.config)
 
+    @property
+    def largest_image(self) -> int:
+        """Pixels of the largest photo as it is trained on."""
+        return max(width * height for width, height in (source.size for source in self._load().sources))
+
     def _load(self) -> _Prepared:
         if self._prepared is None:
             self._prepared = _prepare(self.config, needs_photos=self.downscale_factor is None)

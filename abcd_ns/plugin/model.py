@@ -45,8 +45,7 @@ class AbcdModel(SplatfactoModel):
     config: "AbcdModelConfig"
 
     def populate_modules(self) -> None:
-        """Register empty parameters; the initial Gaussians stay outside, in RAM."""
-        self.initial = self._initial_gaussians()
+        """Register empty parameters; what a run begins with is made when it begins."""
         empty = Gaussians.empty(self.config.sh_degree)
         self.gauss_params = ParameterDict({name: Parameter(value) for name, value in empty.items()})
         self.camera_optimizer = self.config.camera_optimizer.setup(
@@ -89,7 +88,8 @@ class AbcdModel(SplatfactoModel):
         scene = self._coordinator.scene
         return Gaussians.cat([scene.gaussians(block).to("cpu") for block in range(scene.tree.num_blocks)])
 
-    def _initial_gaussians(self) -> Gaussians:
+    def initial_gaussians(self) -> Gaussians:
+        """What a run begins with: a Gaussian for each point, or random ones."""
         config = self.config
         if self.seed_points is None or config.random_init or len(self.seed_points[0]) == 0:
             points, colors = random_points(config.num_random, config.random_scale)

@@ -26,6 +26,7 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
+from abcd_ns.plugin.room import EXPECTED_GROWTH, device_budget, find_room
 from abcd_ns.plugin.views import views_of
 
 if TYPE_CHECKING:
@@ -97,9 +98,11 @@ class AbcdPipeline(VanillaPipeline):
         views = self._views()
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer)
-        tree = BlockTree.from_json(store.header["tree"])
-        coordinator = coordinator_for(config.training)(
-            config.training,
+        header = store.header
+        tree = BlockTree.from_json(header["tree"])
+        training = replace(config.training, block_limit=header.get("block_limit", 0))
+        coordinator = coordinator_for(training)(
+            training,
             Budget(trainer.total_steps, config.max_seconds),
             StoredScene(tree, store),
             views,
@@ -113,6 +116,21 @@ class AbcdPipeline(VanillaPipeline):
         if resumed:
             coordinator.restore()
         return coordinator
+
+    def _room(self, points: int) -> tuple[int, int]:
+        """(number of blocks to begin with, Gaussians in a block at most or 0 for no limit)."""
+        config = self.config
+        if config.blocks > 0:
+            return config.blocks, config.training.block_limit
+        cameras = self.datamanager.train_dataset.cameras
+        room = find_room(
+            device_budget(config.device_budget_gb, self.device),
+            pixels=int((cameras.width * cameras.height).max()),
+            gaussians=config.training.density.limit or EXPECTED_GROWTH * points,
+            training=config.training,
+        )
+        CONSOLE.print(room.in_words(), highlight=False, soft_wrap=True)
+        return room.blocks, room.limit
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""
@@ -129,15 +147,18 @@ class AbcdPipeline(VanillaPipeline):
                 old.clone_to(folder, pin)
             return ParameterStore.open(folder), True
         training = self.config.training
-        gaussians = thin_out(self.model.initial, training.density.limit, training.seed)
-        if len(gaussians) < len(self.model.initial):
+        everything = self.model.initial_gaussians()
+        gaussians = thin_out(everything, training.density.limit, training.seed)
+        if len(gaussians) < len(everything):
             CONSOLE.print(
-                f"Training begins with {len(gaussians):,} of {len(self.model.initial):,} points, the limit "
+                f"Training begins with {len(gaussians):,} of {len(everything):,} points, the limit "
                 "on Gaussians.",
                 highlight=False,
             )
-        tree = cut_space(gaussians, self.config.blocks, self.config.partition)
-        store = ParameterStore.create(folder, {"tree": tree.to_json()})
+        del everything
+        blocks, limit = self._room(len(gaussians))
+        tree = cut_space(gaussians, blocks, self.config.partition)
+        store = ParameterStore.create(folder, {"tree": tree.to_json(), "block_limit": limit})
         if training.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))
             return store, False

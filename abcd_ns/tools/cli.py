@@ -36,6 +36,7 @@ COMMANDS = (
         "demo", "abcd_ns.tools.demo:demo", "make a small scene, train it block by block, show the result"
     ),
     Command("synth", "abcd_ns.tools.synth.command:synth", "render a synthetic scene to train on"),
+    Command("plan", "abcd_ns.tools.plan.command:plan", "say what a run will need, before it begins"),
     Command(
         "compare",
         "abcd_ns.tools.compare.command:compare",
@@ -46,6 +47,7 @@ COMMANDS = (
         "abcd_ns.tools.study.command:study",
         "vary one thing: blocks, Gaussians, or any options",
     ),
+    Command("scale", "abcd_ns.tools.scale.command:scale", "memory and time as the scene grows"),
 )
 
 EXAMPLES = (

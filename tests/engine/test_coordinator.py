@@ -15,7 +15,7 @@ from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan
 from abcd_ns.engine.ordering import front_to_back
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import RunState
-from abcd_ns.engine.scaffold import live_of
+from abcd_ns.engine.scaffold import LIVE
 from abcd_ns.engine.storage import StaleLayerError
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
@@ -186,7 +186,7 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(
     (tmp_path / "whole").mkdir()
     whole = make_coordinator(tmp_path / "whole", start, views, blocks=blocks, **options)
     train(whole, photos)
-    live, within_visits = live_of(whole.scene.tree), 0
+    live, within_visits = LIVE, 0
     for stop in (3, 14, 22):
         folder = tmp_path / str(stop)
         folder.mkdir()

@@ -8,7 +8,7 @@ from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.initialize import split_off
 from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.scaffold import REVEALED_OPACITY, blocks_at_rest, reserve_of
+from abcd_ns.engine.scaffold import RESERVE, REVEALED_OPACITY, blocks_at_rest
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import make_coordinator, whole_scene
@@ -35,7 +35,7 @@ def test_without_a_scaffold_nothing_waits(start):
     tree = build_kd(start.means, 4)
     assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
     assert sorted(blocks_at_rest(tree, start, keep=len(start))) == [0, 1, 2, 3]
-    assert sorted(blocks_at_rest(tree, start, keep=30)) == [0, 1, 2, 3, reserve_of(tree)]
+    assert sorted(blocks_at_rest(tree, start, keep=30)) == [0, 1, 2, 3, RESERVE]
 
 
 def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, photos, start):
@@ -57,7 +57,7 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
     train(coordinator, photos, steps=10)
     assert coordinator.state.active is None
     scene, store = coordinator.scene, coordinator.scene.store
-    assert store.counts(reserve_of(scene.tree)) == 0
+    assert store.counts(RESERVE) == 0
     for block in range(4):
         state = BlockState.from_tensors(*store.load(block))
         assert bool((scene.tree.assign(state.gaussians.means) == block).all())

@@ -1,0 +1,40 @@
+"""Blocks that outgrow what the device holds are cut in two where they come to rest."""
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.partition import best_split
+
+FULL = 0.75
+"""Share of its limit over which a block is cut: the next visit needs room to grow."""
+
+
+def split_full(
+    tree: BlockTree, settled: dict[int, BlockState], limit: int
+) -> tuple[BlockTree, dict[int, BlockState], dict[int, int]]:
+    """Cut each block with more than FULL of `limit` Gaussians in equal halves, and those again if need be.
+
+    Both parts keep the block's clocks. Gaussians that coincide stay together, however many they are.
+
+    Args:
+        settled: blocks that are about to be stored; numbers that are no block's are left alone.
+
+    Returns:
+        The tree with the cuts, everything to be stored, and of each new block the one that it was part of.
+    """
+    parents: dict[int, int] = {}
+    waiting = sorted(block for block in settled if block < tree.num_blocks)
+    settled = dict(settled)
+    while waiting:
+        block = waiting.pop(0)
+        state = settled[block]
+        if len(state) <= FULL * limit:
+            continue
+        means = state.gaussians.means.detach().cpu()
+        new, cut = tree.num_blocks, tree.split(block, *best_split(means, tree.cell(block)))
+        leaves = (cut.assign(means) == new).to(state.gaussians.device)
+        if bool(leaves.all()) or not bool(leaves.any()):
+            continue
+        tree, parents[new] = cut, block
+        settled |= {block: state[~leaves], new: state[leaves]}
+        waiting += [block, new]
+    return tree, settled, parents

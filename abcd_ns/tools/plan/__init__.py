@@ -1,0 +1,1 @@
+"""`abcd plan`: what a run will need, before it begins."""

@@ -1,0 +1,1 @@
+"""`abcd scale`: memory and time as the scene grows and the block does not."""

@@ -1,0 +1,177 @@
+"""One measurement in a process of its own: `python -m abcd_ns.tools.scale.arm JOB.json`."""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch.nn import Parameter, ParameterDict
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import Event, StepTaken, VisitEnded
+from abcd_ns.engine.param_swap import make_adam
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.rasterizer import make_rasterizer
+from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.tools.runs.machine import disk_bytes, peak_rss_bytes
+from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
+from abcd_ns.tools.scale.land import Land
+
+RESULT_FILE = "arm.json"
+RATES = {
+    "means": 1.6e-4,
+    "features_dc": 0.0025,
+    "features_rest": 0.0025 / 20,
+    "opacities": 0.05,
+    "scales": 0.005,
+    "quats": 0.001,
+}
+"""As the methods have them."""
+MONOLITHIC_STEPS = 12
+"""Enough for Adam's moments and the drawing of the largest view to be there."""
+
+
+@dataclass(frozen=True)
+class ArmJob:
+    """What to measure."""
+
+    tiles: int
+    gaussians_per_tile: int
+    monolithic: bool
+    visits: int
+    """Visits to make, or with `monolithic` none."""
+    ram_budget_bytes: int
+    """For blocks that were read; layers and photos have their own."""
+    seed: int
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What was measured."""
+
+    tiles: int
+    gaussians: int
+    """In the whole scene."""
+    monolithic: bool
+    base_rss_bytes: int
+    """RAM before the scene was made: Python, torch and the kernels."""
+    peak_rss_bytes: int
+    peak_device_bytes: int | None
+    store_bytes: int
+    make_seconds: float
+    plan_seconds: float
+    """Until the first visit began: which views see which block."""
+    visit_seconds: float | None
+    """Mean of the visits."""
+    layer_seconds: float | None
+    """Of it, for layers."""
+    steps: int
+    psnr: float
+    """On the crops trained on, mean of the last visit's steps, dB."""
+
+
+def run(job: ArmJob, folder: Path) -> Arm:
+    """Make the scene on disk, train some visits, and say what they took."""
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    rasterizer = make_rasterizer("auto", device)
+    rasterizer.warm_up()
+    base, began = peak_rss_bytes(), time.perf_counter()
+    land = Land(job.tiles, job.gaussians_per_tile, seed=job.seed)
+    store = make_store(land, job.monolithic, folder / "store")
+    made = time.perf_counter()
+    coordinator = _coordinator(job, land, store, rasterizer, device, folder)
+    watch = _Watch(coordinator)
+    cameras = {view.index: view for view in land.cameras()}
+    wanted = MONOLITHIC_STEPS if job.monolithic else None
+    while len(watch.visits) < job.visits if wanted is None else coordinator.state.step < wanted:
+        train_step(coordinator, lambda view, crop: land.photo(cameras[view], crop))
+    visits = watch.visits
+    return Arm(
+        tiles=job.tiles,
+        gaussians=job.tiles * job.gaussians_per_tile,
+        monolithic=job.monolithic,
+        base_rss_bytes=base,
+        peak_rss_bytes=peak_rss_bytes(),
+        peak_device_bytes=torch.cuda.max_memory_allocated() if device.type == "cuda" else None,
+        store_bytes=disk_bytes(folder / "store"),
+        make_seconds=made - began,
+        plan_seconds=watch.first_step - made,
+        visit_seconds=sum(v.seconds for v in visits) / len(visits) if visits else None,
+        layer_seconds=sum(v.layer_seconds for v in visits) / len(visits) if visits else None,
+        steps=coordinator.state.step,
+        psnr=sum(watch.psnr) / len(watch.psnr),
+    )
+
+
+def make_store(land: Land, monolithic: bool, folder: Path) -> ParameterStore:
+    """The land at rest: tile by tile, or all tiles as one block, which takes the RAM that it takes."""
+    if monolithic:
+        tree = build_kd(torch.zeros(0, 3), 1)
+        store = ParameterStore.create(folder, {"tree": tree.to_json()})
+        everything = Gaussians.cat([land.make_tile(tile) for tile in range(land.tiles)])
+        store.commit({0: BlockState.fresh(everything).to_tensors()})
+        return store
+    tree = land.tree()
+    store = ParameterStore.create(folder, {"tree": tree.to_json()})
+    for block, tile in enumerate(land.tile_of(tree)):
+        store.commit({block: BlockState.fresh(land.make_tile(tile)).to_tensors()})
+        print(f"tile {block + 1}/{land.tiles}", flush=True)
+    return store
+
+
+def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, device, folder) -> Coordinator:
+    tree = build_kd(torch.zeros(0, 3), 1) if job.monolithic else land.tree()
+    params = ParameterDict({n: Parameter(v.to(device)) for n, v in Gaussians.empty(3).items()})
+    return Coordinator(
+        TrainingConfig(seed=job.seed, warmup=0.0, sh_ramp=0.0, density=DensityConfig(strategy="off")),
+        Budget(steps=10**9),
+        StoredScene(tree, store, ram_bytes=job.ram_budget_bytes),
+        land.cameras(),
+        LayerCache(folder / "layers"),
+        rasterizer,
+        params,
+        make_adam(params, RATES),
+        device=device,
+    )
+
+
+class _Watch:
+    """Takes note of visits, and of the first step."""
+
+    def __init__(self, coordinator: Coordinator) -> None:
+        self.visits: list[VisitEnded] = []
+        self.psnr: list[float] = []
+        self.first_step = 0.0
+        self._visit = 0
+        coordinator.announce.subscribe(self)
+
+    def __call__(self, event: Event) -> None:
+        match event:
+            case StepTaken():
+                self.first_step = self.first_step or time.perf_counter()
+                if event.visit != self._visit:
+                    self._visit, self.psnr = event.visit, []
+                self.psnr.append(event.psnr)
+            case VisitEnded():
+                self.visits.append(event)
+                print(f"visit {len(self.visits)}: {event.seconds:.1f} s", flush=True)
+
+
+def main() -> int:
+    """Do the job in the file that is the only argument; the result is written beside it."""
+    (path,) = map(Path, sys.argv[1:])
+    job = decode(ArmJob, read_json(path), str(path))
+    write_json(path.with_name(RESULT_FILE), encode(run(job, path.resolve().parent)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,112 @@
+"""Blocks that outgrow their limit are cut in two: nothing lost, bounded, resumable."""
+
+import pytest
+import torch
+
+from abcd_ns.engine.block_state import BlockState, Clocks
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import BlockSplit, VisitBegan
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.run_state import RunState
+from abcd_ns.engine.scaffold import RESERVE
+from abcd_ns.engine.schedule import VisitPlan
+from abcd_ns.engine.splitting import FULL, split_full
+from abcd_ns.engine.training_loop import train, train_step
+from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+
+GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=1e-5)
+
+
+def rows(state: BlockState) -> set[tuple[float, ...]]:
+    return set(map(tuple, state.gaussians.means.tolist()))
+
+
+@pytest.mark.parametrize("limit", [20, 60, 500])
+def test_parts_are_small_enough_and_hold_everything(limit):
+    gaussians = random_gaussians(300)
+    tree = build_kd(gaussians.means, 3)
+    owner = tree.assign(gaussians.means)
+    settled = {b: BlockState.fresh(gaussians[owner == b]) for b in range(3)}
+    settled = {b: BlockState(s.gaussians, s.exp_avg, s.exp_avg_sq, {}, Clocks(b)) for b, s in settled.items()}
+    cut, parts, parents = split_full(tree, settled, limit)
+    assert all(len(state) <= FULL * limit for state in parts.values())
+    assert set().union(*map(rows, parts.values())) == rows(BlockState.fresh(gaussians))
+    assert cut.num_blocks == len(parts) == 3 + len(parents)
+    for block, state in parts.items():
+        assert bool((cut.assign(state.gaussians.means) == block).all())
+        origin = block
+        while origin in parents:
+            origin = parents[origin]
+        assert state.clocks.steps == origin
+    assert (limit < 100 / FULL) == bool(parents)
+
+
+def test_what_cannot_be_parted_is_left_as_it_is():
+    gaussians = random_gaussians(50)
+    gaussians.means[:] = 0.5
+    tree = build_kd(gaussians.means, 1)
+    cut, parts, parents = split_full(tree, {0: BlockState.fresh(gaussians)}, 10)
+    assert (cut, list(parts), parents) == (tree, [0], {})
+
+
+def test_the_reserve_is_no_block():
+    gaussians = random_gaussians(50)
+    tree = build_kd(gaussians.means, 1)
+    waiting = BlockState.fresh(gaussians)
+    assert split_full(tree, {RESERVE: waiting}, 10) == (tree, {RESERVE: waiting}, {})
+
+
+def test_a_part_is_visited_next_to_the_block_it_came_from():
+    state = RunState(queue=[VisitPlan(0, 5), VisitPlan(1, 7)], views={0: 3, 1: 4}, influence={0: {2: 0.5}})
+    state.inherit(2, 0)
+    state.inherit(3, 1)
+    assert state.queue == [VisitPlan(0, 5), VisitPlan(2, 5), VisitPlan(1, 7), VisitPlan(3, 7)]
+    assert (state.views[2], state.views[3]) == (3, 4)
+    assert state.influence == {0: {2: 0.5}, 2: {2: 0.5}}
+    state.influence[2][2] = 0.1
+    assert state.influence[0][2] == 0.5
+
+
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, start, blocks):
+    limit = 90
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=blocks, steps=160, density=GROWING, block_limit=limit, warmup=0.0
+    )
+    seen = []
+    coordinator.announce.subscribe(seen.append)
+    largest = 0
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        largest = max(largest, len(coordinator.params["means"]))
+    cuts = [event for event in seen if isinstance(event, BlockSplit)]
+    assert cuts
+    assert largest <= limit
+    tree = coordinator.scene.tree
+    assert tree.num_blocks == blocks + len(cuts)
+    assert {event.block for event in seen if isinstance(event, VisitBegan)} >= {cut.new for cut in cuts[:1]}
+    assert coordinator.scene.store.header["tree"] == tree.to_json()
+    for block in range(tree.num_blocks):
+        means = coordinator.scene.at_rest(block).means
+        assert bool((tree.assign(means) == block).all())
+
+
+def test_a_run_that_was_cut_resumes_bit_for_bit(tmp_path, views, photos, start):
+    options = {"blocks": 2, "steps": 120, "density": GROWING, "block_limit": 90, "warmup": 0.0}
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    whole.mkdir()
+    halves.mkdir()
+    expected = make_coordinator(whole, start, views, **options)
+    train(expected, photos)
+    first = make_coordinator(halves, start, views, **options)
+    while first.scene.tree.num_blocks == 2 or first.state.active is None:
+        train_step(first, photos)
+    train(first, photos, 3)
+    first.save()
+    first.scene.store.close()
+    second = make_coordinator(halves, start, views, resume=True, **options)
+    assert second.scene.tree.num_blocks > 2
+    train(second, photos)
+    assert expected.scene.tree == second.scene.tree
+    for (_, a), (_, b) in zip(whole_scene(expected).items(), whole_scene(second).items(), strict=True):
+        assert torch.equal(a, b)

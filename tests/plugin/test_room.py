@@ -1,0 +1,41 @@
+"""The number of blocks follows from the device's budget."""
+
+import pytest
+
+from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.memory import DeviceNeeds
+from abcd_ns.engine.splitting import FULL
+from abcd_ns.errors import UserError
+from abcd_ns.plugin.room import GB, check_room, device_budget, find_room
+
+TRAINING = TrainingConfig()
+PIXELS = 1297 * 840
+
+
+@pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
+@pytest.mark.parametrize("gb", [2, 8, 24, 80])
+def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
+    room = find_room(gb * GB, pixels=PIXELS, gaussians=gaussians, training=TRAINING)
+    needs = DeviceNeeds(PIXELS, 1 if room.blocks == 1 else 4)
+    assert needs.bytes_for(room.limit) <= gb * GB < needs.bytes_for(room.limit + 1)
+    assert gaussians <= room.blocks * FULL * room.limit
+    assert room.blocks == 1 or gaussians > (room.blocks - 1) * FULL * room.limit
+
+
+def test_a_scene_that_fits_is_one_block():
+    assert find_room(24 * GB, pixels=PIXELS, gaussians=2_000_000, training=TRAINING).blocks == 1
+    assert find_room(24 * GB, pixels=PIXELS, gaussians=200_000_000, training=TRAINING).blocks > 10
+
+
+def test_a_budget_too_small_for_any_block_names_the_least():
+    with pytest.raises(
+        UserError, match=r"--pipeline\.device-budget-gb 0\.25 .* give (\S+) or more"
+    ) as caught:
+        check_room(GB // 4, PIXELS, TRAINING)
+    least = float(str(caught.value).split("give ")[1].split()[0])
+    check_room(int((least + 0.01) * GB), PIXELS, TRAINING)
+
+
+def test_the_budget_is_what_is_wanted_or_a_share_of_what_there_is():
+    assert device_budget(3.0, "cpu") == 3 * GB
+    assert device_budget(0.0, "cpu") > 0
