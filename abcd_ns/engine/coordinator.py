@@ -30,9 +30,9 @@ from abcd_ns.engine.scaffold import join, live_of, part
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import endless_order, exponential_decay, sh_degree_at, view_order
 from abcd_ns.engine.settle import had_reserve, has_reserve, settle
-from abcd_ns.engine.storage import LayerCache
+from abcd_ns.engine.storage import LayerCache, crash_points
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.engine.visit import VisitLayers
+from abcd_ns.engine.visit import AT_HAND_BYTES, VisitLayers
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
@@ -46,6 +46,7 @@ class Coordinator:
         params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
             learning rates; that of the means is the one to decay from.
         scene_key: fingerprint of the capture, part of every layer's key.
+        at_hand_bytes: see VisitLayers.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Coordinator:
         *,
         scene_key: str = "",
         device: torch.device | str = "cpu",
+        at_hand_bytes: int = AT_HAND_BYTES,
     ) -> None:
         self.config, self.budget, self.scene, self.cache = config, budget, scene, cache
         self.params, self.optimizers = params, optimizers
@@ -70,7 +72,7 @@ class Coordinator:
         self.stopwatch = Stopwatch()
         self.density = DensityControl(for_blocks(config.density, scene.tree.num_blocks))
         self.state = RunState()
-        self._scene_key = scene_key
+        self._scene_key, self._at_hand_bytes = scene_key, at_hand_bytes
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
         self.batch = config.batch or (1 if scene.tree.num_blocks == 1 else DEFAULT_BATCH)
@@ -251,7 +253,7 @@ class Coordinator:
             self.scene.store.pin(pin)
 
     def restore(self) -> None:
-        """Go on from what the store holds: exactly where `save` was called."""
+        """Go on from the store's newest generation: where `save` was called, or the last visit ended."""
         self.state = RunState.from_json(self.scene.store.state)
         self.stopwatch = Stopwatch(self.state.seconds)
         if self.state.active is not None:
@@ -335,6 +337,7 @@ class Coordinator:
             settings,
             window_weight=self.config.window_weight,
             scene_key=self._scene_key,
+            at_hand_bytes=self._at_hand_bytes,
         )
         wanted = dict.fromkeys(self._order[active.done * self.batch :])
         for done, _ in enumerate(layers.draw(wanted), start=1):
@@ -355,6 +358,7 @@ class Coordinator:
             self._layers.forget()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
+        crash_points.reached(crash_points.VISIT_TRAINED)
         self.scene.store.commit({b: s.to_tensors() for b, s in updates.items()}, state=self.state.to_json())
         block = None if active.is_whole else active.geometry.block
         staying = len(state) if block is None else len(updates[block])

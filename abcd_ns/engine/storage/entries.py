@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import lmdb
 
+from abcd_ns.engine.storage import crash_points
 from abcd_ns.engine.storage.atomic import FolderLock
 
 T = TypeVar("T")
@@ -88,6 +89,7 @@ class LmdbEntries:
                 self._delete_files()
             self._unsynced.write_bytes(boot)
             self._environment = self._open()
+            crash_points.reached(crash_points.CACHE_OPENED)
         except BaseException:
             self._lock.release()
             raise
@@ -161,6 +163,7 @@ class LmdbEntries:
             with environment.begin(write=True) as transaction:
                 for key, value in items:
                     transaction.put(key, value)
+                crash_points.reached(crash_points.LAYERS_PUT)
             return True
 
         return self._attempt(write) is True
