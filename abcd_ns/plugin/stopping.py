@@ -80,15 +80,15 @@ class StopSignals:
         self._before = {}
 
 
-def command_to_go_on(argv: Sequence[str], method: str, folder: Path) -> str:
-    """What to type to go on with the run in `folder`.
+def command_to_go_on(argv: Sequence[str], method: str, folder: Path) -> str | None:
+    """What to type to go on with the run in `folder`: the same command with --load-dir.
 
     Args:
-        argv: the command line of this process. If it is `ns-train`'s, its options are kept.
+        argv: the command line of this process; None is returned if it is not `ns-train`'s.
     """
     program, *words = argv
     if Path(program).name != "ns-train" or words[:1] != [method]:
-        words = [method]
+        return None
     kept, skip = [], False
     for word in words[1:]:
         name = word.partition("=")[0].replace("_", "-")

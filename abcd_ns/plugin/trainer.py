@@ -70,19 +70,14 @@ class AbcdTrainer(Trainer):
             self._end_report()
             with exit_on_user_error():
                 self.pipeline.coordinator.save()
-            CONSOLE.print(
-                f"Stopped by {stopped.received.name} after step {self.pipeline.coordinator.state.step:,} of "
-                f"{self.total_steps:,}. Nothing is lost; go on with",
-                highlight=False,
-                soft_wrap=True,
-            )
-            self._print_command()
+            name, step = stopped.received.name, self.pipeline.coordinator.state.step
+            self._say(f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost.")
+            self._say_how_to_go_on()
             raise SystemExit(stopped.exit_code) from None
         except UserError as error:
             self._end_report()
             print_error(str(error))
-            CONSOLE.print("When that is mended, go on with", highlight=False)
-            self._print_command()
+            self._say_how_to_go_on()
             raise SystemExit(2) from None
 
     def _train_complete_viewer(self) -> None:
@@ -99,9 +94,13 @@ class AbcdTrainer(Trainer):
         for callback in self.callbacks:
             callback.run_callback_at_location(self.step, location=TrainingCallbackLocation.AFTER_TRAIN)
 
-    def _print_command(self) -> None:
+    def _say_how_to_go_on(self) -> None:
         command = command_to_go_on(sys.argv, self.config.method_name, self.checkpoint_dir)
-        CONSOLE.print(f"  {command}", highlight=False, markup=False, soft_wrap=True)
+        if command is not None:  # else whoever started this training knows better
+            self._say(f"To go on:\n  {command}")
+
+    def _say(self, text: str) -> None:
+        CONSOLE.print(text, highlight=False, markup=False, soft_wrap=True)
 
     # -- checkpoints ---------------------------------------------------------------------------------
 
@@ -115,11 +114,7 @@ class AbcdTrainer(Trainer):
         self.config.max_num_iterations = max(self.total_steps - start.step, 0)
         self.step = start.step - 1
         which = "where it was left" if start.pin is None else start.pin
-        CONSOLE.print(
-            f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        self._say(f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}")
 
     def save_checkpoint(self, step: int) -> None:
         """Save the merged scene for nerfstudio's tools, and everything else in the store.

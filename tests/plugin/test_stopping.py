@@ -18,22 +18,22 @@ def test_a_signal_acts_at_once_where_nothing_is_held(number):
 
 
 def test_a_signal_waits_for_the_end_of_a_step():
-    done = []
-    with pytest.raises(Stopped), StopSignals() as signals:
+    with StopSignals() as signals:
         signals.check()
         signals.hold()
         signal.raise_signal(signal.SIGTERM)
-        done.append("step")
-        signals.release()
-        done.append("never")
-    assert done == ["step"]
+        with pytest.raises(Stopped):
+            signals.check()
+        with pytest.raises(Stopped):
+            signals.release()
 
 
 def test_a_second_ctrl_c_does_not_wait():
-    with pytest.raises(KeyboardInterrupt), StopSignals() as signals:
+    with StopSignals() as signals:
         signals.hold()
         signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
 
 
 def test_handlers_are_put_back():
@@ -68,8 +68,8 @@ def test_in_another_thread_signals_stay_as_they_are():
             "ns-train abcd --load-dir 'my run' --data wall",
         ),
         ("ns-train abcd --load-dir=older --data wall", "ns-train abcd --load-dir 'my run' --data wall"),
-        ("python -m abcd_ns.tools.runs.worker job.json", "ns-train abcd --load-dir 'my run'"),
-        ("ns-train abcd-paper --data wall", "ns-train abcd --load-dir 'my run'"),
+        ("/venv/lib/abcd_ns/tools/runs/worker.py job.json", None),
+        ("ns-train abcd-paper --data wall", None),
     ],
 )
 def test_the_command_to_go_on_keeps_the_options(argv, expected):

@@ -4,6 +4,7 @@ Processes are forked from a server that has everything imported, so each starts 
 all the same, and are killed by SIGKILL. What a run must end with does not depend on whether it was killed.
 """
 
+import errno
 import hashlib
 import json
 import multiprocessing
@@ -46,21 +47,28 @@ class Kill:
     nth: int = 1
 
 
-def run(folder: Path, kill: Kill | None = None, file_bytes: int | None = None) -> None:
+def run(
+    folder: Path, kill: Kill | None = None, file_bytes: int | None = None, failing_file: int | None = None
+) -> None:
     """Train from where `folder` stands to the end; the body of a process.
 
     Args:
         file_bytes: no file may grow above this, as on a full disk.
+        failing_file: the n-th file that is written, counted from 1, has no room.
     """
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     if kill is not None:
         crash_points.reached = killer(kill)
+    if failing_file is not None:
+        crash_points.reached = _no_room_for(failing_file)
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
     if file_bytes is not None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, most))
     try:
         _train(folder)
-    except StoreError as error:
+    except (StoreError, OSError) as error:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
         (folder / "error.txt").write_text(str(error))
         os._exit(DISK_FULL)
 
@@ -74,6 +82,18 @@ def killer(kill: Kill) -> Callable[[str], None]:
         left -= point == kill.point
         if left == 0:
             os.kill(os.getpid(), signal.SIGKILL)
+
+    return reached
+
+
+def _no_room_for(nth: int) -> Callable[[str], None]:
+    left = nth
+
+    def reached(point: str) -> None:
+        nonlocal left
+        left -= point == crash_points.FILE_WRITTEN
+        if left == 0 and point == crash_points.FILE_WRITTEN:
+            raise OSError(errno.ENOSPC, "No space left on device")
 
     return reached
 
@@ -172,7 +192,11 @@ class Runs:
 
     def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
         """A process; see `body` for its arguments."""
-        process = self._context.Process(target=self.body, args=args, kwargs=options)
+        return self.process(self.body, *args, **options)
+
+    def process(self, target: Callable[..., None], *args: Any, **options: Any) -> multiprocessing.Process:
+        """A process that does something else."""
+        process = self._context.Process(target=target, args=args, kwargs=options)
         process.start()
         return process
 
