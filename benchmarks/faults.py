@@ -185,7 +185,7 @@ class Bench:
             for length in sorted({0, 1, size // 2, max(size - 1, 0)}):
                 yield Trial("a cache's file cut short", partial(self._spoil, cache, path.name, length, None))
         size = (cache / "data.mdb").stat().st_size
-        for _ in range(self.args.flips):
+        for _ in range(self.args.flips // 10):
             bit = self.random.randrange(8 * size)
             yield Trial("a bit flipped in a cache's file", partial(self._spoil, cache, "data.mdb", None, bit))
 
@@ -346,10 +346,11 @@ def main(args: Args) -> int:
     torch.set_num_threads(1)
     console = Console()
     with tempfile.TemporaryDirectory(prefix="abcd-faults-") as name:
-        benches: list[Bench | TrainingBench] = [Bench(args, Path(name))]
-        if args.trainings:
-            benches.append(TrainingBench(args, Path(name) / "trainings"))
-        rows = carry_out([trial for bench in benches for trial in bench.trials()], console)
+        with console.status("runs that nothing disturbs"):
+            trials = Bench(args, Path(name)).trials()
+            if args.trainings:
+                trials += TrainingBench(args, Path(name) / "trainings").trials()
+        rows = carry_out(trials, console)
     print(f"{platform.system()}, {os.cpu_count()} cores, torch {torch.__version__}, seed {args.seed}\n")
     print(table(rows))
     return int(any(row.survived < row.tried or row.lost for row in rows))

@@ -222,6 +222,7 @@ def test_the_saved_config_is_the_config(trained):
         (lambda c: setattr(c, "mixed_precision", True), "float32"),
         (lambda c: setattr(c.pipeline, "blocks", 0), "--pipeline.blocks"),
         (lambda c: setattr(c.pipeline, "near_plane", -1.0), "--pipeline.near-plane"),
+        (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
         (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),
         (lambda c: setattr(c.pipeline.training, "influence_share", 0.0), "training.influence-share"),
         (lambda c: setattr(c.pipeline.training, "window_weight", 1.0), "training.window-weight"),
