@@ -46,9 +46,9 @@ from abcd_ns.engine.schedule import (
 )
 from abcd_ns.engine.settle import had_reserve, has_reserve, settle
 from abcd_ns.engine.splitting import split_full
-from abcd_ns.engine.storage import LayerCache
+from abcd_ns.engine.storage import LayerCache, crash_points
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.engine.visit import VisitLayers
+from abcd_ns.engine.visit import AT_HAND_BYTES, VisitLayers
 
 
 class Coordinator:
@@ -59,6 +59,7 @@ class Coordinator:
         params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
             learning rates; that of the means is the one to decay from.
         scene_key: fingerprint of the capture, part of every layer's key.
+        at_hand_bytes: see VisitLayers.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Coordinator:
         *,
         scene_key: str = "",
         device: torch.device | str = "cpu",
+        at_hand_bytes: int = AT_HAND_BYTES,
     ) -> None:
         self.config, self.budget, self.scene, self.cache = config, budget, scene, cache
         self.params, self.optimizers = params, optimizers
@@ -83,7 +85,7 @@ class Coordinator:
         self.stopwatch = Stopwatch()
         self.density = self._density_control()
         self.state = RunState()
-        self._scene_key = scene_key
+        self._scene_key, self._at_hand_bytes = scene_key, at_hand_bytes
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
         self._planner = Planner(
@@ -277,7 +279,7 @@ class Coordinator:
             self.scene.store.pin(pin)
 
     def restore(self) -> None:
-        """Go on from what the store holds: exactly where `save` was called."""
+        """Go on from the store's newest generation: where `save` was called, or the last visit ended."""
         self.state = RunState.from_json(self.scene.store.state)
         self.stopwatch = Stopwatch(self.state.seconds)
         if self.state.active is not None:
@@ -361,6 +363,7 @@ class Coordinator:
             settings,
             window_weight=self.config.window_weight,
             scene_key=self._scene_key,
+            at_hand_bytes=self._at_hand_bytes,
         )
         wanted = dict.fromkeys(self._order[active.done * self.batch :])
         for done, _ in enumerate(layers.draw(wanted), start=1):
@@ -382,6 +385,7 @@ class Coordinator:
             self._layers.forget()
         self.state.active, self._layers = None, None
         self.state.seconds = self.stopwatch.seconds
+        crash_points.reached(crash_points.VISIT_TRAINED)
         self.scene.rest(tree, {b: s.to_tensors() for b, s in updates.items()}, self.state.to_json())
         self.density = self._density_control()
         block = None if active.is_whole else active.geometry.block

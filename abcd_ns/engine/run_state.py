@@ -108,7 +108,9 @@ class RunState:
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "RunState":
-        """The inverse of `to_json`."""
+        """The inverse of `to_json`; of nothing, as in a store that is new, a run that has not begun."""
+        if not data:
+            return RunState()
         active = data["active"]
         if active is not None:
             geometry = VisitGeometry.from_json(active["geometry"])

@@ -101,6 +101,7 @@ class VisitLayers:
         window_weight: see TrainingConfig.
         views: all views, by index.
         scene_key: fingerprint of all else that changes a pixel, for the cache's keys.
+        at_hand_bytes: see AT_HAND_BYTES.
     """
 
     def __init__(
@@ -114,6 +115,7 @@ class VisitLayers:
         *,
         window_weight: float,
         scene_key: str,
+        at_hand_bytes: int,
     ) -> None:
         self._painter, self._cache = painter, cache
         self._geometry, self._views, self._settings = geometry, views, settings
@@ -126,7 +128,7 @@ class VisitLayers:
         self._near: dict[int, Splats | None] = {}
         self._windows: dict[int, DepthWindow] = {}
         self._at_hand: dict[int, Surroundings] = {}
-        self._room = AT_HAND_BYTES
+        self._room = at_hand_bytes
         self._uses_cache = False
 
     def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Surroundings]]:
@@ -186,6 +188,11 @@ class VisitLayers:
         if found is None:  # never drawn, or the disposable cache has lost it
             ((_, found),) = self.draw([view])
         return found
+
+    @property
+    def nbytes(self) -> int:
+        """Of the layers at hand."""
+        return sum(around.nbytes for around in self._at_hand.values())
 
     def forget(self) -> None:
         """Give back the room in the cache: when the block has changed, nothing of it will be found again."""

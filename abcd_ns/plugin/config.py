@@ -11,12 +11,12 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
+from abcd_ns.plugin.input_errors import exit_on_user_error
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.pipeline import AbcdPipeline
 from abcd_ns.plugin.room import check_room, device_budget
@@ -36,7 +36,7 @@ class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     dataparser: AbcdDataParserConfig = field(default_factory=AbcdDataParserConfig)
     """Where photos, poses and points come from: a COLMAP folder or a transforms.json."""
     photo_cache_gb: float = 0.0
-    """RAM for decoded photos, GB; 0 takes a tenth of the machine's."""
+    """RAM for decoded photos, GB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
 
 
 @dataclass
@@ -137,6 +137,9 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     near_plane: float = 0.0
     """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
     the nearest distance at which a photo shows a point."""
+    ram_budget_gb: float = 0.0
+    """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it.
+    0 takes 8, or 40% of the machine's memory where that is less."""
     layer_bits: Literal[16, 32] = 16
     """Bits to which the colours and transmittances of layers are rounded."""
     max_seconds: float | None = None
@@ -170,7 +173,7 @@ class AbcdTrainerConfig(TrainerConfig):
         if self.machine.device_type == "cuda" and not torch.cuda.is_available():
             self.machine.device_type = "cpu"
             CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
-        try:
+        with exit_on_user_error():
             if self.machine.num_devices * self.machine.num_machines > 1:
                 raise UserError("ABCD trains on one device; leave out --machine.num-devices.")
             if self.pipeline.blocks < 0:
@@ -181,6 +184,10 @@ class AbcdTrainerConfig(TrainerConfig):
                 )
             if not self.pipeline.near_plane >= 0:
                 raise UserError(f"--pipeline.near-plane must be 0 or more, not {self.pipeline.near_plane}.")
+            if not self.pipeline.ram_budget_gb >= 0:
+                raise UserError(
+                    f"--pipeline.ram-budget-gb must be 0 or more, not {self.pipeline.ram_budget_gb}."
+                )
             check_training(self.pipeline.training)
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")
@@ -193,6 +200,3 @@ class AbcdTrainerConfig(TrainerConfig):
             if self.pipeline.blocks == 0:
                 budget = device_budget(self.pipeline.device_budget_gb, self.machine.device_type)
                 check_room(budget, parser.largest_image, self.pipeline.training)
-        except UserError as error:
-            CONSOLE.print(f"[bold red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
-            raise SystemExit(2) from None

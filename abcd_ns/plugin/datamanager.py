@@ -38,15 +38,13 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def create_train_dataset(self) -> AbcdDataset:
         """The training photos, under their share of RAM."""
-        return AbcdDataset(self.train_dataparser_outputs, budget_bytes=self._photo_budget())
+        budget = int(self.config.photo_cache_gb * 2**30) if self.config.photo_cache_gb else None
+        return AbcdDataset(self.train_dataparser_outputs, budget_bytes=budget)
 
     def create_eval_dataset(self) -> AbcdDataset:
-        """The held-out photos; looked at one after the other, so hardly any need to be kept."""
+        """The held-out photos; looked at one after the other, so none is kept."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
-        return AbcdDataset(outputs, budget_bytes=self._photo_budget())
-
-    def _photo_budget(self) -> int | None:
-        return int(self.config.photo_cache_gb * 2**30) or None
+        return AbcdDataset(outputs, budget_bytes=0)
 
     def follow(self, coordinator: Coordinator) -> None:
         """Serve what this coordinator asks for from now on."""

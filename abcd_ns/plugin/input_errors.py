@@ -3,6 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+
 from abcd_ns.errors import UserError
 
 
@@ -12,6 +15,21 @@ def one_line(text: str) -> str:
         c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
     )
     return printable.encode("utf-8", "backslashreplace").decode()
+
+
+def print_error(text: str) -> None:
+    """Say on the console what the user can mend."""
+    CONSOLE.print(f"[bold red]error:[/] {escape(text)}", soft_wrap=True, highlight=False)
+
+
+@contextmanager
+def exit_on_user_error() -> Iterator[None]:
+    """End the process with code 2 and the message alone, no traceback, where the body raises UserError."""
+    try:
+        yield
+    except UserError as error:
+        print_error(str(error))
+        raise SystemExit(2) from None
 
 
 class InputError(UserError):

@@ -1,5 +1,6 @@
 """Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
 
+import hashlib
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.scene import BlockScene, MemoryScene
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
+from abcd_ns.errors import UserError
 from abcd_ns.plugin.datamanager import BATCH
 from abcd_ns.plugin.metrics import image_metrics
 from abcd_ns.plugin.views import view_of
@@ -103,12 +105,27 @@ class AbcdModel(SplatfactoModel):
         """The merged scene under splatfacto's names, whatever is live."""
         state = super().state_dict(*args, **kwargs)
         if self._coordinator is not None:
-            prefix = kwargs.get("prefix", "")
-            state.update({f"{prefix}gauss_params.{n}": value for n, value in self.merged().items()})
+            prefix, merged = kwargs.get("prefix", ""), self.merged()
+            state.update({f"{prefix}gauss_params.{n}": value for n, value in merged.items()})
+            state[f"{prefix}_extra_state"]["checksum"] = checksum(merged)
         return state
 
+    def load_state_dict(self, state: dict[str, Any], **kwargs: Any) -> None:
+        """As splatfacto's; torch.load alone would accept altered bytes.
+
+        Raises:
+            UserError: the Gaussians are not those that were saved.
+        """
+        expected = state.get("_extra_state", {}).get("checksum")
+        super().load_state_dict(state, **kwargs)
+        if expected is not None and checksum(live_gaussians(self.gauss_params)) != expected:
+            raise UserError(
+                "This checkpoint is damaged: the checksum of its Gaussians is wrong. Go on with the run by "
+                "`ns-train --load-dir`, which saves another, or take an older one."
+            )
+
     def get_extra_state(self) -> dict[str, Any]:
-        """What the merged list of Gaussians does not tell: how space is cut, and the near plane."""
+        """What the Gaussians do not tell: how space is cut, and the near plane."""
         return {"tree": self.tree.to_json(), "near": self.near}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -239,6 +256,14 @@ class AbcdModel(SplatfactoModel):
 
     def _count(self) -> int:
         return len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
+
+
+def checksum(gaussians: Gaussians) -> str:
+    """blake2b of all parameters, hexadecimal."""
+    digest = hashlib.blake2b(digest_size=16)
+    for _, value in gaussians.items():
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _as_list(values: Tensor | list[Tensor]) -> list[Tensor]:

@@ -21,20 +21,22 @@ from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.storage import LayerCache, ParameterStore, view_fingerprint
+from abcd_ns.engine.storage import ParameterStore, view_fingerprint
 from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.visit import AT_HAND_BYTES
 from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
+from abcd_ns.plugin.ram_budget import budget_bytes, share_out
 from abcd_ns.plugin.room import EXPECTED_GROWTH, device_budget, find_room
+from abcd_ns.plugin.run_folder import CACHE as CACHE
+from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, open_cache, take_over
+from abcd_ns.plugin.run_folder import STORE as STORE
 from abcd_ns.plugin.views import views_of
 
 if TYPE_CHECKING:
     from abcd_ns.plugin.config import AbcdPipelineConfig
     from abcd_ns.plugin.trainer import AbcdTrainer
-
-STORE, CACHE = "store", "layers"
-"""Folders of a run, under `abcd`: the blocks at rest, which are precious, and layers, which are not."""
 
 
 class AbcdPipeline(VanillaPipeline):
@@ -46,6 +48,9 @@ class AbcdPipeline(VanillaPipeline):
 
     def __init__(self, config: "AbcdPipelineConfig", *args: Any, **kwargs: Any) -> None:
         config.model.mirror(config.training)
+        self._ram = share_out(budget_bytes(config.ram_budget_gb))
+        if not config.datamanager.photo_cache_gb:
+            config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / 2**30
         super().__init__(config, *args, **kwargs)
         self._coordinator: Coordinator | None = None
 
@@ -94,24 +99,25 @@ class AbcdPipeline(VanillaPipeline):
     # -- set-up --------------------------------------------------------------------------------------
 
     def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Coordinator:
-        config, folder = self.config, trainer.base_dir / "abcd"
+        config, folder = self.config, trainer.base_dir / STATE
         views = self._views()
         self.model.draws_with().warm_up()
-        store, resumed = self._open_store(folder / STORE, trainer)
+        store, resumed = self._open_store(folder / STORE, trainer, views)
         header = store.header
         tree = BlockTree.from_json(header["tree"])
         training = replace(config.training, block_limit=header.get("block_limit", 0))
         coordinator = coordinator_for(training)(
             training,
             Budget(trainer.total_steps, config.max_seconds),
-            StoredScene(tree, store),
+            StoredScene(tree, store, self._ram.blocks),
             views,
-            LayerCache(folder / CACHE, bits=config.layer_bits),
+            open_cache(folder / CACHE, self._ram.cache, config.layer_bits),
             self.model.draws_with(),
             self.model.gauss_params,
             {name: optimizers[name] for name in self.model.gauss_params},
             scene_key=scene_fingerprint(self.datamanager.get_datapath(), views),
             device=self.device,
+            at_hand_bytes=min(self._ram.at_hand, AT_HAND_BYTES),
         )
         if resumed:
             coordinator.restore()
@@ -139,14 +145,14 @@ class AbcdPipeline(VanillaPipeline):
         self.model.near = self.config.near_plane or near_plane(known, views)
         return [replace(view, near=self.model.near) for view in views]
 
-    def _open_store(self, folder: Path, trainer: "AbcdTrainer") -> tuple[ParameterStore, bool]:
+    def _open_store(
+        self, folder: Path, trainer: "AbcdTrainer", views: list[View]
+    ) -> tuple[ParameterStore, bool]:
         """The run's own store: a copy of the one it goes on from, or a new one."""
+        training, photos = self.config.training, self.datamanager.train_dataset.image_filenames
+        made_for = MadeFor.of(photos, views, training)
         if trainer.resumed_from is not None:
-            source, pin = trainer.resumed_from
-            with ParameterStore.open(source, pin, read_only=True) as old:
-                old.clone_to(folder, pin)
-            return ParameterStore.open(folder), True
-        training = self.config.training
+            return take_over(trainer.resumed_from, folder, made_for), True
         everything = self.model.initial_gaussians()
         gaussians = thin_out(everything, training.density.limit, training.seed)
         if len(gaussians) < len(everything):
@@ -158,7 +164,7 @@ class AbcdPipeline(VanillaPipeline):
         del everything
         blocks, limit = self._room(len(gaussians))
         tree = cut_space(gaussians, blocks, self.config.partition)
-        store = ParameterStore.create(folder, {"tree": tree.to_json(), "block_limit": limit})
+        store = new_store(folder, {"tree": tree.to_json(), "block_limit": limit, **made_for.header()})
         if training.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))
             return store, False

@@ -32,13 +32,13 @@ def names_in(folder: Path) -> set[str]:
 
 
 class FailAt:
-    """Calls `original`, but the n-th call (counted from 1), or each from then on, raises EIO."""
+    """Calls `original`, but the n-th call (counted from 1), or each from then on, raises OSError."""
 
-    def __init__(self, original, n: int, persistent: bool = False):
-        self.original, self.n, self.persistent, self.calls = original, n, persistent, 0
+    def __init__(self, original, n: int, persistent: bool = False, code: int = errno.EIO):
+        self.original, self.n, self.persistent, self.calls, self.code = original, n, persistent, 0, code
 
     def __call__(self, *args, **kwargs):
         self.calls += 1
         if self.calls == self.n or (self.persistent and self.calls > self.n):
-            raise OSError(errno.EIO, "injected")
+            raise OSError(self.code, "injected")
         return self.original(*args, **kwargs)

@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-import abcd_ns.engine.visit
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
 from abcd_ns.engine.config import resolve_ownership
@@ -176,13 +175,10 @@ def test_migrants_take_their_moments_along(tmp_path, views, photos, start):
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(
-    tmp_path, views, photos, start, blocks, monkeypatch
-):
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, blocks):
     """Bit for bit, in the middle of a visit too (invariant 7), with 16-bit layers and densification, and with
     layers at hand and in the cache."""
-    monkeypatch.setattr(abcd_ns.engine.visit, "AT_HAND_BYTES", 100_000)
-    options = {"steps": 30, "density": GROWING, "bits": 16}
+    options = {"steps": 30, "density": GROWING, "bits": 16, "at_hand_bytes": 100_000}
     (tmp_path / "whole").mkdir()
     whole = make_coordinator(tmp_path / "whole", start, views, blocks=blocks, **options)
     train(whole, photos)
@@ -337,13 +333,13 @@ def test_a_giant_is_trained_where_it_reaches_out_of_its_cell(tmp_path, views, st
     assert seen > 0
 
 
-def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start, monkeypatch):
+def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start):
     results = []
     for room, is_cached in ((2**30, False), (100_000, True)):
-        monkeypatch.setattr(abcd_ns.engine.visit, "AT_HAND_BYTES", room)
         folder = tmp_path / str(room)
         folder.mkdir()
-        coordinator = make_coordinator(folder, start, views, blocks=2, steps=10, bits=16)
+        options = {"steps": 10, "bits": 16, "at_hand_bytes": room}
+        coordinator = make_coordinator(folder, start, views, blocks=2, **options)
         train(coordinator, photos)
         results.append(whole_scene(coordinator))
         assert (coordinator.cache.hits > 0) == is_cached

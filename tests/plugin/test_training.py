@@ -39,27 +39,46 @@ def configure(data: Path, out: Path, method=methods.abcd, *, steps: int = STEPS,
     return config
 
 
-def run(config: AbcdTrainerConfig, stop_after: int | None = None) -> AbcdTrainer:
-    """Train as ns-train does; `stop_after` breaks off without saving, as a kill would."""
+class BrokenOff(BaseException):
+    """Ends a run without saving, as a kill would."""
+
+
+def run(
+    config: AbcdTrainerConfig, stop_after: int | None = None, after_step=None, listener=None
+) -> AbcdTrainer:
+    """Train as ns-train does; `stop_after` breaks off without saving, as a kill would.
+
+    Args:
+        after_step: called with the trainer after every step.
+        listener: of the coordinator's events.
+    """
     config.set_timestamp()
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    if stop_after is None:
-        trainer.train()
-    else:
-        after_step = trainer.pipeline._after_step
+    try:
+        trainer.setup()
+        pipeline = trainer.pipeline
+        end_step = pipeline._after_step
 
-        def break_off(who) -> None:
-            after_step(who)
+        def watched(who) -> None:
+            end_step(who)
+            if after_step is not None:
+                after_step(trainer)
             if trainer.step + 1 == stop_after:
-                raise KeyboardInterrupt
+                raise BrokenOff
 
-        trainer.pipeline._after_step = break_off
-        with pytest.raises(KeyboardInterrupt):
+        pipeline._after_step = watched
+        if listener is not None:
+            pipeline.coordinator.announce.subscribe(listener)
+        if stop_after is None:
             trainer.train()
-    trainer.pipeline.coordinator.scene.store.close()
-    trainer.pipeline.coordinator.cache.close()
+        else:
+            with pytest.raises(BrokenOff):
+                trainer.train()
+    finally:
+        if (coordinator := getattr(trainer.pipeline, "coordinator", None)) is not None:
+            coordinator.scene.store.close()
+            coordinator.cache.close()
     return trainer
 
 
@@ -203,6 +222,7 @@ def test_the_saved_config_is_the_config(trained):
         (lambda c: setattr(c, "mixed_precision", True), "float32"),
         (lambda c: setattr(c.pipeline, "blocks", -1), "--pipeline.blocks"),
         (lambda c: setattr(c.pipeline, "near_plane", -1.0), "--pipeline.near-plane"),
+        (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
         (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),
         (lambda c: setattr(c.pipeline.training, "influence_share", 0.0), "training.influence-share"),
         (lambda c: setattr(c.pipeline.training, "window_weight", 1.0), "training.window-weight"),

@@ -17,6 +17,7 @@ from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.visit import AT_HAND_BYTES
 
 RATES = {
     "means": 1.6e-4,
@@ -100,9 +101,15 @@ def make_coordinator(
     scaffold: int | None = None,
     kind: type[Coordinator] = Coordinator,
     content: Callable = blocks_at_rest,
+    cache: LayerCache | None = None,
+    ram_bytes: int = 2 << 30,
+    at_hand_bytes: int = AT_HAND_BYTES,
     **training,
 ) -> Coordinator:
-    """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is."""
+    """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is.
+
+    Layers go into `cache`, or else into one of `bits` in memory.
+    """
     if resume:
         store = ParameterStore.open(folder / "store")
         tree = BlockTree.from_json(store.header["tree"])
@@ -116,12 +123,13 @@ def make_coordinator(
     coordinator = kind(
         config,
         Budget(steps=steps),
-        StoredScene(tree, store),
+        StoredScene(tree, store, ram_bytes),
         views,
-        LayerCache(None, bits=bits),
+        cache or LayerCache(None, bits=bits),
         TorchRasterizer(compile="never"),
         params,
         make_adam(params, RATES),
+        at_hand_bytes=at_hand_bytes,
     )
     if resume:
         coordinator.restore()

@@ -45,7 +45,7 @@ def build_kernels(kernels: Sequence[Kernel], side: int, chunk: int) -> None:
     command = [sys.executable, "-m", BUILDER, str(side), str(chunk)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     if run.returncode != 0:
-        reason = (run.stderr.strip().splitlines() or ["no output"])[-1]
+        reason = (run.stderr.strip().splitlines() or [f"exit code {run.returncode}"])[-1]
         warnings.warn(f"building kernels failed, the torch rasterizer stays slow: {reason}", stacklevel=2)
     forget_loaded()
 

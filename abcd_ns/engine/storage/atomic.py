@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from abcd_ns.engine.storage import crash_points
+from abcd_ns.errors import UserError
+
 LOCK_NAME = "lock"
 TEMPORARY_SUFFIX = ".tmp"
 
@@ -31,9 +34,12 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
     try:
         yield temporary
+        crash_points.reached(crash_points.FILE_WRITTEN)
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
+        crash_points.reached(crash_points.FILE_SYNCED)
         os.replace(temporary, path)
+        crash_points.reached(crash_points.FILE_IN_PLACE)
     except BaseException:  # an interrupt must not leave the temporary file behind either
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -59,7 +65,7 @@ def remove_temporaries(folder: Path) -> None:
                 leftover.unlink()
 
 
-class FolderLockedError(RuntimeError):
+class FolderLockedError(UserError):
     """Another writer has the folder open."""
 
 

@@ -1,7 +1,6 @@
 """Bytes by key under a limit, in memory or in LMDB; never raises for what a disk does. Not thread-safe."""
 
 import mmap
-import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import TypeVar
 
 import lmdb
 
+from abcd_ns.engine.storage import crash_points
 from abcd_ns.engine.storage.atomic import FolderLock
 
 T = TypeVar("T")
@@ -65,29 +65,24 @@ class MemoryEntries:
 
 
 class LmdbEntries:
-    """An LMDB environment that is deleted and made anew whenever it is full, damaged or refused by the disk.
+    """An LMDB environment that begins empty, and is made anew whenever it is full or the disk refuses it.
 
-    LMDB trusts its files: a damaged page can crash the process that maps it. So a file is discarded, before
-    any page is read, if it is shorter than its header says, or if it was open when the machine went down,
-    for pages are written without syncing. A killed process does no such harm: the kernel has its pages.
+    LMDB trusts its files: one flipped bit of a page can crash the process that maps it. And pages are written
+    without syncing. So what an earlier process left is thrown away unread.
     """
 
     def __init__(self, folder: Path, limit: int):
         self.evictions = self.rejected = self.recreated = 0
         self._folder = folder
         self._limit = max(limit // mmap.PAGESIZE, _LEAST_PAGES) * mmap.PAGESIZE
-        self._unsynced = folder / "unsynced"  # there while open; says in which boot that was
         self._environment: lmdb.Environment | None = None
         folder.mkdir(parents=True, exist_ok=True)
         self._lock = FolderLock(folder)
         self._closed = False
         try:
-            boot = _boot_id()
-            if self._unsynced.exists() and self._unsynced.read_bytes() != boot:
-                self.recreated += 1
-                self._delete_files()
-            self._unsynced.write_bytes(boot)
+            self._delete_files()
             self._environment = self._open()
+            crash_points.reached(crash_points.CACHE_OPENED)
         except BaseException:
             self._lock.release()
             raise
@@ -136,9 +131,6 @@ class LmdbEntries:
             return
         self._closed = True
         if self._environment is not None:
-            with suppress(lmdb.Error, OSError):
-                self._environment.sync(True)
-                self._unsynced.unlink()
             self._environment.close()
         self._environment = None
         self._lock.release()
@@ -161,6 +153,7 @@ class LmdbEntries:
             with environment.begin(write=True) as transaction:
                 for key, value in items:
                     transaction.put(key, value)
+                crash_points.reached(crash_points.LAYERS_PUT)
             return True
 
         return self._attempt(write) is True
@@ -198,45 +191,22 @@ class LmdbEntries:
             (self._folder / name).unlink(missing_ok=True)
 
     def _open(self) -> lmdb.Environment:
-        """The environment; an empty one in place of files that are damaged or too large.
+        """An empty environment.
 
         Raises:
-            OSError: not even an empty one can be made.
+            OSError: none can be made.
         """
-        for _ in range(2):
-            try:
-                environment = lmdb.open(
-                    str(self._folder),
-                    map_size=self._limit,
-                    sync=False,
-                    metasync=False,
-                    lock=False,  # the folder's lock and the cache's mutex leave nothing for LMDB's to do
-                )
-            except lmdb.Error as error:
-                problem = str(error)
-            else:
-                if self._is_sound(environment):
-                    return environment
-                environment.close()
-                problem = "its size is wrong"
-            self.recreated += 1
-            self._delete_files()
-        raise OSError(f"No layer cache can be made in {self._folder}: {problem}.")
-
-    def _is_sound(self, environment: lmdb.Environment) -> bool:
-        """Whether the file holds all pages that its header counts, within the limit."""
-        size = (self._folder / "data.mdb").stat().st_size
-        pages = environment.info()["last_pgno"] + 1
-        return pages * environment.stat()["psize"] <= size <= self._limit
+        try:
+            return lmdb.open(
+                str(self._folder),
+                map_size=self._limit,
+                sync=False,
+                metasync=False,
+                lock=False,  # the folder's lock and the cache's mutex leave nothing for LMDB's to do
+            )
+        except lmdb.Error as error:
+            raise OSError(f"No layer cache can be made in {self._folder}: {error}.") from error
 
 
 Entries = MemoryEntries | LmdbEntries
 """What a layer cache needs of its memory or disk: the methods that the two share."""
-
-
-def _boot_id() -> bytes:
-    """Names the time since the machine started; where the system does not tell, nothing equals it."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_bytes()
-    except OSError:
-        return secrets.token_bytes(16)

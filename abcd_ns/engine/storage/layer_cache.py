@@ -75,7 +75,7 @@ class LayerCache:
     """
 
     def __init__(self, folder: Path | str | None, map_size: int = 2**32, bits: Literal[16, 32] = 16):
-        """Open the cache in `folder`, or an empty one in memory if None.
+        """An empty cache in `folder`, in place of what is there, or in memory if None.
 
         Args:
             map_size: the limit in bytes.
@@ -138,7 +138,7 @@ class LayerCache:
             self._open_entries().clear()
 
     def close(self) -> None:
-        """Let go of the folder; entries on disk stay for the next run. Harmless when done twice."""
+        """Let go of the folder. Harmless when done twice."""
         with self._mutex:
             if os.getpid() == self._process:
                 self._entries.close()
@@ -171,7 +171,7 @@ class LayerCache:
 
     @property
     def recreated(self) -> int:
-        """How often the files were damaged and made anew, at opening or later."""
+        """How often the files failed and were made anew."""
         return self._entries.recreated
 
     def _address(self, key: LayerKey) -> tuple[bytes, bytes]:

@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from abcd_ns.errors import UserError
+
 FORMAT = "abcd-parameter-store"
 FORMAT_VERSION = 1
 
 
-class StoreError(RuntimeError):
+class StoreError(UserError):
     """The store cannot do what was asked; the message names the file and what to do."""
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from safetensors import SafetensorError
 from torch import Tensor
 
+from abcd_ns.engine.storage import crash_points
 from abcd_ns.engine.storage.atomic import FolderLock, fsync_folder, remove_temporaries, write_file
 from abcd_ns.engine.storage.manifest import (
     Manifest,
@@ -200,6 +201,7 @@ class ParameterStore:
                 for block, (tensors, _) in updates.items()
             }
             fsync_folder(self.folder)
+            crash_points.reached(crash_points.SHARDS_IN_PLACE)
             new = replace(new, blocks=old.blocks | shards)
             self._publish(new)
         except BaseException as error:
@@ -282,6 +284,7 @@ class ParameterStore:
             for file in manifest.files:
                 link_or_copy(self.folder / file, folder / file)
             fsync_folder(folder)
+            crash_points.reached(crash_points.SHARDS_LINKED)
             write_file(manifest_path(folder), manifest.to_bytes())
         except BaseException as error:
             with suppress(OSError):
@@ -335,6 +338,7 @@ class ParameterStore:
         """Make `manifest` the present one, on disk and here. Its shards must be on disk."""
         write_file(manifest_path(self.folder), manifest.to_bytes())
         self._manifest = manifest
+        crash_points.reached(crash_points.GENERATION_PUBLISHED)
 
     def _roll_back(self, old: Manifest) -> str:
         """Undo a commit that failed anywhere, even after its manifest came into place; say what is left.
@@ -367,6 +371,7 @@ class ParameterStore:
             if path.name not in kept:
                 with suppress(OSError):  # the commit stands; the next collection tries again
                     path.unlink()
+                    crash_points.reached(crash_points.SHARD_DELETED)
         self._verified &= kept
 
 

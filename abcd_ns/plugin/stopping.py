@@ -1,0 +1,99 @@
+"""Ctrl-C and SIGTERM: a run ends between two steps, when it is whole, and says how to go on with it."""
+
+import shlex
+import signal
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+FORGOTTEN = ("--load-dir", "--load-step", "--load-checkpoint")
+"""Options that say where a run began: what goes on from it has its own."""
+
+
+class Stopped(BaseException):
+    """The user, or the machine's scheduler, asked the run to end."""
+
+    def __init__(self, received: signal.Signals) -> None:
+        super().__init__(received)
+        self.received = received
+
+    @property
+    def exit_code(self) -> int:
+        """What a shell expects of a process that was ended by a signal."""
+        return 128 + self.received
+
+
+class StopSignals:
+    """While entered, turns the first signal into Stopped: at once, or at the end of what must not be cut.
+
+    A second signal acts as it always did, so that whoever does not want to wait need not. In other threads
+    than the main one nothing happens: Python gives signals to that alone.
+    """
+
+    def __init__(self) -> None:
+        self._received: signal.Signals | None = None
+        self._held = False
+        self._before: dict[signal.Signals, object] = {}
+
+    def __enter__(self) -> "StopSignals":
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._receive) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._restore()
+
+    def hold(self) -> None:
+        """From now on a signal waits for `check` or `release`."""
+        self._held = True
+
+    def release(self) -> None:
+        """Signals act at once again.
+
+        Raises:
+            Stopped: one came meanwhile.
+        """
+        self._held = False
+        self.check()
+
+    def check(self) -> None:
+        """Let a signal that waits have its way.
+
+        Raises:
+            Stopped: one came.
+        """
+        if self._received is not None:
+            raise Stopped(self._received)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        self._restore()
+        self._received = signal.Signals(number)
+        if not self._held:
+            raise Stopped(self._received)
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+
+def command_to_go_on(argv: Sequence[str], method: str, folder: Path) -> str | None:
+    """What to type to go on with the run in `folder`: the same command with --load-dir.
+
+    Args:
+        argv: the command line of this process; None is returned if it is not `ns-train`'s.
+    """
+    program, *words = argv
+    if Path(program).name != "ns-train" or words[:1] != [method]:
+        return None
+    kept, skip = [], False
+    for word in words[1:]:
+        name = word.partition("=")[0].replace("_", "-")
+        if skip or name in FORGOTTEN:
+            skip = not skip and "=" not in word
+        else:
+            kept.append(word)
+    return shlex.join(["ns-train", method, "--load-dir", str(folder), *kept])

@@ -1,0 +1,240 @@
+"""Runs of the engine, in processes that are killed, on a scene small enough to train in a second or two.
+
+Processes are forked from a server that has everything imported, so each starts at once; they are processes
+all the same, and are killed by SIGKILL. What a run must end with does not depend on whether it was killed.
+"""
+
+import errno
+import hashlib
+import json
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import Event, VisitEnded
+from abcd_ns.engine.storage import LayerCache, ParameterStore, StoreError, crash_points
+from abcd_ns.engine.training_loop import train_step
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
+
+STEPS = 48
+SAVE_EVERY = 7
+"""Steps between saves in the middle of visits, as nerfstudio's checkpoints are."""
+AT_HAND_BYTES = 40_000
+"""Room for some views' layers, so that the cache has others."""
+DISK_FULL = 3
+"""Exit code of a run that the disk refused."""
+WALL_TIMES = ("seconds", "layer_seconds", "began", "since", "until")
+"""Parts of a run's state that clocks decide."""
+_PROGRESS = "progress.txt"
+
+
+@dataclass(frozen=True)
+class Kill:
+    """Where a run kills itself: the n-th time, counted from 1, that it reaches a point."""
+
+    point: str
+    nth: int = 1
+
+
+def run(
+    folder: Path, kill: Kill | None = None, file_bytes: int | None = None, failing_file: int | None = None
+) -> None:
+    """Train from where `folder` stands to the end; the body of a process.
+
+    Args:
+        file_bytes: no file may grow above this, as on a full disk.
+        failing_file: the n-th file that is written, counted from 1, has no room.
+    """
+    torch.set_num_threads(1)
+    folder.mkdir(parents=True, exist_ok=True)
+    if kill is not None:
+        crash_points.reached = killer(kill)
+    if failing_file is not None:
+        crash_points.reached = _no_room_for(failing_file)
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if file_bytes is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, most))
+    try:
+        _train(folder)
+    except (StoreError, OSError) as error:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+        (folder / "error.txt").write_text(str(error))
+        os._exit(DISK_FULL)
+
+
+def killer(kill: Kill) -> Callable[[str], None]:
+    """For `crash_points.reached`: ends this process as `kill -9` does."""
+    left = kill.nth
+
+    def reached(point: str) -> None:
+        nonlocal left
+        left -= point == kill.point
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    return reached
+
+
+def _no_room_for(nth: int) -> Callable[[str], None]:
+    left = nth
+
+    def reached(point: str) -> None:
+        nonlocal left
+        left -= point == crash_points.FILE_WRITTEN
+        if left == 0 and point == crash_points.FILE_WRITTEN:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    return reached
+
+
+def points_reached(folder: Path) -> dict[str, int]:
+    """How often an undisturbed run in `folder` reaches each point. Runs in this process."""
+    counts: dict[str, int] = {}
+
+    def count(point: str) -> None:
+        counts[point] = counts.get(point, 0) + 1
+
+    before, crash_points.reached = crash_points.reached, count
+    try:
+        _train(folder)
+    finally:
+        crash_points.reached = before
+    return counts
+
+
+def _train(folder: Path) -> None:
+    views = ring_of_views(4, width=32, height=24)
+    photos = Photos(random_gaussians(100, seed=7, size=0.12), views)
+    with LayerCache(folder / "layers", 1 << 22) as cache:
+        coordinator = _open(folder, views, cache)
+        coordinator.announce.subscribe(lambda event: _note(folder, coordinator, event))
+        while not coordinator.finished:
+            train_step(coordinator, photos)
+            if coordinator.state.step % SAVE_EVERY == 0:
+                coordinator.save(pin="saved")
+                _write(folder, coordinator.state.step)
+        coordinator.save()
+        coordinator.scene.store.close()
+
+
+def _open(folder: Path, views: list, cache: LayerCache) -> Coordinator:
+    """Go on from a clone of what is there, as the trainer does with --load-dir, or begin."""
+    start = random_gaussians(90, seed=1, size=0.12)
+    resume = begun(folder)
+    if resume:
+        shutil.rmtree(folder / "clone", ignore_errors=True)
+        with ParameterStore.open(folder / "store") as store:
+            store.clone_to(folder / "clone")
+        clone = ParameterStore.open(folder / "clone")
+        clone.close()
+        shutil.rmtree(folder / "clone")
+    else:
+        shutil.rmtree(folder / "store", ignore_errors=True)
+    density = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
+    return make_coordinator(
+        folder,
+        start,
+        views,
+        blocks=3,
+        steps=STEPS,
+        resume=resume,
+        bits=16,
+        scaffold=30,
+        cache=cache,
+        at_hand_bytes=AT_HAND_BYTES,
+        density=density,
+    )
+
+
+def begun(folder: Path) -> bool:
+    """Whether there is anything to go on from."""
+    if not (folder / "store" / "manifest.json").exists():
+        return False
+    return bool(ParameterStore.open(folder / "store", read_only=True).blocks)
+
+
+def _note(folder: Path, coordinator: Coordinator, event: Event) -> None:
+    if isinstance(event, VisitEnded):
+        _write(folder, coordinator.state.step)
+
+
+def _write(folder: Path, step: int) -> None:
+    (folder / _PROGRESS).write_text(str(step))
+
+
+# -- from outside --------------------------------------------------------------------------------------
+
+
+class Runs:
+    """Starts runs in processes of their own and looks at what they leave."""
+
+    body: Callable[..., None] = staticmethod(run)
+    """What a process does."""
+    modules: tuple[str, ...] = ("tests.reference.crash_runs",)
+    """What the server imports."""
+
+    def __init__(self) -> None:
+        # Before the server starts: libraries read it when they are imported.
+        os.environ["OMP_NUM_THREADS"] = "1"
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload([*self.modules])
+
+    def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
+        """A process; see `body` for its arguments."""
+        return self.process(self.body, *args, **options)
+
+    def process(self, target: Callable[..., None], *args: Any, **options: Any) -> multiprocessing.Process:
+        """A process that does something else."""
+        process = self._context.Process(target=target, args=args, kwargs=options)
+        process.start()
+        return process
+
+    def finish(self, *args: Any, **options: Any) -> int:
+        """Run to the end, or until the process is killed; its exit code."""
+        process = self.start(*args, **options)
+        process.join()
+        return process.exitcode
+
+    def killed_after(self, seconds: float, *args: Any, **options: Any) -> bool:
+        """Kill a run so long after its start; False if it was done by then."""
+        process = self.start(*args, **options)
+        time.sleep(seconds)
+        process.kill()
+        process.join()
+        return process.exitcode == -signal.SIGKILL
+
+
+def lost_steps(folder: Path) -> int:
+    """Steps that were safe, by what the run said, and are not in the store; 0 unless something is wrong."""
+    progress = folder / _PROGRESS
+    said = int(progress.read_text() or 0) if progress.exists() else 0
+    if not begun(folder):
+        return said
+    kept = ParameterStore.open(folder / "store", read_only=True).state.get("step", 0)
+    return max(said - kept, 0)
+
+
+def digest(folder: Path) -> str:
+    """Of all blocks' tensors and clocks, and the run's state but for wall times; every byte is checked."""
+    found = hashlib.blake2b(digest_size=16)
+    with ParameterStore.open(folder / "store", read_only=True) as store:
+        for block in store.blocks:
+            tensors, meta = store.load(block)
+            found.update(json.dumps([block, meta], sort_keys=True).encode())
+            for name in sorted(tensors):
+                found.update(f"{name} {tuple(tensors[name].shape)}".encode())
+                found.update(tensors[name].numpy().tobytes())
+        state = {name: value for name, value in store.state.items() if name not in WALL_TIMES}
+        found.update(json.dumps(state, sort_keys=True).encode())
+    return found.hexdigest()
