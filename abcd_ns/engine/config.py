@@ -53,6 +53,9 @@ class TrainingConfig:
     migrate: bool = True
     """Gaussians that left their cell by the end of a visit move to the block that holds them. Off, as in the
     paper, they are deleted."""
+    heal: bool = True
+    """Where blocks are trained within layers: undo a visit that left its pictures worse than it found them,
+    shrink giants, drop what no picture can show. Values that are no numbers are mended in any case."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
     sh_degree: int = 3
