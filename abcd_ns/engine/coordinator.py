@@ -156,6 +156,7 @@ class Coordinator:
         self.density.before_backward(infos)
         pictures = []
         for sample, raster in zip(batch.samples, rasters, strict=True):
+            self.health.see(sample.layers and sample.layers.front, raster.transmittance)
             if sample.layers is None:
                 rgb = raster.color + raster.transmittance[..., None] * sample.background
             else:

@@ -21,6 +21,7 @@ from abcd_ns.engine.health_record import BlockHealth, Ledger
 from abcd_ns.engine.health_rules import (
     GIANT_ANGLE,
     GIANT_SHARE,
+    HIDDEN,
     SHOWS,
     extent,
     is_worse,
@@ -32,7 +33,7 @@ from abcd_ns.engine.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.settle import at_rest
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import Gaussians, Layer
 
 LEAST_DAMPING = 1 / 16
 """Of learning rates, however often a block's visits were undone."""
@@ -64,8 +65,8 @@ class Health:
         self._ledger: Ledger = {}
         self._attached: Tensor | None = None
         self._bad: Tensor | None = None
-        self._has_gradient = False
         self._losses: tuple[tuple[int, ...], list[Tensor]] = ((), [])
+        self._shares: list[Tensor] = []
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
 
@@ -81,7 +82,20 @@ class Health:
             ledger: the run's, to be written to.
         """
         self._active, self._ledger = active, ledger
-        self._attached, self._bad = self._params["means"], None
+        self._attached, self._bad, self._shares = self._params["means"], None, []
+
+    @torch.no_grad()
+    def see(self, before: Layer | None, own: Float[Tensor, "h w"]) -> None:
+        """Take note of how much of a picture the live block can be.
+
+        Args:
+            before: the frozen layer in front of the block, if there are layers.
+            own: transmittance of the block, and of what was sorted in with it.
+        """
+        if self._active is None or self._active.shown:
+            return
+        alpha = 1 - own
+        self._shares.append((alpha if before is None else before.transmittance * alpha).mean())
 
     def note(self, views: tuple[int, ...], losses: list[Float[Tensor, ""]]) -> None:
         """Remember the loss of each view in this step."""
@@ -90,9 +104,7 @@ class Health:
     def end_step(self) -> bool:
         """Call after the optimizers stepped; whether the step's gradients were all numbers."""
         self._read_losses()
-        if self._active is not None and self._has_gradient:
-            self._active.shown = True
-        self._has_gradient = False
+        self._read_shares()
         if self._bad is None:
             return True
         self._count("gradients", int(self._bad.sum()))
@@ -177,7 +189,6 @@ class Health:
                 continue
             # One pass over memory; an overflow of the squares counts, as it would in Adam's second moment.
             size = float(torch.linalg.vector_norm(parameter.grad))
-            self._has_gradient |= size != 0.0
             if not math.isfinite(size):
                 self._zero_bad_rows(parameter.grad)
 
@@ -237,6 +248,11 @@ class Health:
                 first = self._active.objective.get(view, [loss])[0]
                 seen = view in self._active.objective
                 self._active.objective[view] = [first, loss] if seen else [first]
+
+    def _read_shares(self) -> None:
+        shares, self._shares = self._shares, []
+        if self._active is not None and not self._active.shown and shares:
+            self._active.shown = float(torch.stack(shares).max()) > HIDDEN
 
     @property
     def _record(self) -> BlockHealth:

@@ -31,7 +31,7 @@ class BlockHealth:
     damping: float = 1.0
     """Learning rates of the next visit, as a share of what they would be."""
     hidden: bool = False
-    """In the last visit no picture depended on the block."""
+    """In the last visit no picture showed the block."""
 
 
 Ledger = dict[int, BlockHealth]

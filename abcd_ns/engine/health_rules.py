@@ -19,6 +19,8 @@ GIANT_SHARE = 0.5
 GIANT_ANGLE = 0.3
 """... and over this share of its distance to the nearest camera: 3 sigma cover 45 degrees to either side.
 What is far away, sky for instance, may be large."""
+HIDDEN = 1e-4
+"""A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
 RISE = 0.02
 """A visit is undone if the loss of its views rose by more than this share ..."""
 SURE = 3.0

@@ -52,7 +52,7 @@ class Planner:
 
     def next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
         """A visit to the next block that some view sees; blocks that none sees any more are passed over, and
-        most of the time those that no picture depended on when they were last visited.
+        most of the time those that no picture showed when they were last visited.
 
         Raises:
             RuntimeError: no view sees any block.

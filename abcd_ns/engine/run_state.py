@@ -59,7 +59,7 @@ class ActiveVisit:
     until: float = 1.0
     """Share of the run at which the visit ends, whatever its steps."""
     shown: bool = False
-    """Whether any picture has depended on the block so far."""
+    """Whether any picture has shown the block so far."""
     objective: dict[int, list[float]] = field(default_factory=dict)
     """By view, its loss when the visit first used it and, from its second use on, when it last did."""
 

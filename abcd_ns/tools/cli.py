@@ -46,6 +46,11 @@ COMMANDS = (
         "abcd_ns.tools.study.command:study",
         "vary one thing: blocks, Gaussians, or any options",
     ),
+    Command(
+        "stability",
+        "abcd_ns.tools.stability.command:stability",
+        "make methods fail on small scenes and see what ABCD does",
+    ),
 )
 
 EXAMPLES = (
