@@ -22,6 +22,8 @@ class Clocks:
     """Adam's own step count, which corrects its bias."""
     visits: int = 0
     """Visits that have ended."""
+    resets: int = 0
+    """Times that its opacities were due to be reset, and were."""
 
 
 @dataclass(frozen=True)

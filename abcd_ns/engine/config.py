@@ -53,6 +53,9 @@ class TrainingConfig:
     migrate: bool = True
     """Gaussians that left their cell by the end of a visit move to the block that holds them. Off, as in the
     paper, they are deleted."""
+    heal: bool = True
+    """Where blocks are trained within layers: undo a visit that left its pictures worse than it found them,
+    shrink giants, drop what no picture can show. Values that are no numbers are mended in any case."""
     block_limit: int = 0
     """Gaussians that a block may hold while it is trained; one that comes near it is cut in two when its
     visit ends. 0 is none; `ns-train abcd` sets it by the device's memory."""

@@ -18,7 +18,7 @@ from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
-from abcd_ns.engine.density import DensityClock, DensityControl, for_blocks
+from abcd_ns.engine.density import DensityClock, DensityControl, Infos, for_blocks
 from abcd_ns.engine.events import (
     Announcer,
     BlockSplit,
@@ -28,14 +28,16 @@ from abcd_ns.engine.events import (
     VisitBegan,
     VisitEnded,
 )
+from abcd_ns.engine.health import Health
 from abcd_ns.engine.influence import DIGITS, Influence, influence, weights
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
 from abcd_ns.engine.planner import Planner
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
+from abcd_ns.engine.room import check_room
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.scaffold import LIVE, join, part
+from abcd_ns.engine.scaffold import LIVE, part
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
     endless_order,
@@ -44,7 +46,7 @@ from abcd_ns.engine.schedule import (
     view_order,
     views_per_step,
 )
-from abcd_ns.engine.settle import had_reserve, has_reserve, settle
+from abcd_ns.engine.settle import at_rest, had_reserve, has_reserve, owners_at_rest, settle
 from abcd_ns.engine.splitting import split_full
 from abcd_ns.engine.storage import LayerCache, crash_points
 from abcd_ns.engine.types import Gaussians, View
@@ -97,6 +99,14 @@ class Coordinator:
             device=self.device,
         )
         self._pace = Pace(optimizers)
+        self.health = Health(
+            scene,
+            params,
+            optimizers,
+            self.announce,
+            may_act=config.heal and config.layers,
+            may_drop=config.density.strategy == "default",
+        )
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
         self._layers: VisitLayers | None = None
@@ -134,7 +144,8 @@ class Coordinator:
             self._begin_visit()
         active = self._active
         decay = exponential_decay(self.progress, 1.0, self.config.means_lr_decay)
-        self._pace.set(1 if active.is_whole else self.batch, means_decay=decay)
+        views = 1 if active.is_whole else self.batch
+        self._pace.set(views, means_decay=decay, damping=self.health.damping)
         samples = enumerate(self._next_views(active))
         return Batch(self.state.step, tuple(self._sample(view, place) for place, view in samples))
 
@@ -171,6 +182,7 @@ class Coordinator:
         self.density.before_backward(infos)
         pictures = []
         for sample, raster in zip(batch.samples, rasters, strict=True):
+            self.health.see(sample.layers and sample.layers.front, raster.transmittance)
             if sample.layers is None:
                 rgb = raster.color + raster.transmittance[..., None] * sample.background
             else:
@@ -186,18 +198,19 @@ class Coordinator:
     ) -> Float[Tensor, ""]:
         """The loss of a step: photometric over the crops, the mean of the samples', plus what the density
         strategy asks for."""
-        total = torch.zeros((), device=self.device)
-        for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
-            view = sample.view
-            total = total + photometric_loss(
+        losses = [
+            photometric_loss(
                 picture,
                 photo,
-                full_pixels=view.width * view.height,
-                full_windows=ssim_windows(view.height, view.width),
+                full_pixels=sample.view.full.pixels,
+                full_windows=ssim_windows(sample.view.height, sample.view.width),
                 ssim_lambda=self.config.ssim_lambda,
                 pixel_loss=self.config.pixel_loss,
             )
-        photometric = total / len(batch.samples)
+            for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True)
+        ]
+        self.health.note(tuple(sample.view.index for sample in batch.samples), losses)
+        photometric = sum(losses, start=torch.zeros((), device=self.device)) / len(batch.samples)
         if self.config.density.strategy != "mcmc":
             return photometric
         return photometric + self.density.regularisation(self.params, self.count())
@@ -207,9 +220,10 @@ class Coordinator:
         active, taken = self._active, len(rendered.pictures)
         self.state.step += 1
         active.done += 1
+        sound = self.health.end_step()
         if not active.is_whole:
             self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)
-            self._refine(rendered, taken)
+            self._refine(rendered.infos if sound else (), taken)
         self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
         if (
             active.done >= active.steps
@@ -218,11 +232,15 @@ class Coordinator:
         ):
             self._end_visit()
 
-    def _refine(self, rendered: Rendered, taken: int) -> None:
+    def _refine(self, infos: Infos, taken: int) -> None:
         clock = self._density_clock(taken)
-        self._growth = self.density.after_step(
-            self.params, self.optimizers, self._growth, rendered.infos, clock
-        )
+        self._growth = self.density.after_step(self.params, self.optimizers, self._growth, infos, clock)
+        if not self.health.acts:
+            return
+        if self.density.resets(clock):
+            self._clocks = replace(self._clocks, resets=clock.steps // self.config.density.reset_every)
+        if self.density.is_due(clock):
+            self.health.hold_back_giants(view.center for view in self.views.values())
 
     @property
     def _progress_of_blocks(self) -> float:
@@ -239,13 +257,19 @@ class Coordinator:
         return min(rooms, default=None)
 
     def _density_clock(self, taken: int) -> DensityClock:
+        active = self._active
+        views = self.state.views.get(active.geometry.block, len(active.geometry.views))
+        if self.scene.tree.num_blocks > 1:
+            views = min(views, active.steps * self.batch)  # once a visit, even with thousands of photos
         return DensityClock(
             progress=self._progress_of_blocks,
             steps=self._clocks.steps,
             taken=taken,
-            views=self.state.views.get(self._active.geometry.block, len(self._active.geometry.views)),
+            views=views,
             room=self._room,
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
+            resets=self._clocks.resets if self.health.acts else None,
+            may_reset=4 * active.done <= active.steps,
         )
 
     # -- at rest -------------------------------------------------------------------------------------
@@ -269,6 +293,7 @@ class Coordinator:
         """
         updates = {}
         if (active := self.state.active) is not None:
+            self.health.look_over()
             state = self._detached()
             held = part(state, self._owner) if active.is_whole else {LIVE: state}
             updates = {block: state.to_tensors() for block, state in held.items()}
@@ -301,16 +326,14 @@ class Coordinator:
         self._attach(self.state.active)
 
     def _attach(self, active: ActiveVisit) -> None:
-        tree = self.scene.tree
-        alone = LIVE if active.saved else active.geometry.block
-        blocks = range(tree.num_blocks) if active.is_whole else [alone]
-        states = [BlockState.from_tensors(*self.scene.store.load(block)) for block in blocks]
-        rows = torch.tensor([len(state) for state in states])
-        self._owner = torch.tensor(list(blocks)).repeat_interleave(rows).to(self.device)
-        rest = join(states).to(self.device)
+        which = (self.scene, active.geometry.block, active.saved)
+        self._owner = owners_at_rest(*which).to(self.device)
+        check_room(len(self._owner), self.config.sh_degree, self.device)
+        rest = at_rest(*which).to(self.device)
         if active.done == 0 and not self.config.keep_moments:
             rest = rest.forgetful()
         attach(rest, self.params, self.optimizers)
+        self.health.begin_visit(active, self.state.health)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
         self.scene.lay_over(
             None if active.is_whole else active.geometry.block, lambda: live_gaussians(self.params)
@@ -373,7 +396,7 @@ class Coordinator:
     def _end_visit(self) -> None:
         active = self._active
         self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
-        state = self._detached()
+        state = self.health.end_visit(active, self._detached)
         if active.is_whole:
             self.state.influence = self._influence_of_all(state.gaussians)
         updates = settle(self.scene, active.geometry.block, state, self.config.migrate)

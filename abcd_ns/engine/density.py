@@ -100,6 +100,10 @@ class DensityClock:
     """Gaussians that may still be added to the scene; None for no limit."""
     seed: int
     """Of the random numbers drawn in this step."""
+    resets: int | None = None
+    """Resets of the opacities that the block has had; None resets at the very step that one is due."""
+    may_reset: bool = True
+    """Whether enough of the visit is left for a reset to be made good before others see the block."""
 
     def reached(self, every: int) -> bool:
         """Whether `steps` has come to a multiple of `every` in this step."""
@@ -137,6 +141,15 @@ class DensityControl:
         warm = clock.steps >= self.config.warmup_passes * clock.views
         running = self.config.refine_start <= clock.progress < self.config.refine_stop
         return warm and running and clock.reached(max(self.config.refine_every, clock.views, 1))
+
+    def resets(self, clock: DensityClock) -> bool:
+        """Whether this step resets opacities (`default` strategy)."""
+        every = self.config.reset_every
+        if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
+            return False
+        if clock.resets is None:
+            return clock.reached(every)
+        return clock.may_reset and clock.steps // every > clock.resets
 
     def after_step(
         self,
@@ -197,7 +210,7 @@ class DensityControl:
             # Nothing is visible in this info, so the statistics are not gathered twice.
             unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
             strategy.step_post_backward(params, optimizers, state, REFINE, unseen)
-        if config.reset_every > 0 and clock.reached(config.reset_every):
+        if self.resets(clock):
             gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
         return {name: value for name, value in state.items() if isinstance(value, Tensor)}
 

@@ -75,7 +75,32 @@ class BlockSplit:
     new_gaussians: int
 
 
-Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded | BlockSplit
+@dataclass(frozen=True)
+class Mended:
+    """Something in the live block was wrong and was put right."""
+
+    visit: int
+    block: int | None
+    """None for the warm-up, and where all blocks are trained in every step."""
+    what: str
+    """The count of health_record.BlockHealth that it is added to."""
+    count: int
+    """Gaussians."""
+
+
+@dataclass(frozen=True)
+class VisitUndone:
+    """A visit left its pictures worse than it found them; the block was put back. VisitEnded follows."""
+
+    visit: int
+    block: int
+    before: float
+    """Mean loss of the visit's views when they were first used."""
+    after: float
+    """The same when they were last used."""
+
+
+Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded | BlockSplit | Mended | VisitUndone
 Listener = Callable[[Event], None]
 
 

@@ -137,6 +137,7 @@ class ExactCoordinator(Coordinator):
         self._all = joined[order.argsort()] if kept else joined
         self._lay_over()
         self._pictures, self._layers_of = [], []
+        self.health.end_step()
         self.announce(StepTaken(self.state.step, 0, self.state.step, psnr))
         if self.finished:
             self.save()

@@ -15,6 +15,8 @@ from abcd_ns.engine.types import Gaussians
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 INITIAL_OPACITY = 0.1
+NEIGHBOURS = 3
+"""Other points whose mean distance is a point's size."""
 
 
 def gaussians_from_points(
@@ -27,7 +29,8 @@ def gaussians_from_points(
     """Isotropic Gaussians at `points`, as wide as the mean distance to the three nearest others.
 
     Args:
-        points: world space; rows that are not finite are dropped with a warning.
+        points: world space; rows that are not finite are dropped with a warning. Another warns where the
+            points are too few.
         colors: 0..255.
         seed: of the random rotations.
     """
@@ -36,6 +39,13 @@ def gaussians_from_points(
         warnings.warn(f"dropped {int((~keep).sum())} initial points that are not finite", stacklevel=2)
         points, colors = points[keep], colors[keep]
     count = points.shape[0]
+    elsewhere = int((points != points[:1]).any(dim=1).sum())
+    if elsewhere < NEIGHBOURS:
+        warnings.warn(
+            f"{count} initial points, {elsewhere} of them not where the first is: too few to tell how large "
+            "Gaussians should be, and to grow a scene from; look at how the poses were found",
+            stacklevel=2,
+        )
     generator = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=points.clone(),
@@ -82,7 +92,7 @@ def random_points(count: int, extent: float, seed: int = 0) -> tuple[Tensor, Ten
     return points, torch.rand((count, 3), generator=generator) * 255
 
 
-def _neighbour_distance(points: np.ndarray, neighbours: int = 3) -> np.ndarray:
+def _neighbour_distance(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
     """[n] mean distance to the nearest others; equal points get the smallest positive distance there is."""
     count = len(points)
     if count < 2:

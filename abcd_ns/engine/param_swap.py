@@ -82,8 +82,9 @@ class Pace:
         self._optimizers = optimizers
         self._given = {name: (group["lr"], group["betas"]) for name, group in groups.items()}
 
-    def set(self, batch: int, means_decay: float) -> None:
-        """For a step of `batch` views, with the means' rate at a share of what was given.
+    def set(self, batch: int, means_decay: float, damping: float = 1.0) -> None:
+        """For a step of `batch` views, with the means' rate at a share of what was given, and all of them
+        damped.
 
         Rates grow with the square root, and moments forget as many views' worth a step: for Adam this follows
         the path of single views, as far as gradients are noise (Malladi et al. 2022, "On the SDEs and scaling
@@ -92,7 +93,7 @@ class Pace:
         for name, (rate, betas) in self._given.items():
             group = self._optimizers[name].param_groups[0]
             decay = means_decay if name == "means" else 1.0
-            group["lr"] = rate * decay * math.sqrt(batch)
+            group["lr"] = rate * decay * math.sqrt(batch) * damping
             group["betas"] = tuple(beta**batch for beta in betas)
 
 

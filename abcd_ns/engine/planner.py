@@ -24,6 +24,9 @@ from abcd_ns.engine.schedule import (
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, survey
 
+LOOK_AGAIN = 4
+"""Blocks that were hidden behind others are looked at again every so many sweeps."""
+
 
 class Planner:
     """Plans the visits of a run; all that it remembers is in the run's state.
@@ -55,18 +58,25 @@ class Planner:
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
     def next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
-        """A visit to the next block that some view sees; blocks that none sees any more are passed over.
+        """A visit to the next block that some view sees; blocks that none sees any more are passed over, and
+        most of the time those that no picture showed when they were last visited.
 
         Raises:
             RuntimeError: no view sees any block.
         """
         while True:
             plan = self._next_plan(state)
+            if self._is_hidden(state, plan.block) and state.sweep % LOOK_AGAIN:
+                continue
             geometry = self._survey(plan.block)
             kept = self._worth_training(state, geometry)
             state.views[plan.block] = len(kept)
             if kept:
                 return self._visit(state, plan, geometry, kept, sh_degree, began)
+
+    @staticmethod
+    def _is_hidden(state: RunState, block: int) -> bool:
+        return block in state.health and state.health[block].hidden
 
     def _visit(
         self,

@@ -5,6 +5,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+from abcd_ns.engine.health_record import BlockHealth, Ledger
 from abcd_ns.engine.influence import Influence
 from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
@@ -58,6 +59,10 @@ class ActiveVisit:
     """Share of the run that was done then."""
     until: float = 1.0
     """Share of the run at which the visit ends, whatever its steps."""
+    shown: bool = False
+    """Whether any picture has shown the block so far."""
+    objective: dict[int, list[float]] = field(default_factory=dict)
+    """By view, its loss when the visit first used it and, from its second use on, when it last did."""
 
     @property
     def is_whole(self) -> bool:
@@ -80,6 +85,8 @@ class RunState:
     """By block, how many views were worth training it on when last looked at; 0 means that none is."""
     influence: Influence = field(default_factory=dict)
     """As far as known; blocks that are missing are trained on all views that see them."""
+    health: Ledger = field(default_factory=dict)
+    """What had to be mended, by block."""
     active: ActiveVisit | None = None
     seconds: float = 0.0
     """Training time up to the last save."""
@@ -100,11 +107,14 @@ class RunState:
             "geometry": self.active.geometry.to_json(),
             "views": list(self.active.views),
             "looked_at": list(self.active.looked_at),
+            "objective": {str(view): losses for view, losses in self.active.objective.items()},
         }
         queue = [[plan.block, plan.steps] for plan in self.queue]
         views = {str(block): count for block, count in self.views.items()}
         known = {str(b): {str(v): value for v, value in row.items()} for b, row in self.influence.items()}
-        return {**vars(self), "queue": queue, "active": active, "views": views, "influence": known}
+        health = {str(block): dict(vars(record)) for block, record in self.health.items()}
+        changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
+        return {**vars(self), **changed}
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "RunState":
@@ -115,11 +125,14 @@ class RunState:
         if active is not None:
             geometry = VisitGeometry.from_json(active["geometry"])
             views = {name: tuple(active[name]) for name in ("views", "looked_at")}
-            active = ActiveVisit(**{**active, **views, "geometry": geometry})
+            losses = {int(view): list(found) for view, found in active.get("objective", {}).items()}
+            active = ActiveVisit(**{**active, **views, "geometry": geometry, "objective": losses})
         queue = [VisitPlan(*plan) for plan in data["queue"]]
         views = {int(block): count for block, count in data["views"].items()}
         known = {int(b): {int(v): value for v, value in row.items()} for b, row in data["influence"].items()}
-        return RunState(**{**data, "queue": queue, "active": active, "views": views, "influence": known})
+        health = {int(block): BlockHealth(**record) for block, record in data.get("health", {}).items()}
+        changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
+        return RunState(**{**data, **changed})
 
 
 class Stopwatch:

@@ -2,11 +2,34 @@
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from abcd_ns.engine.block_state import BlockState
-from abcd_ns.engine.scaffold import RESERVE, WHOLE, part, revealed
+from abcd_ns.engine.scaffold import LIVE, RESERVE, WHOLE, join, part, revealed
 from abcd_ns.engine.scene import StoredScene
+
+
+def at_rest(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
+    """What is attached when a visit to `block`, or with WHOLE the warm-up, begins or goes on.
+
+    Args:
+        saved: the visit goes on where a save found it.
+    """
+    return join([_at_rest(scene, number) for number in _numbers(scene, block, saved)])
+
+
+def owners_at_rest(scene: StoredScene, block: int, saved: bool = False) -> Tensor:
+    """The number under which the store keeps each row of `at_rest` [n]."""
+    numbers = _numbers(scene, block, saved)
+    rows = torch.tensor([scene.store.counts(number) for number in numbers])
+    return torch.tensor(numbers).repeat_interleave(rows)
+
+
+def _numbers(scene: StoredScene, block: int, saved: bool) -> list[int]:
+    if block == WHOLE:
+        return list(range(scene.tree.num_blocks))
+    return [LIVE if saved else block]
 
 
 def settle(scene: StoredScene, block: int, state: BlockState, migrate: bool = True) -> dict[int, BlockState]:

@@ -9,13 +9,26 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.events import Event, LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import (
+    Event,
+    LayersDrawn,
+    Mended,
+    StepTaken,
+    SweepEnded,
+    VisitBegan,
+    VisitEnded,
+    VisitUndone,
+)
+from abcd_ns.engine.health_record import MENDED, summary
 from abcd_ns.engine.run_state import UNLIMITED
 
 SECONDS_BETWEEN_LINES = 10.0
 """Where the output is no terminal (a log file, say), a line is printed this often."""
 SMOOTHING = 0.98
 """Of the PSNR shown: the weight of what was there before."""
+
+ALARMING = ("gradients", "moments", "values")
+"""What is said at once when it is mended; the rest is counted and said at the end."""
 
 
 class ProgressReport:
@@ -46,6 +59,13 @@ class ProgressReport:
                 self._visit_seconds += event.seconds
             case SweepEnded():
                 self._end_sweep(event)
+            case Mended() if event.what in ALARMING:
+                self._print(f"{_block(event.block)}: {event.count:,} {MENDED[event.what]}")
+            case VisitUndone():
+                rise = event.after / event.before - 1
+                self._print(
+                    f"{_block(event.block)}: visit undone, it raised the loss of its views by {rise:.0%}"
+                )
 
     def close(self) -> None:
         """Take the live line away and say what became of the run."""
@@ -58,6 +78,8 @@ class ProgressReport:
             f"{_clock(self._coordinator.stopwatch.seconds)}; {self._summary()}",
             highlight=False,
         )
+        for line in summary(self._coordinator.scene.tree.num_blocks, state.health, state.views):
+            CONSOLE.print(f"  {line}", highlight=False)
 
     def _take_step(self, event: StepTaken) -> None:
         before = event.psnr if self._psnr is None else self._psnr
@@ -108,6 +130,10 @@ class ProgressReport:
             self._task = self._live.add_task("", total=1.0, what="")
             self._live.start()
         return self._live
+
+
+def _block(block: int | None) -> str:
+    return "warm-up" if block is None else f"block {block + 1}"
 
 
 def _memory() -> str:

@@ -48,6 +48,11 @@ COMMANDS = (
         "vary one thing: blocks, Gaussians, or any options",
     ),
     Command("scale", "abcd_ns.tools.scale.command:scale", "memory and time as the scene grows"),
+    Command(
+        "stability",
+        "abcd_ns.tools.stability.command:stability",
+        "make methods fail on small scenes and see what ABCD does",
+    ),
 )
 
 EXAMPLES = (

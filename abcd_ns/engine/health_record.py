@@ -1,0 +1,93 @@
+"""What is known of each block's health: counts of what was mended, and its standing in words."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+FEW_VIEWS = 2
+"""A block that no more views see has surfaces that nothing but the first Gaussians hold in place."""
+
+
+@dataclass
+class BlockHealth:
+    """Of one block, since the run began. All but `damping` are counts or facts of its last visit."""
+
+    visits: int = 0
+    """That ended, undone ones included."""
+    gradients: int = 0
+    """Rows of gradients that were no numbers and were set to zero."""
+    moments: int = 0
+    """Rows of Adam's moments likewise."""
+    values: int = 0
+    """Gaussians that were no numbers: put back as they were at rest or, where that is not known, replaced by
+    transparent ones."""
+    giants: int = 0
+    """Gaussians that were shrunk."""
+    transparent: int = 0
+    """Gaussians that no picture can show and that were dropped."""
+    rises: int = 0
+    """Visits that left the loss of their views higher than they found it."""
+    undone: int = 0
+    """Those of them that were undone."""
+    damping: float = 1.0
+    """Learning rates of the next visit, as a share of what they would be."""
+    hidden: bool = False
+    """In the last visit no picture showed the block."""
+
+
+Ledger = dict[int, BlockHealth]
+"""By block; scaffold.WHOLE for the warm-up. A block that was never visited is missing."""
+
+
+def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -> str:
+    """How a block stands, in a few words.
+
+    Args:
+        views: by block, how many views were worth training it on when last looked at.
+    """
+    if views.get(block) == 0:
+        return "seen by no view, left as it was"
+    if record is None or record.visits == 0:
+        return "not visited yet"
+    if record.hidden:
+        return "hidden behind others, passed over"
+    if record.undone >= record.visits:
+        return "every visit undone"
+    if views.get(block, FEW_VIEWS + 1) <= FEW_VIEWS:
+        return "seen by 1 view only" if views[block] == 1 else f"seen by {views[block]} views only"
+    return "trained"
+
+
+def summary(blocks: int, ledger: Ledger, views: Mapping[int, int]) -> list[str]:
+    """Lines for the end of a run: how the blocks stand, and what had to be mended. Blocks count from 1."""
+    by_standing: dict[str, list[int]] = {}
+    for block in range(blocks):
+        by_standing.setdefault(standing(block, ledger.get(block), views), []).append(block + 1)
+    if list(by_standing) == ["trained"]:
+        lines = ["1 block: trained" if blocks == 1 else f"all {blocks} blocks: trained"]
+    else:
+        lines = [f"{_named(members)}: {words}" for words, members in by_standing.items()]
+    return lines + _mended(ledger.values())
+
+
+def _named(blocks: list[int]) -> str:
+    word = "block" if len(blocks) == 1 else "blocks"
+    shown = ", ".join(map(str, blocks[:12])) + (", ..." if len(blocks) > 12 else "")
+    return f"{word} {shown}"
+
+
+MENDED = {
+    "gradients": "gradients that were no numbers set to zero",
+    "moments": "moments that were no numbers set to zero",
+    "values": "Gaussians that were no numbers replaced",
+    "giants": "giants shrunk",
+    "transparent": "Gaussians that nothing can show dropped",
+    "undone": "visits undone that made their pictures worse",
+}
+"""What the counts of a BlockHealth say."""
+
+
+def _mended(records: Iterable[BlockHealth]) -> list[str]:
+    records = list(records)
+    totals = {name: sum(getattr(record, name) for record in records) for name in MENDED}
+    found = [f"{total:,} {MENDED[name]}" for name, total in totals.items() if total]
+    return [", ".join(found)] if found else []

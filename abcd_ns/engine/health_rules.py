@@ -1,0 +1,77 @@
+"""What counts as ill: pure functions of Gaussians and of losses."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from abcd_ns.engine.types import Gaussians
+
+SHOWS = 1 / 255
+"""Rasterizers skip a Gaussian wherever its alpha is below this: with less opacity it is never drawn."""
+STAND_IN_OPACITY = -9.0
+"""Logit of the opacity of a Gaussian that takes the place of one that was lost; far below SHOWS."""
+LARGEST_LOG_SCALE = 40.0
+"""A standard deviation of e^40; its square still is a number in float32."""
+GIANT_SHARE = 0.5
+"""A giant's standard deviation is over this share of its block's extent ..."""
+GIANT_ANGLE = 0.3
+"""... and over this share of its distance to the nearest camera: 3 sigma cover 45 degrees to either side.
+What is far away, sky for instance, may be large."""
+HIDDEN = 1e-4
+"""A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
+RISE = 0.02
+"""A visit is undone if the loss of its views rose by more than this share ..."""
+SURE = 3.0
+"""... and by more than this many standard errors: with random backgrounds losses scatter."""
+FEWEST_VIEWS = 4
+"""Fewer than these say nothing about a rise."""
+
+
+def unsound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """Which Gaussians hold a value that is no number, or a scale whose square is none."""
+    bad = gaussians.scales.amax(dim=1) > LARGEST_LOG_SCALE
+    for _, value in gaussians.items():
+        bad = bad | ~torch.isfinite(value).flatten(1).all(dim=1)
+    return bad
+
+
+def stand_ins(sound: Gaussians, count: int) -> Gaussians:
+    """`count` Gaussians amid the `sound` ones, as large as they usually are, and too faint to be drawn."""
+    known = len(sound) > 0
+    values = {name: value.new_zeros((count, *value.shape[1:])) for name, value in sound.items()}
+    for name in ("means", "scales"):
+        if known:
+            values[name] += getattr(sound, name).median(dim=0).values
+    values["quats"][:, 0] = 1.0
+    values["opacities"] += STAND_IN_OPACITY
+    return Gaussians(**values)
+
+
+def extent(means: Float[Tensor, "n 3"]) -> float:
+    """The longest side of the box that holds all means but the outermost hundredths; 0 for none."""
+    if len(means) == 0:
+        return 0.0
+    ranked, last = means.sort(dim=0).values, len(means) - 1
+    low, high = round(0.01 * last), round(0.99 * last)
+    return float((ranked[high] - ranked[low]).max())
+
+
+def loss_rise(uses: list[list[float]]) -> tuple[float, float, float] | None:
+    """(before, after, standard error of the difference) of the mean loss; None if too little is known.
+
+    Args:
+        uses: by view, the losses when it was first and last used in the visit; [first] where used once.
+    """
+    pairs = [use for use in uses if len(use) == 2]
+    if len(pairs) < FEWEST_VIEWS:
+        return None
+    first, last = torch.tensor(pairs, dtype=torch.float64).unbind(dim=1)
+    error = float((last - first).std()) / math.sqrt(len(pairs))
+    return float(first.mean()), float(last.mean()), error
+
+
+def is_worse(before: float, after: float, error: float) -> bool:
+    """Whether the loss rose by more than is allowed, and more than chance would have it."""
+    return after - before > max(RISE * before, SURE * error)

@@ -1,0 +1,1 @@
+"""Where methods fail: small scenes that make them, and what ABCD does there."""

@@ -1,0 +1,156 @@
+"""`abcd stability`: make methods fail, and see what ABCD does."""
+
+import shlex
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeRemainingColumn as TimeLeft
+
+from abcd_ns.errors import UserError
+from abcd_ns.tools.runs.machine import describe_machine, describe_versions
+from abcd_ns.tools.stability.catalogue import SCENARIOS
+from abcd_ns.tools.stability.curves import Curve, Study, studies
+from abcd_ns.tools.stability.lab import Lab
+from abcd_ns.tools.stability.outcome import Outcome, Scenario
+from abcd_ns.tools.stability.real import read_stage, real_scenarios
+from abcd_ns.tools.stability.report import (
+    RESULTS_FILE,
+    SCHEMA,
+    Report,
+    headline,
+    print_outcome,
+    write_report,
+)
+
+
+def stability(
+    *,
+    out: Path,
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None,
+    downscale: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="A1 A3 ...", help_behavior_hint="")] = (),
+    quick: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")] = False,
+) -> int:
+    """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
+
+    All methods draw the same number of views. OUT gets stability.json, table.md and charts of held-out PSNR
+    against the number of blocks, steps a visit, the age and the bits of layers, views, noise of poses and
+    exposure. Needs no GPU and no data; some 10 minutes on two cores.
+
+    Args:
+        out: Folder for the results; absent, empty, or one of an earlier call.
+        data: A capture as for `ns-train abcd --data`; adds scenarios R1 to R5 on it.
+        downscale: Divides the width and height of its photos.
+        only: Scenarios to carry out, by id, without the charts.
+        quick: A third of the training, no charts: to see that everything works. Its rules may fail.
+
+    Raises:
+        UserError: an option cannot be used, or OUT holds something else.
+    """
+    claim(out)
+    if downscale < 1:
+        raise UserError(f"--downscale is {downscale}; it must be at least 1.")
+    console = Console()
+    known = dict(SCENARIOS)
+    if data is not None:
+        stage = read_stage(data, downscale)
+        known |= {scenario.id: scenario for scenario in real_scenarios(stage, data.resolve().name)}
+    chosen = choose(only, known)
+    wanted = () if only or quick else studies()
+    with tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder, _bar(console) as progress:
+        lab = Lab(Path(folder), quick=quick)
+        outcomes, curves = carry_out(lab, chosen, wanted, progress)
+    report = Report(
+        SCHEMA,
+        datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        shlex.join(["abcd", *sys.argv[1:]]),
+        describe_machine(),
+        describe_versions(),
+        outcomes,
+        curves,
+    )
+    for path in write_report(report, out):
+        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
+    console.print(headline(outcomes), highlight=False, soft_wrap=True)
+    return 0 if all(outcome.passed for outcome in outcomes) else 1
+
+
+def choose(only: Sequence[str], known: dict[str, Scenario]) -> list[Scenario]:
+    """The scenarios asked for, in their order; all if none is named.
+
+    Raises:
+        UserError: there is none of that id.
+    """
+    wanted = {name.upper() for name in only}
+    for name in sorted(wanted - set(known)):
+        hint = "; R1 to R5 need --data" if name.startswith("R") else ""
+        raise UserError(f"--only {name}: there is no such scenario{hint}; there are {', '.join(known)}.")
+    return [scenario for name, scenario in known.items() if not wanted or name in wanted]
+
+
+def claim(out: Path) -> None:
+    """Make `out` a folder of this command.
+
+    Raises:
+        UserError: it is a file, or holds something else.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out} is a file; name a folder.")
+    if out.is_dir() and any(out.iterdir()) and not (out / RESULTS_FILE).exists():
+        raise UserError(f"--out {out} is not empty and holds no stability report; name another folder.")
+    out.mkdir(parents=True, exist_ok=True)
+
+
+def carry_out(
+    lab: Lab, scenarios: Sequence[Scenario], wanted: Sequence[Study], progress: Progress
+) -> tuple[tuple[Outcome, ...], tuple[Curve, ...]]:
+    """Every scenario and every curve, one after the other."""
+    total = sum(scenario.cost for scenario in scenarios) + sum(map(len, wanted))
+    task = progress.add_task("", total=total)
+    outcomes, curves = [], []
+    for scenario in scenarios:
+        progress.update(task, description=f"{scenario.id} {scenario.fails[:40]}")
+        outcomes.append(examine(lab, scenario))
+        progress.advance(task, scenario.cost)
+        print_outcome(outcomes[-1], progress.console)
+    for study in wanted:
+        progress.update(task, description=f"chart: {study.title}")
+        for curve in study.make(lab):
+            progress.advance(task)
+            curves += [] if curve is None else [curve]
+        progress.console.print(f"      chart: {study.title}", highlight=False)
+    return tuple(outcomes), tuple(curves)
+
+
+def examine(lab: Lab, scenario: Scenario) -> Outcome:
+    """Carry out one scenario."""
+    torch.manual_seed(0)
+    began = time.perf_counter()
+    found = scenario.run(lab)
+    return Outcome(
+        scenario.id,
+        scenario.fails,
+        scenario.done,
+        scenario.rule,
+        found.passed,
+        found.worse,
+        found.said,
+        {name: float(value) for name, value in found.numbers.items()},
+        round(time.perf_counter() - began, 1),
+    )
+
+
+def _bar(console: Console) -> Progress:
+    text = TextColumn("{task.description}")
+    return Progress(
+        text, BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), TimeLeft(), console=console
+    )

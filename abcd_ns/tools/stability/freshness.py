@@ -1,0 +1,128 @@
+"""A13, A19: old layers, and what the number of blocks and the length of visits decide."""
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.events import VisitEnded
+from abcd_ns.engine.partition import build_grid
+from abcd_ns.engine.storage import StaleLayerError
+from abcd_ns.tools.stability.captures import BUDGET
+from abcd_ns.tools.stability.lab import STILL, Lab, Stage, make_stage
+from abcd_ns.tools.stability.outcome import Finding, Scenario, db
+from abcd_ns.tools.stability.stale import StaleCoordinator
+from abcd_ns.tools.stability.world import ring
+
+BLOCKS = (1, 2, 4, 8, 27)
+CLIFF_DB = 0.5
+VISITS_RISING = 0.05
+RISES_BY = 1e-3
+"""A visit raised the objective if by more than this share of it."""
+SWEEP = 4
+"""Blocks, and so visits in a sweep, of the runs with old layers."""
+
+
+def is_noticed(lab: Lab, stage: Stage) -> bool:
+    """Whether a frozen block that changes under a visit stops the run."""
+    coordinator = lab.coordinator(stage.start(), stage.views, budget=200, blocks=3, warmup=0.0)
+    lab.finish(coordinator, stage, steps=1)
+    other = next(b for b in range(3) if b != coordinator.state.active.geometry.block)
+    store = coordinator.scene.store
+    store.commit({other: store.load(other)})
+    try:
+        lab.finish(coordinator, stage, steps=1)
+    except StaleLayerError:
+        return True
+    return False
+
+
+def objectives(lab: Lab, stage: Stage, coordinator: Coordinator) -> list[float]:
+    """Train to the end; the error over all training photos at the start and after each visit."""
+    found = [lab.error(coordinator, stage)]
+
+    def listen(event) -> None:
+        if isinstance(event, VisitEnded):
+            found.append(lab.error(coordinator, stage))
+
+    coordinator.announce.subscribe(listen)
+    lab.finish(coordinator, stage)
+    return found
+
+
+def share_rising(errors: Sequence[float]) -> float:
+    """The share of visits that raised the objective."""
+    rises = [after > (1 + RISES_BY) * before for before, after in pairwise(errors)]
+    return sum(rises) / len(rises)
+
+
+def train_stale(
+    lab: Lab, stage: Stage, every: int, *, damping: float = 1.0, heal: bool = False
+) -> tuple[float, float]:
+    """(share of visits that raised the objective, held-out PSNR) with layers up to `every` visits old."""
+    coordinator = lab.coordinator(
+        stage.start(),
+        stage.views,
+        budget=lab.views_drawn(BUDGET),
+        blocks=SWEEP,
+        warmup=0.0,
+        density=STILL,
+        heal=heal,
+        first_passes=2,
+        last_passes=2,
+        kind=partial(StaleCoordinator, every=every, damping=damping),
+    )
+    rising = share_rising(objectives(lab, stage, coordinator))
+    return rising, lab.score(coordinator, stage.held_out, stage.truth)
+
+
+def old_layers(lab: Lab) -> Finding:
+    """A13: a refresh left out, and refreshes once a sweep with and without damping."""
+    stage, numbers, said = make_stage(views=ring(12), points=400), {}, {}
+    noticed = is_noticed(lab, stage)
+    said["abcd"] = "a layer of an old version stops the run" if noticed else "an old layer went unnoticed"
+    cases = {
+        "abcd": {"every": 1},
+        "once a sweep": {"every": SWEEP},
+        "once a sweep, damped": {"every": SWEEP, "damping": 0.5, "heal": True},
+    }
+    for name, options in cases.items():
+        rising, score = train_stale(lab, stage, **options)
+        numbers |= {f"rising {name}": rising, f"psnr {name}": score}
+        words = f"{rising:.0%} of visits raised the objective, {db(score)}"
+        said[name] = f"{said[name]}; fresh: {words}" if name in said else words
+    damped = numbers["rising once a sweep, damped"] <= VISITS_RISING
+    return Finding(noticed and damped and numbers["rising abcd"] <= VISITS_RISING, said, numbers)
+
+
+def blocks_and_cuts(lab: Lab) -> Finding:
+    """A19: the defaults with 1 to 27 blocks, and with a grid whose planes cut every ball."""
+    stage = make_stage(views=ring(24))
+    start, budget = stage.start(), lab.views_drawn(2 * BUDGET)
+    psnr = {f"{k} blocks": lab.train(stage, budget=budget, blocks=k).psnr for k in BLOCKS}
+    cut = build_grid(start.means.clamp(-0.5, 0.5), counts=(2, 2, 2))
+    psnr["cut through the balls"] = lab.train(stage, budget=budget, tree=cut).psnr
+    gap = max(psnr.values()) - min(psnr.values())
+    behind = psnr["1 blocks"] - min(psnr.values())
+    said = {"abcd": ", ".join(f"{name} {value:.2f}" for name, value in psnr.items()) + " dB"}
+    said["abcd-monolithic"] = db(psnr["1 blocks"])
+    numbers = {**{f"psnr {name}": value for name, value in psnr.items()}, "best to worst": gap}
+    return Finding(gap <= CLIFF_DB, said, numbers, worse=behind > 0)
+
+
+SCENARIOS = (
+    Scenario(
+        "A13",
+        "old layers oscillate and diverge",
+        "one frozen block changed under a visit; layers drawn once a sweep, plainly and damped",
+        f"the first stops the run; damped, the full objective rises in at most {VISITS_RISING:.0%} of visits",
+        old_layers,
+    ),
+    Scenario(
+        "A19",
+        "the number of blocks and of steps a visit decide the quality",
+        f"{', '.join(map(str, BLOCKS))} blocks and a grid that cuts every ball, at the defaults",
+        f"worst within {CLIFF_DB} dB of the best; the charts show visits of 1 to 256 steps too",
+        blocks_and_cuts,
+    ),
+)

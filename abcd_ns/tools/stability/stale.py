@@ -1,0 +1,87 @@
+"""Training against old pictures of the other blocks, which the engine refuses: to see what that does."""
+
+from typing import Any
+
+import torch
+
+from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.run_state import ActiveVisit
+from abcd_ns.engine.scene import BlockScene
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.visit import VisitLayers
+
+
+class Snapshot(BlockScene):
+    """All blocks as they were at one moment."""
+
+    def __init__(self, scene: BlockScene, generation: int) -> None:
+        self.tree, self._generation = scene.tree, generation
+        self._blocks = [
+            Gaussians(**{name: value.clone() for name, value in scene.gaussians(block).items()})
+            for block in range(scene.tree.num_blocks)
+        ]
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._blocks[block]
+
+    def version(self, block: int) -> int:  # noqa: ARG002 - all are of the same moment
+        return self._generation
+
+    def count(self, block: int) -> int:
+        return len(self._blocks[block])
+
+
+class StaleCoordinator(Coordinator):
+    """Shows blocks to each other as they were some visits ago.
+
+    The number of Gaussians must stay (strategy "off", `migrate` off is not needed).
+
+    Args:
+        every: visits between two looks at the scene; 1 is always fresh.
+        damping: what a visit did is kept to this share; 1 keeps all.
+    """
+
+    def __init__(self, *args: Any, every: int = 1, damping: float = 1.0, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._every, self._damping = every, damping
+        self._seen: Snapshot | None = None
+        self._taken_at = 0
+
+    def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
+        if active.is_whole or self.scene.tree.num_blocks == 1:
+            return None
+        if self._seen is None or active.number - self._taken_at >= self._every:
+            self._seen, self._taken_at = Snapshot(self.scene, active.number), active.number
+        painter = Painter(
+            self._seen,
+            list(self.views.values()),
+            self._rasterizer,
+            ownership=self._ownership,
+            pass_gaussians=10**9,
+        )
+        layers = VisitLayers(
+            painter,
+            self.cache,
+            active.geometry,
+            self.scene.at_rest(active.geometry.block),
+            self.views,
+            PaintSettings(active.sh_degree),
+            window_weight=self.config.window_weight,
+            scene_key=f"stale {active.number}",
+        )
+        for _ in layers.draw(dict.fromkeys(self._order)):
+            pass
+        return layers
+
+    def _detached(self) -> BlockState:
+        state = super()._detached()
+        active = self.state.active
+        if self._damping == 1.0 or active is None or active.is_whole:
+            return state
+        before = self.scene.at_rest(active.geometry.block)
+        mixed = {n: torch.lerp(getattr(before, n), v, self._damping) for n, v in state.gaussians.items()}
+        return BlockState(
+            Gaussians(**mixed), state.exp_avg, state.exp_avg_sq, state.growth, state.clocks
+        )  # moments are of the path, not of where it ends
