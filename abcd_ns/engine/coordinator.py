@@ -401,6 +401,7 @@ class Coordinator:
             self.state.influence = self._influence_of_all(state.gaussians)
         updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
         tree, updates = self._split_full(updates)
+        split = tree is not self.scene.tree
         if active.saved:
             updates[LIVE] = state[:0]
         self.scene.lift()
@@ -410,7 +411,8 @@ class Coordinator:
         self.state.seconds = self.stopwatch.seconds
         crash_points.reached(crash_points.VISIT_TRAINED)
         self.scene.rest(tree, {b: s.to_tensors() for b, s in updates.items()}, self.state.to_json())
-        self.density = self._density_control()
+        if split:
+            self.density = self._density_control()
         block = None if active.is_whole else active.geometry.block
         staying = len(state) if block is None else len(updates[block])
         self.announce(

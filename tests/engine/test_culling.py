@@ -14,6 +14,7 @@ from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.scene import MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians
+from abcd_ns.engine.visibility import DRAWN_SIGMAS
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer(compile="never")
@@ -77,7 +78,7 @@ def test_a_box_without_end_may_always_show():
 def test_bounds_hold_means_and_extents():
     gaussians = random_gaussians(30, dtype=torch.float64)
     bounds = bounds_of(gaussians)
-    reach = BOUNDS_SLANT * 3.33 * gaussians.scales.exp().amax(dim=1, keepdim=True)
+    reach = (1 - 1e-9) * BOUNDS_SLANT * DRAWN_SIGMAS * gaussians.scales.exp().amax(dim=1, keepdim=True)
     assert bool((bounds.lower <= gaussians.means - reach).all())
     assert bool((gaussians.means + reach <= bounds.upper).all())
     assert bounds_of(gaussians[:0]) is None

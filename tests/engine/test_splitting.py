@@ -69,9 +69,9 @@ def test_a_part_is_visited_next_to_the_block_it_came_from():
 
 @pytest.mark.parametrize("blocks", [1, 2])
 def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, start, blocks):
-    limit = 90
+    limit = 130
     coordinator = make_coordinator(
-        tmp_path, start, views, blocks=blocks, steps=160, density=GROWING, block_limit=limit, warmup=0.0
+        tmp_path, start, views, blocks=blocks, steps=50, density=GROWING, block_limit=limit, warmup=0.0
     )
     seen = []
     coordinator.announce.subscribe(seen.append)
@@ -92,7 +92,7 @@ def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, sta
 
 
 def test_a_run_that_was_cut_resumes_bit_for_bit(tmp_path, views, photos, start):
-    options = {"blocks": 2, "steps": 120, "density": GROWING, "block_limit": 90, "warmup": 0.0}
+    options = {"blocks": 2, "steps": 50, "density": GROWING, "block_limit": 110, "warmup": 0.0}
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     whole.mkdir()
     halves.mkdir()

@@ -13,7 +13,7 @@ PIXELS = 1297 * 840
 
 
 @pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
-@pytest.mark.parametrize("gb", [2, 8, 24, 80])
+@pytest.mark.parametrize("gb", [3, 8, 24, 80])
 def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
     room = find_room(gb * GB, pixels=PIXELS, gaussians=gaussians, training=TRAINING)
     needs = DeviceNeeds(PIXELS, 1 if room.blocks == 1 else 4)
