@@ -35,7 +35,7 @@ def listen(coordinator, kind) -> list:
 
 
 def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
-    """The row's gradient of one parameter is `value` in every step. Hooks run in their order: this goes first."""
+    """The row's gradient of one parameter is `value` in every step: a hook that runs before all others."""
     optimizer = coordinator.optimizers[name]
 
     def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
