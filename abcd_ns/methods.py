@@ -25,6 +25,7 @@ PAPER = TrainingConfig(
     keep_moments=False,
     sh_restart=True,
     migrate=False,
+    heal=False,
     ssim_lambda=0.0,
     pixel_loss="l2",
 )

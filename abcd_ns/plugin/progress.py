@@ -78,7 +78,8 @@ class ProgressReport:
             f"{_clock(self._coordinator.stopwatch.seconds)}; {self._summary()}",
             highlight=False,
         )
-        for line in summary(self._coordinator.scene.tree.num_blocks, state.health, state.views):
+        lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
+        for line in lines if state.health else []:  # exact joint training has no visits
             CONSOLE.print(f"  {line}", highlight=False)
 
     def _take_step(self, event: StepTaken) -> None:

@@ -92,6 +92,15 @@ def test_opacities_are_reset_on_the_blocks_own_clock_alone():
         assert bool((torch.sigmoid(params["opacities"]) < 0.02).all()) is reset, steps
 
 
+def test_a_reset_waits_for_a_visit_that_can_make_it_good():
+    control = DensityControl(DensityConfig(reset_every=500))
+    late, early = {"steps": 520, "may_reset": False}, {"steps": 560, "may_reset": True}
+    assert not control.resets(clock(resets=0, **late))
+    assert control.resets(clock(resets=0, **early))
+    assert not control.resets(clock(resets=1, **early))
+    assert not control.resets(clock(resets=0, progress=0.6, **early))
+
+
 def test_giants_are_pruned_only_once_opacities_were_reset():
     gaussians = random_gaussians(8, size=0.01)
     gaussians.opacities[:] = 3.0

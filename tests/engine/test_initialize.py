@@ -1,5 +1,7 @@
 """The first Gaussians: no more than there may be, the same ones for the same seed, no gaps."""
 
+import warnings
+
 import pytest
 import torch
 
@@ -42,3 +44,23 @@ def test_fewer_gaussians_are_wider_so_that_no_gaps_are_left(many):
     assert float(few.scales.mean() - many.scales.mean()) == pytest.approx(
         torch.tensor(2.0).log().item(), abs=0.2
     )
+
+
+@pytest.mark.parametrize(
+    ("points", "warns"),
+    [
+        (torch.zeros(0, 3), True),
+        (torch.zeros(1, 3), True),
+        (torch.eye(3), True),
+        (torch.zeros(5, 3), True),
+        (torch.cat([torch.eye(3), torch.zeros(1, 3)]), False),
+        (torch.linspace(0, 1, 5)[:, None] * torch.ones(1, 3), False),
+    ],
+)
+def test_too_few_points_are_warned_of_and_give_numbers_all_the_same(points, warns):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        made = gaussians_from_points(points, torch.zeros(len(points), 3))
+    assert ["too few" in str(warning.message) for warning in caught] == [True] * warns
+    assert len(made) == len(points)
+    assert all(bool(torch.isfinite(value).all()) for _, value in made.items())

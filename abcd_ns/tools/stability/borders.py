@@ -13,7 +13,7 @@ from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.types import View
 from abcd_ns.tools.stability.captures import BUDGET
-from abcd_ns.tools.stability.lab import METHODS, Lab, Trained, make_stage
+from abcd_ns.tools.stability.lab import METHODS, Lab, Stage, Trained, make_stage
 from abcd_ns.tools.stability.outcome import Finding, Scenario
 from abcd_ns.tools.stability.world import Wall, World, camera
 
@@ -48,10 +48,10 @@ def above(count: int, turn: float = 0.0) -> list[View]:
     return views
 
 
-def band_ratio(lab: Lab, trained: Trained, bands: list[Tensor], truth: list[Tensor]) -> float:
+def band_ratio(lab: Lab, trained: Trained, bands: list[Tensor], stage: Stage) -> float:
     """Mean absolute error of held-out pictures in the bands, over that outside them."""
-    drawn = lab.pictures(trained.gaussians, above(16, turn=1.0)[::3])
-    errors = torch.stack([(a - b).abs().mean(dim=-1) for a, b in zip(drawn, truth, strict=True)])
+    drawn = lab.pictures(trained.gaussians, stage.held_out)
+    errors = torch.stack([(a - b).abs().mean(dim=-1) for a, b in zip(drawn, stage.truth, strict=True)])
     inside = torch.stack(bands)
     return float(errors[inside].mean() / errors[~inside].mean())
 
@@ -65,7 +65,7 @@ def seams(lab: Lab) -> Finding:
     numbers, said = {}, {}
     for method in METHODS:
         trained = lab.train(stage, method, budget=lab.views_drawn(BUDGET), tree=tree)
-        ratio = band_ratio(lab, trained, bands, stage.truth)
+        ratio = band_ratio(lab, trained, bands, stage)
         numbers |= {f"ratio {method}": ratio, f"psnr {method}": trained.psnr}
         said[method] = f"{ratio:.2f} of the interior's error at borders, {trained.psnr:.2f} dB"
     worse = numbers["ratio abcd"] > numbers["ratio abcd-monolithic"]

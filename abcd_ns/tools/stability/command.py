@@ -12,7 +12,7 @@ from typing import Annotated
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as TimeLeft
 
 from abcd_ns.errors import UserError
@@ -67,8 +67,8 @@ def stability(
     chosen = choose(only, known)
     wanted = () if only or quick else studies()
     with tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder, _bar(console) as progress:
-        lab = Lab(Path(folder), quick=quick)
-        outcomes, curves = carry_out(lab, chosen, wanted, progress)
+        meter = Meter(progress, sum(scenario.cost for scenario in chosen) + sum(map(len, wanted)))
+        outcomes, curves = carry_out(Lab(Path(folder), quick=quick, tick=meter.step), chosen, wanted, meter)
     report = Report(
         SCHEMA,
         datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -110,24 +110,43 @@ def claim(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
 
 
+class Meter:
+    """How far the command is: a bar, what is going on, and steps of training so far."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self.console, self._progress, self._steps = progress.console, progress, 0
+        self._task = progress.add_task("", total=total, steps=0)
+
+    def begin(self, what: str) -> None:
+        """Say what is going on."""
+        self._progress.update(self._task, description=what[:44])
+
+    def advance(self, by: int = 1) -> None:
+        """So much is done."""
+        self._progress.advance(self._task, by)
+
+    def step(self) -> None:
+        """One step of training was taken."""
+        self._steps += 1
+        self._progress.update(self._task, steps=self._steps)
+
+
 def carry_out(
-    lab: Lab, scenarios: Sequence[Scenario], wanted: Sequence[Study], progress: Progress
+    lab: Lab, scenarios: Sequence[Scenario], wanted: Sequence[Study], meter: Meter
 ) -> tuple[tuple[Outcome, ...], tuple[Curve, ...]]:
     """Every scenario and every curve, one after the other."""
-    total = sum(scenario.cost for scenario in scenarios) + sum(map(len, wanted))
-    task = progress.add_task("", total=total)
     outcomes, curves = [], []
     for scenario in scenarios:
-        progress.update(task, description=f"{scenario.id} {scenario.fails[:40]}")
+        meter.begin(f"{scenario.id} {scenario.fails}")
         outcomes.append(examine(lab, scenario))
-        progress.advance(task, scenario.cost)
-        print_outcome(outcomes[-1], progress.console)
+        meter.advance(scenario.cost)
+        print_outcome(outcomes[-1], meter.console)
     for study in wanted:
-        progress.update(task, description=f"chart: {study.title}")
+        meter.begin(f"chart: {study.title}")
         for curve in study.make(lab):
-            progress.advance(task)
+            meter.advance()
             curves += [] if curve is None else [curve]
-        progress.console.print(f"      chart: {study.title}", highlight=False)
+        meter.console.print(f"      chart: {study.title}", highlight=False)
     return tuple(outcomes), tuple(curves)
 
 
@@ -150,7 +169,6 @@ def examine(lab: Lab, scenario: Scenario) -> Outcome:
 
 
 def _bar(console: Console) -> Progress:
-    text = TextColumn("{task.description}")
-    return Progress(
-        text, BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), TimeLeft(), console=console
-    )
+    what, steps = TextColumn("{task.description}"), TextColumn("{task.fields[steps]:,} steps")
+    columns = (what, BarColumn(20), TaskProgressColumn(), steps, TimeElapsedColumn(), TimeLeft())
+    return Progress(*columns, console=console)

@@ -13,8 +13,10 @@ from abcd_ns.tools.stability.lab import STILL, Lab, Stage, make_stage, merged
 from abcd_ns.tools.stability.outcome import Finding, Scenario
 from abcd_ns.tools.stability.world import TABLE, Ball, World, camera, ring
 
-CLUSTERS = {1: (-20.0, 0), 2: (-30.0, 1), 3: (-40.0, 2)}
-"""By block, how deep under the table a ball lies, and how many cameras stand there."""
+CLUSTERS = ((-20.0, 0), (-30.0, 1), (-40.0, 2))
+"""How deep under the table balls lie, and how many cameras stand there."""
+VISIT = 3
+"""Steps of a visit: each of the views is used once, so that nobody can tell that its pictures got worse."""
 
 
 def equal(a: Gaussians, b: Gaussians) -> bool:
@@ -30,10 +32,10 @@ def nobody_left(lab: Lab) -> Finding:
     tree = build_kd(stage.start().means, 3)
     tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]]))), 2, 8.0)
     coordinator = lab.coordinator(
-        stage.start(), stage.views, budget=600, tree=tree, warmup=0.0, visit_steps=4, batch=4
+        stage.start(), stage.views, budget=600, tree=tree, warmup=0.0, visit_steps=VISIT, batch=4
     )
     empty = int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]])))
-    lab.finish(coordinator, stage, steps=4)
+    lab.finish(coordinator, stage, steps=VISIT)
     kept, emptied = _prune_a_visit(coordinator, stage)
     passed = kept and coordinator.scene.count(emptied) == 0 and coordinator.scene.count(empty) == 0
     lab.finish(coordinator, stage)
@@ -59,9 +61,9 @@ def _prune_a_visit(coordinator: Coordinator, stage: Stage) -> tuple[bool, int]:
 
 def few_cameras() -> tuple[Stage, BlockTree]:
     """A table that 12 cameras see, and deep below it balls that 0, 1 and 2 cameras see, each a block."""
-    balls = [Ball((0.0, 0.0, depth), 0.2) for depth, _ in CLUSTERS.values()]
+    balls = [Ball((0.0, 0.0, depth), 0.2) for depth, _ in CLUSTERS]
     world, views = World((*TABLE.surfaces[:-1], *balls)), ring(12)
-    for depth, count in CLUSTERS.values():
+    for depth, count in CLUSTERS:
         for k in range(count):
             views.append(camera((0.9 * (1 - 2 * k), -0.5, depth), (0.0, 0.0, depth), len(views)))
     stage = make_stage(world, views, points=390)
@@ -87,7 +89,7 @@ def observed(lab: Lab) -> Finding:
     """A9: train, and ask each block how it stands."""
     stage, tree = few_cameras()
     start = stage.start()
-    at = {count: int(tree.assign(torch.tensor([[0.0, 0.0, depth]]))) for depth, count in CLUSTERS.values()}
+    at = {count: int(tree.assign(torch.tensor([[0.0, 0.0, depth]]))) for depth, count in CLUSTERS}
     unseen = start[tree.assign(start.means) == at[0]]
     options = {"budget": lab.views_drawn(900), "tree": tree, "warmup": 0.0}
     coordinator = lab.coordinator(start, stage.views, **options)

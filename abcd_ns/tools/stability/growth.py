@@ -15,7 +15,7 @@ from abcd_ns.tools.stability.world import ring
 
 CAP = 300
 CAMERAS = (1, 2, 3, 10, 100, 1000, 2900, 15_000)
-RESET_EVERY = 90
+RESET_EVERY = 150
 """A block's own views between resets: in the midst of visits and at their ends."""
 ALLOWED_RISE = 0.02
 """Of the mean absolute error over all training photos, by one visit."""
@@ -48,7 +48,7 @@ def resets(lab: Lab) -> Finding:
     stage, said, numbers = make_stage(views=ring(12), points=400), {}, {}
     density = DensityConfig(reset_every=RESET_EVERY, refine_start=0.0, refine_stop=1.0)
     for name, heal in (("abcd", True), ("abcd, not healing", False)):
-        options = {"budget": lab.views_drawn(1200), "blocks": 3, "warmup": 0.0, "density": density}
+        options = {"budget": lab.views_drawn(900), "blocks": 3, "warmup": 0.0, "density": density}
         coordinator = lab.coordinator(stage.start(), stage.views, heal=heal, **options)
         errors, undone = [lab.error(coordinator, stage)], []
 
@@ -79,7 +79,7 @@ def refinements(cameras: int, sweep: int, config: DensityConfig, *, batch: int =
 def splatfacto_refines(cameras: int, steps: int = 15_000) -> int:
     """nerfstudio 1.1.5: not before `cameras` + 100 steps after a reset, and resets are 3,000 steps apart."""
     every, reset = 100, 3000
-    return sum(step % every == 0 and step % reset > cameras + every for step in range(500, steps))
+    return sum(step % every == 0 and step % reset >= cameras + every for step in range(500, steps))
 
 
 def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no training

@@ -7,6 +7,7 @@ import torch
 
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.types import View
+from abcd_ns.errors import UserError
 from abcd_ns.tools.stability.captures import GAINS, SHIFT, TURN_DEGREES, with_gains, with_noisy_poses
 from abcd_ns.tools.stability.lab import METHODS, Lab, Stage
 from abcd_ns.tools.stability.outcome import Finding, Scenario, against_one_block, db
@@ -23,10 +24,11 @@ MOST_POINTS = 6000
 
 
 def read_stage(data: Path, downscale: int) -> Stage:
-    """A capture as `ns-train abcd --data` reads it; every 8th view held out. All photos are kept in RAM.
+    """A capture as `ns-train abcd --data` reads it; every 8th view held out. All photos are kept in RAM;
+    masks and alpha channels are left aside.
 
     Raises:
-        InputError: it cannot be used; the message says why.
+        UserError: it cannot be used; the message says why.
     """
     # Here and not above: loads nerfstudio.
     from abcd_ns.plugin.data.photos import Photos
@@ -41,7 +43,9 @@ def read_stage(data: Path, downscale: int) -> Stage:
         pictures = [photos.image(row)[..., :3].float() / 255 for row in range(len(photos))]
         splits[split] = views_of(outputs.cameras), pictures, outputs.metadata
     views, pictures, metadata = splits["train"]
-    points = metadata.get("points3D_xyz", torch.zeros(0, 3))
+    if "points3D_xyz" not in metadata:
+        raise UserError(f"{data} has no points to begin with; the scenarios need some.")
+    points = metadata["points3D_xyz"]
     near = near_plane(points, views)
     chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
     held_out, truth, _ = splits["test"]

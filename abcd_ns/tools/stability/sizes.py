@@ -96,7 +96,7 @@ def transparent(lab: Lab) -> Finding:
     """A8: what an export holds that nobody can see; and cells that begin empty."""
     stage, numbers, said = make_stage(views=ring(12), points=500), {}, {}
     start = stage.start()
-    faint = replace(start, opacities=start.opacities - 2.5 * (torch.arange(len(start)) % 3 == 0)[:, None])
+    faint = replace(start, opacities=start.opacities - 4.0 * (torch.arange(len(start)) % 3 == 0)[:, None])
     tree = build_kd(start.means, BLOCKS)
     for k in range(EMPTY_CELLS):
         tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, 50.0 + k]]))), 2, 50.5 + k)
@@ -128,8 +128,7 @@ def far_away(lab: Lab) -> Finding:
     outlier = lab.train(
         replace(stage, points=where, colors=torch.cat([stage.colors, stage.colors[:1]])), **options
     )
-    scene = outlier.coordinator.scene
-    largest = max(map(scene.count, range(scene.tree.num_blocks)))
+    largest = int(outlier.coordinator.scene.tree.assign(where.float()).bincount().max())
     numbers |= {"lost to outlier": plain.psnr - outlier.psnr, "largest block": largest}
     moved = [lab.train(surveyed(stage, offset), **options).psnr for offset in OFFSETS]
     numbers |= {f"offset {offset:g}": score for offset, score in zip(OFFSETS, moved, strict=True)}
