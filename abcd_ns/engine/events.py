@@ -62,7 +62,17 @@ class SweepEnded:
     step: int
 
 
-Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded
+@dataclass(frozen=True)
+class HeldOutScored:
+    """Whoever runs the training has looked at views that are not trained on; means over them."""
+
+    psnr: float
+    """dB."""
+    ssim: float | None
+    """None where pictures are smaller than SSIM's window."""
+
+
+Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded | HeldOutScored
 Listener = Callable[[Event], None]
 
 

@@ -37,6 +37,11 @@ COMMANDS = (
     ),
     Command("synth", "abcd_ns.tools.synth.command:synth", "render a synthetic scene to train on"),
     Command(
+        "report",
+        "abcd_ns.tools.report.command:report",
+        "show all about a training run on one HTML page",
+    ),
+    Command(
         "compare",
         "abcd_ns.tools.compare.command:compare",
         "train ABCD and its peers on one scene and compare",
