@@ -193,7 +193,7 @@ def test_changed_settings_and_the_command_that_sets_them():
     settings = made_up_settings(options={**options, **changed}, data="my data; rm -rf")
     found = {option.name: (option.value, option.default) for option in changed_options(settings)}
     assert found == {"pipeline.blocks": ("4", "8"), "pipeline.max_seconds": ("60.0", "None")}
-    assert shlex.split(training_command(settings)) == [
+    assert shlex.split(training_command(settings).replace("\\\n", "")) == [
         "ns-train", "abcd", "--data", "my data; rm -rf",
         "--pipeline.blocks", "4", "--pipeline.max-seconds", "60.0",
     ]  # fmt: skip
@@ -243,3 +243,6 @@ def test_a_sparkline_rises_where_values_do():
     assert last < first
     assert sparkline([]) == ""
     assert "nan" not in sparkline([20.0])
+    (noise,) = re.findall(r'points="([^"]+)"', sparkline([20.0, 20.01]))
+    heights = [float(point.split(",")[1]) for point in noise.split()]
+    assert abs(heights[0] - heights[1]) < 1

@@ -7,7 +7,7 @@ from statistics import fmean, median
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
 from abcd_ns.tools.report.story import Story, Visit
 from abcd_ns.tools.runs.style import COLORS, in_style, label_ends, lay_grid
@@ -67,9 +67,9 @@ def draw_visits(story: Story) -> Figure | None:
     for visit in story.visits:
         _draw_visit(axes, visit, story.blocks)
     for line in story.sweeps:
-        axes.axvline(line.seconds, color=QUIET, linewidth=0.6, linestyle=(0, (1, 2)), zorder=0)
+        axes.axvline(line.seconds, color=QUIET, linewidth=0.9, linestyle=(0, (1, 2)), zorder=0)
     axes.set_ylim(story.blocks + 0.6, 0.4)
-    axes.yaxis.set_major_locator(MaxNLocator(min(story.blocks, 12), integer=True, min_n_ticks=1))
+    axes.yaxis.set_major_locator(MultipleLocator(max(1, -(-story.blocks // MANY_BLOCKS))))
     axes.set_ylabel("block")
     axes.grid(visible=False)
     for place, (color, text) in enumerate([(STEPS, "steps"), (LAYERS, "layers")]):
@@ -125,7 +125,7 @@ def draw_budgets(story: Story) -> Figure | None:
     def write(name: str, share: float) -> str:
         return f"{name}\n{share:.0f}% of {budgets[name] / GIB:.1f} GiB"
 
-    return _draw_series(story, series, colors, "of its budget (%)", write)
+    return _draw_series(story, series, colors, "of its budget (%)", write, high=100)
 
 
 @in_style
@@ -142,8 +142,9 @@ def draw_block_quality(story: Story) -> Figure | None:
     axes.set_ylabel("PSNR on training crops (dB)")
     axes.margins(y=0.08)
     if few:
-        ends = {str(block + 1): points[-1] for block, points in known.items()}
-        _label(axes, story, ends, dict.fromkeys(ends, STEPS), lambda name, psnr: f"{name}:  {psnr:.1f}")
+        for block, points in known.items():
+            beside = {"xytext": (5, 0), "textcoords": "offset points", "va": "center"}
+            axes.annotate(str(block + 1), points[-1], color=STEPS, annotation_clip=False, **beside)
     else:
         _label_median(axes, story, list(known.values()))
     return figure
@@ -199,13 +200,15 @@ def _draw_series(
     colors: dict[str, str],
     what: str,
     write: Callable[[str, float], str],
+    high: float = 1e-3,
 ) -> Figure | None:
+    """A line for each series, from 0 up to `high` at least."""
     known = {name: points for name, points in series.items() if points}
     if not known:
         return None
     figure, axes = _axes(story)
     ends = {name: _line(axes, points, colors[name]) for name, points in known.items()}
-    axes.set_ylim(0, max(1.1 * max(y for points in known.values() for _, y in points), 1e-3))
+    axes.set_ylim(0, max(1.1 * max(y for points in known.values() for _, y in points), high))
     axes.set_ylabel(what)
     _label(axes, story, ends, colors, write)
     return figure
@@ -218,7 +221,8 @@ def _label(
     colors: dict[str, str],
     write: Callable[[str, float], str],
 ) -> None:
-    gap = 0.17 if "\n" in write("", 0.0) else 0.075
+    two_lines = any("\n" in write(name, y) for name, (_, y) in ends.items())
+    gap = 0.17 if two_lines else 0.075
     label_ends(axes, ends, 1.03 * max(story.seconds, 1e-3), colors, write, gap)
 
 

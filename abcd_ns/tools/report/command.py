@@ -12,7 +12,7 @@ from abcd_ns.plugin.pipeline import AbcdPipeline
 from abcd_ns.tools.report.held_out import HeldOut, look_at_held_out
 from abcd_ns.tools.report.page import GENERATOR, render_page
 from abcd_ns.tools.report.plan import Plan, make_plan
-from abcd_ns.tools.report.run_folder import RunFolder, load_pipeline, open_run
+from abcd_ns.tools.report.run_folder import RunFolder, find_run, load_pipeline, open_run
 from abcd_ns.tools.runs.checks import check_ranges
 
 PAGE_FILE = "report.html"
@@ -39,9 +39,10 @@ def report(
         UserError: `run` is no run with a log, something in it is damaged, or `out` is another file.
     """
     check_ranges({"pictures": pictures})
-    out = (run.parent if run.name == "config.yml" else run) / PAGE_FILE if out is None else out
+    folder = find_run(run)
+    out = folder / PAGE_FILE if out is None else out
     _check_page(out)
-    console, found = Console(), open_run(run)
+    console, found = Console(), open_run(folder)
     pipeline, notes = _load(found)
     held_out = None
     if pipeline is not None:

@@ -23,12 +23,12 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
     """What a run came to, most important first."""
     story, limit = run.story, run.story.trainings[-1].limit
     visits, sweeps = len(story.visits), len(story.sweeps)
-    rounds = f"{visits:,} visits, {sweeps:,} full sweeps" if visits and story.blocks > 1 else ""
+    rounds = f"{_count(visits, 'visit')}, {_count(sweeps, 'full sweep')}" if story.blocks > 1 else ""
     share = story.layer_seconds / story.seconds if story.seconds else 0.0
     return [
         *_quality(story, held_out),
         Fact("Gaussians", f"{story.gaussians:,}", more="" if limit is None else f"limit {limit:,}"),
-        Fact("blocks", f"{story.blocks:,}", more=rounds),
+        Fact("blocks", f"{story.blocks:,}", more=rounds if visits else ""),
         Fact("steps", f"{story.step:,}"),
         Fact(
             "training time",
@@ -73,6 +73,10 @@ def _memory(run: RunFolder) -> list[Fact]:
     if machine.gpu is not None:
         facts.append(Fact("peak GPU memory", f"{device / GIB:.2f}", "GiB", machine.gpu))
     return facts
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}" + ("" if number == 1 else "s")
 
 
 def _clock(seconds: float) -> str:

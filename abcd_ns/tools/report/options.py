@@ -37,7 +37,7 @@ class Changed:
     @property
     def words(self) -> list[str]:
         """As on `ns-train`'s command line."""
-        return [f"--{self.name.replace('_', '-')}", *self.value.split()]
+        return [f"--{self.name.replace('_', '-')}", self.value]
 
 
 def changed_options(settings: Settings) -> list[Changed]:
@@ -54,11 +54,10 @@ def changed_options(settings: Settings) -> list[Changed]:
 
 
 def training_command(settings: Settings) -> str:
-    """The command line that trains the run again."""
-    words = ["ns-train", settings.method, "--data", settings.data]
-    for changed in changed_options(settings):
-        words += changed.words
-    return shlex.join(words)
+    """The command line that trains the run again, an option a line."""
+    words = [["ns-train", settings.method, "--data", settings.data]]
+    words += [changed.words for changed in changed_options(settings)]
+    return " \\\n  ".join(map(shlex.join, words))
 
 
 def as_text(value: Plain) -> str:

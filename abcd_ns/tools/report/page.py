@@ -15,7 +15,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from abcd_ns import __version__
-from abcd_ns.plugin.machine import without_home
+from abcd_ns.plugin.machine import Versions, without_home
 from abcd_ns.tools.compare.pictures import ERROR_COLORS, ERROR_GAIN
 from abcd_ns.tools.report import charts
 from abcd_ns.tools.report.blocks import Block, describe_blocks
@@ -32,6 +32,8 @@ GENERATOR = "abcd report"
 """Begins the page's generator, by which a page of ours is known."""
 HERE = Path(__file__).parent
 SPARK_WIDTH, SPARK_HEIGHT, SPARK_EDGE = 112, 22, 3
+SPARK_DB = 1.0
+"""The height of a sparkline stands for at least so much, that noise may look small."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +81,19 @@ def render_page(run: RunFolder, held_out: HeldOut | None, plan: Plan | None, not
         options=[(name, as_text(value)) for name, value in sorted(settings.options.items())],
         command=without_home(training_command(settings)),
         machine=about_machine(settings.machine),
-        versions=[(name, value or NOTHING) for name, value in vars(settings.versions).items()],
+        versions=_versions(settings.versions),
     )
 
 
 def _csp_hash(script: str) -> str:
     """As a Content-Security-Policy names the one script that may run."""
     return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _versions(versions: Versions) -> list[tuple[str, str]]:
+    commit, plus, changes = (versions.commit or NOTHING).partition("+")
+    known = {**vars(versions), "commit": commit[:12] + plus + changes}
+    return [(name, value or NOTHING) for name, value in known.items()]
 
 
 def _unfinished(story: Story) -> list[str]:
@@ -176,11 +184,11 @@ def sparkline(values: Sequence[float]) -> Markup:
     """A line through the values, as large as a word; nothing without values."""
     if not values:
         return Markup("")
-    low, high = min(values), max(values)
+    middle, span = (min(values) + max(values)) / 2, max(max(values) - min(values), SPARK_DB)
     across = (SPARK_WIDTH - 2 * SPARK_EDGE) / max(len(values) - 1, 1)
-    along = (SPARK_HEIGHT - 2 * SPARK_EDGE) / max(high - low, 1e-9)
+    along = (SPARK_HEIGHT - 2 * SPARK_EDGE) / span
     places = [
-        (SPARK_EDGE + k * across, SPARK_HEIGHT - SPARK_EDGE - (y - low) * along) for k, y in enumerate(values)
+        (SPARK_EDGE + k * across, SPARK_HEIGHT / 2 - (y - middle) * along) for k, y in enumerate(values)
     ]
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
     return Markup(

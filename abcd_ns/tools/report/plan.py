@@ -18,8 +18,8 @@ from torch import Tensor
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.tools.runs.style import in_style
 
-WIDTH, LOWEST, LARGEST = 4.9, 1.2, 5.0
-"""Inches: of the drawing, and its height at least and at most."""
+WIDTH, EDGE, FOOT, LOWEST, LARGEST = 4.9, 0.5, 1.0, 1.2, 5.0
+"""Inches: width of the figure, its scales beside and below, the drawing's height at least and at most."""
 SHOWN = (0.03, 0.97)
 """Quantiles of the Gaussians between which the drawing reaches, and beyond where cameras are."""
 MARGIN = 0.06
@@ -84,8 +84,8 @@ def draw_plan(plan: Plan, across: int = 0, along: int = 1) -> Figure | None:
         return None
     low, high = _bounds(plan, [across, along])
     extent = high - low
-    height = min(max(WIDTH * extent[1] / extent[0], LOWEST), LARGEST)
-    figure = Figure(figsize=(WIDTH, height + 0.9), layout="constrained")
+    height = min(max((WIDTH - EDGE) * extent[1] / extent[0], LOWEST), LARGEST)
+    figure = Figure(figsize=(WIDTH, height + FOOT), layout="constrained")
     axes = figure.add_subplot()
     axes.set_aspect("equal")
     axes.set_xlim(low[0], high[0])

@@ -59,15 +59,24 @@ class RunFolder:
     """Where the planner stood at the checkpoint, or else when the run was last heard of."""
 
 
-def open_run(path: Path) -> RunFolder:
-    """Read a run's settings, log, newest checkpoint and state.
+def find_run(path: Path) -> Path:
+    """The folder of a run that is named by it or by its config.yml.
 
     Raises:
-        UserError: it is no run's folder, or something in it is damaged or of another version.
+        UserError: it is none; the message says what to give.
     """
     path = path.parent if path.name == "config.yml" else path
     if not (path / "abcd" / SETTINGS_FILE).exists():
         raise UserError(f"{path} is no run with a log: {_hint(path)}")
+    return path
+
+
+def open_run(path: Path) -> RunFolder:
+    """Read a run's settings, log, newest checkpoint and state.
+
+    Raises:
+        UserError: something in the folder is missing, damaged or of another version.
+    """
     settings = read_record(path / "abcd" / SETTINGS_FILE, Settings, SCHEMA)
     story = read_story(path / "abcd" / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)

@@ -115,11 +115,13 @@ def label_ends(
     """
     low, high = axes.get_ylim()
     heights = spread([y for _, y in ends.values()], gap * (high - low))
+    # Below the axis they would run into its numbers.
+    lift = max(low + gap * (high - low) / 2 - min(heights), 0)
     for (name, (x, y)), height in zip(ends.items(), heights, strict=True):
         axes.annotate(
             write(name, y),
             xy=(x, y),
-            xytext=(right, height),
+            xytext=(right, height + lift),
             color=colors[name],
             va="center",
             annotation_clip=False,
