@@ -100,7 +100,27 @@ class VisitUndone:
     """The same when they were last used."""
 
 
-Event = VisitBegan | LayersDrawn | StepTaken | VisitEnded | SweepEnded | BlockSplit | Mended | VisitUndone
+@dataclass(frozen=True)
+class HeldOutScored:
+    """Whoever runs the training has looked at views that are not trained on; means over them."""
+
+    psnr: float
+    """dB."""
+    ssim: float | None
+    """None where pictures are smaller than SSIM's window."""
+
+
+Event = (
+    VisitBegan
+    | LayersDrawn
+    | StepTaken
+    | VisitEnded
+    | SweepEnded
+    | BlockSplit
+    | Mended
+    | VisitUndone
+    | HeldOutScored
+)
 Listener = Callable[[Event], None]
 
 

@@ -66,7 +66,7 @@ class StoredScene:
     def __init__(self, tree: BlockTree, store: ParameterStore, ram_bytes: int = 2 << 30) -> None:
         self.tree = tree
         self.store = store
-        self._ram_bytes = ram_bytes
+        self.ram_bytes = ram_bytes
         self._ram: OrderedDict[tuple[int, int], Gaussians] = OrderedDict()
         self._bounds: dict[int, tuple[int, Box | None]] = {}
         self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
@@ -109,9 +109,14 @@ class StoredScene:
             self._ram[key] = Gaussians(**self.store.load_names(block, PARAM_NAMES))
         self._ram.move_to_end(key)
         found = self._ram[key]
-        while len(self._ram) > 1 and sum(map(_nbytes, self._ram.values())) > self._ram_bytes:
+        while len(self._ram) > 1 and self.cached_bytes > self.ram_bytes:
             self._ram.popitem(last=False)
         return found
+
+    @property
+    def cached_bytes(self) -> int:
+        """RAM that blocks take which were read and kept."""
+        return sum(map(_nbytes, self._ram.values()))
 
     def version(self, block: int) -> int:
         return self.store.version(block)

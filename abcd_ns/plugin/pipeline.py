@@ -13,6 +13,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.exact import ExactCoordinator
 from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
 from abcd_ns.engine.initialize import thin_out
@@ -32,6 +33,7 @@ from abcd_ns.plugin.room import EXPECTED_GROWTH, device_budget, find_room
 from abcd_ns.plugin.run_folder import CACHE as CACHE
 from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, open_cache, take_over
 from abcd_ns.plugin.run_folder import STORE as STORE
+from abcd_ns.plugin.run_log import keep_log
 from abcd_ns.plugin.views import views_of
 
 if TYPE_CHECKING:
@@ -69,6 +71,8 @@ class AbcdPipeline(VanillaPipeline):
         self.model.follow(self._coordinator)
         report = ProgressReport(self._coordinator)
         self._coordinator.announce.subscribe(report)
+        log = keep_log(trainer, self._coordinator)
+        self._coordinator.announce.subscribe(log)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
         def end_step(step: int) -> None:  # noqa: ARG001 - the coordinator counts
@@ -76,6 +80,7 @@ class AbcdPipeline(VanillaPipeline):
 
         def end_run(step: int) -> None:  # noqa: ARG001
             report.close()
+            log.close()
 
         return [
             TrainingCallback(after, end_step),
@@ -87,6 +92,23 @@ class AbcdPipeline(VanillaPipeline):
         outputs, losses, metrics = super().get_train_loss_dict(step)
         self._rendered, self._quality = outputs.pop("rendered"), float(metrics["psnr"])
         return outputs, losses, metrics
+
+    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As VanillaPipeline's; while training, it is no training time."""
+        if self._coordinator is not None:
+            self._coordinator.stopwatch.pause()
+        return super().get_eval_image_metrics_and_images(step)
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
+        if self._coordinator is not None:
+            self._coordinator.stopwatch.pause()
+        found = super().get_average_eval_image_metrics(step, output_path, get_std)
+        if self._coordinator is not None:
+            self._coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
+        return found
 
     def _after_step(self, trainer: "AbcdTrainer") -> None:
         if self._coordinator is None:

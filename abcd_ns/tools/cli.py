@@ -38,6 +38,11 @@ COMMANDS = (
     Command("synth", "abcd_ns.tools.synth.command:synth", "render a synthetic scene to train on"),
     Command("plan", "abcd_ns.tools.plan.command:plan", "say what a run will need, before it begins"),
     Command(
+        "report",
+        "abcd_ns.tools.report.command:report",
+        "show all about a training run on one HTML page",
+    ),
+    Command(
         "compare",
         "abcd_ns.tools.compare.command:compare",
         "train ABCD and its peers on one scene and compare",

@@ -88,7 +88,8 @@ def demo(
 ) -> int:
     """Make a small scene, train it block by block, score it and export it. Needs no GPU and no data.
 
-    Runs `abcd synth`, `ns-train abcd`, `ns-eval` and `ns-export gaussian-splat`, as you would.
+    Runs `abcd synth`, `ns-train abcd`, `ns-eval`, `ns-export gaussian-splat` and `abcd report`, as you
+    would.
 
     Args:
         out: Folder for everything that is made; absent, empty, or an earlier demo's.
@@ -116,18 +117,21 @@ def demo(
 
 def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Console) -> None:
     scene = out / "scene"
-    steps.begin("1/4  A scene: two walled courts, seen by 40 cameras")
+    steps.begin("1/5  A scene: two walled courts, seen by 40 cameras")
     flags = [word for name, value in SCENE.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    steps.run("synth", [sys.executable, "-m", "abcd_ns.tools.cli", "synth", str(scene), *flags])
-    steps.begin(f"2/4  Training in {blocks} blocks for {seconds:g} s")
+    steps.run("synth", [*_abcd("synth"), str(scene), *flags])
+    steps.begin(f"2/5  Training in {blocks} blocks for {seconds:g} s")
     trained = _train(steps, out, scene, seconds, blocks)
-    steps.begin("3/4  Held-out views: scores and pictures")
+    steps.begin("3/5  Held-out views: scores and pictures")
     scores = _evaluate(steps, out, trained)
-    steps.begin("4/4  Export for other viewers")
+    steps.begin("4/5  Export for other viewers")
     ply = out / "splat.ply"
     export = [_tool("ns-export"), "gaussian-splat", "--load-config", str(trained.config)]
     steps.run("ns-export", [*export, "--output-dir", str(out), "--output-filename", ply.name])
     pictures = _draw(out)
+    steps.begin("5/5  A report about the run")
+    page = out / "report.html"
+    steps.run("report", [*_abcd("report"), str(trained.config.parent), "--out", str(page)])
     steps.begin("Done")
     facts = {
         "held-out PSNR": f"{scores['psnr']:.2f} dB",
@@ -137,6 +141,7 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
         "time": f"{steps.seconds:.0f} s, training {trained.seconds:.0f} s of it",
         "pictures": "\n".join(map(str, pictures)),
         "Gaussians for viewers": str(ply),
+        "all about the run": str(page),
     }
     _print_facts(facts, console)
     _print_next(trained.config, console)
@@ -211,6 +216,11 @@ def _tool(name: str) -> str:
     return str(path)
 
 
+def _abcd(command: str) -> list[str]:
+    """A command of ours, in the environment of this one."""
+    return [sys.executable, "-m", "abcd_ns.tools.cli", command]
+
+
 def _print_facts(facts: dict[str, str], console: Console) -> None:
     table = Table.grid(padding=(0, 2))
     for name, value in facts.items():
@@ -221,6 +231,7 @@ def _print_facts(facts: dict[str, str], console: Console) -> None:
 def _print_next(config: Path, console: Console) -> None:
     commands = {
         f"ns-viewer --load-config {config}": "look around in it",
+        f"abcd report {config.parent}": "a page about any run, such as this one's report.html",
         f"abcd compare --data {config.parents[4] / 'scene'} --seconds 60 --blocks 4 --out comparison": (
             "hold it against training in one piece"
         ),

@@ -1,8 +1,8 @@
 """Made-up runs for tests of what `abcd compare` writes. No number here was ever measured."""
 
+from abcd_ns.plugin.machine import Machine, Versions
 from abcd_ns.tools.compare.results import SCHEMA, LeftOut, Protocol, Results
 from abcd_ns.tools.runs.job import METHODS
-from abcd_ns.tools.runs.machine import Machine, Versions
 from abcd_ns.tools.runs.run import CurvePoint, Failure, Run, ViewScore
 
 MACHINE = Machine(cpu="Made-up CPU", cores=2, torch_threads=2, ram_bytes=8 << 30, gpu=None, os="Linux x86_64")

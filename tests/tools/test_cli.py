@@ -11,6 +11,8 @@ from abcd_ns import __version__
 from abcd_ns.errors import UserError
 from abcd_ns.tools import cli
 
+THERE_ARE = f"there are: {', '.join(command.name for command in cli.COMMANDS)}."
+
 
 class _NoSuchScene(UserError):
     pass
@@ -102,8 +104,8 @@ def test_wrong_arguments_exit_with_2(greet, capsys):
     ("name", "hint"),
     [
         ("snyth", "did you mean 'abcd synth'?"),
-        ("xyz", "there are: demo, synth, compare, study."),
-        ("--verbose", "there are: demo, synth, compare, study."),
+        ("xyz", THERE_ARE),
+        ("--verbose", THERE_ARE),
     ],
 )
 def test_an_unknown_command_is_one_line_with_a_hint(name, hint, capsys):

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from abcd_ns.plugin.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.tools.compare.protocol import Options
 from abcd_ns.tools.compare.results import SCHEMA, read_results, write_results
 from abcd_ns.tools.runs.evaluate import mean, ordering_gap
-from abcd_ns.tools.runs.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.tools.runs.records import RecordError, decode, encode
 from abcd_ns.tools.runs.run import CurvePoint, Run
 from tests.tools.compare_records import made_up_results, made_up_run

@@ -47,6 +47,9 @@ elif name == "ns-eval":
 elif name == "ns-export":
     header = b"ply\\nformat binary_little_endian 1.0\\nelement vertex 1234\\nproperty float x\\nend_header\\n"
     (given("--output-dir") / given("--output-filename")).write_bytes(header)
+elif name == "abcd-report":
+    assert (pathlib.Path(words[0]) / "config.yml").is_file()
+    given("--out").write_text("a page")
 """
 
 
@@ -56,7 +59,7 @@ class StandIns:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir()
-        for name in ("ns-train", "ns-eval", "ns-export"):
+        for name in ("ns-train", "ns-eval", "ns-export", "abcd-report"):
             path = folder / name
             path.write_text(STAND_IN.format(python=sys.executable))
             path.chmod(path.stat().st_mode | stat.S_IXUSR)
@@ -70,19 +73,23 @@ class StandIns:
 def commands(tmp_path, monkeypatch) -> StandIns:
     stand_ins = StandIns(tmp_path / "bin")
     monkeypatch.setattr(demo_module, "_tool", lambda name: str(stand_ins.folder / name))
+    real = demo_module._abcd
+    stand_in = {"report": [str(stand_ins.folder / "abcd-report")]}
+    monkeypatch.setattr(demo_module, "_abcd", lambda command: stand_in.get(command) or real(command))
     small = {"courts": 1, "views_per_court": 2, "width": 32, "height": 24, "points_per_court": 50}
     monkeypatch.setattr(demo_module, "SCENE", small)
     monkeypatch.setenv("COLUMNS", "200")
     return stand_ins
 
 
-def test_demo_runs_the_four_steps_and_says_what_came_of_them(commands, tmp_path, capfd):
+def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capfd):
     out = tmp_path / "demo"
 
     assert demo(out=out, seconds=5.0, blocks=3) == 0
 
     assert (out / "scene" / "sparse" / "0").is_dir()
-    assert [name for name, *_ in commands.calls()] == ["ns-train", "ns-eval", "ns-export"]
+    assert [name for name, *_ in commands.calls()] == ["ns-train", "ns-eval", "ns-export", "abcd-report"]
+    assert (out / "report.html").read_text() == "a page"
     train = commands.calls()[0]
     assert train[1:4] == ["abcd", "--data", str((out / "scene").resolve())]
     for flag, value in (
@@ -94,7 +101,8 @@ def test_demo_runs_the_four_steps_and_says_what_came_of_them(commands, tmp_path,
         assert train[train.index(flag) + 1] == value
     assert commands.calls()[2][1] == "gaussian-splat"
     printed = capfd.readouterr().out
-    for part in ("21.50 dB", "0.750", "1,234", "GiB", str(out / "splat.ply"), "ns-viewer --load-config"):
+    files = (str(out / "splat.ply"), str(out / "report.html"))
+    for part in ("21.50 dB", "0.750", "1,234", "GiB", *files, "ns-viewer --load-config"):
         assert part in printed
     assert "output of ns-train" in printed
     assert "output of ns-eval" not in printed
@@ -117,7 +125,12 @@ def test_pictures_are_photo_picture_and_error_of_views_far_apart(tmp_path, capfd
 
 @pytest.mark.parametrize(
     ("broken", "where"),
-    [("ns-train", "its output above"), ("ns-eval", "ns-eval.log"), ("ns-export", "ns-export.log")],
+    [
+        ("ns-train", "its output above"),
+        ("ns-eval", "ns-eval.log"),
+        ("ns-export", "ns-export.log"),
+        ("abcd-report", "report.log"),
+    ],
 )
 def test_a_failing_command_ends_the_demo_in_one_line(commands, tmp_path, monkeypatch, capfd, broken, where):
     monkeypatch.setenv("BROKEN", broken)
@@ -125,7 +138,7 @@ def test_a_failing_command_ends_the_demo_in_one_line(commands, tmp_path, monkeyp
     assert demo(out=tmp_path / "demo", seconds=1.0) == 1
 
     last = capfd.readouterr().out.strip().splitlines()[-1]
-    assert last.startswith(f"error: {broken} failed with exit code 3; see ")
+    assert last.startswith(f"error: {broken.removeprefix('abcd-')} failed with exit code 3; see ")
     assert where in last
     assert commands.calls()[-1][0] == broken
 

@@ -5,7 +5,7 @@ import torch
 
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
-from abcd_ns.tools.runs.machine import describe_machine, describe_versions
+from abcd_ns.plugin.machine import describe_machine, describe_versions
 from abcd_ns.tools.runs.records import decode, encode, read_json
 from abcd_ns.tools.scale.arm import Arm, ArmJob, run
 from abcd_ns.tools.scale.chart import draw

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from abcd_ns.errors import UserError
+from abcd_ns.plugin.machine import describe_machine, describe_versions
 from abcd_ns.tools import cli
-from abcd_ns.tools.runs.machine import describe_machine, describe_versions
 from abcd_ns.tools.stability.catalogue import SCENARIOS
 from abcd_ns.tools.stability.charts import draw_curves
 from abcd_ns.tools.stability.command import choose, claim

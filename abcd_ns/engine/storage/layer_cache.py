@@ -86,6 +86,7 @@ class LayerCache:
             OSError: the folder cannot be made or written to.
         """
         self.bits = bits
+        self.map_size = map_size
         self.hits = 0
         self.misses = 0
         self.corrupt = 0

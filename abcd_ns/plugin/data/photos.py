@@ -67,6 +67,11 @@ class Photos:
         return len(self.sources)
 
     @property
+    def budget_bytes(self) -> int:
+        """How much decoded pixels may stay in memory."""
+        return self._cache.budget
+
+    @property
     def cached_bytes(self) -> int:
         """Bytes of decoded pixels that are kept now; at most the budget."""
         return self._cache.used

@@ -8,13 +8,13 @@ import torch
 import tyro
 from rich.console import Console
 
+from abcd_ns.plugin.machine import describe_machine, describe_versions
 from abcd_ns.tools.compare.charts import draw_size_accuracy, draw_speed_accuracy
 from abcd_ns.tools.compare.pictures import draw_pictures
 from abcd_ns.tools.compare.protocol import Options, Plan, make_plan, read_options
 from abcd_ns.tools.compare.results import SCHEMA, LeftOut, Protocol, Results, write_results
 from abcd_ns.tools.compare.tables import print_table, write_table
 from abcd_ns.tools.runs.job import HELD_OUT_EVERY, Job, Method
-from abcd_ns.tools.runs.machine import describe_machine, describe_versions
 from abcd_ns.tools.runs.run import Failure, Run
 from abcd_ns.tools.runs.runner import claim, run_jobs
 

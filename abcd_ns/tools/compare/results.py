@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from abcd_ns.tools.runs.machine import Machine, Versions
+from abcd_ns.plugin.machine import Machine, Versions
 from abcd_ns.tools.runs.records import encode, read_record, write_json
 from abcd_ns.tools.runs.run import Failure, Run
 

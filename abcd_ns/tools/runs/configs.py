@@ -72,6 +72,11 @@ def check_options(job: Job) -> None:
         raise UserError(f"{job.variant.name}: blocks must be 1 or more, not {pipeline.blocks}.")
 
 
+def registered(method: str) -> AbcdTrainerConfig | None:
+    """The configuration that `ns-train` knows a method of ABCD's by, not a copy; None for any other."""
+    return _REGISTERED[method].config if method in _REGISTERED else None
+
+
 def default_options(method: str) -> AbcdPipelineConfig:
     """The method's pipeline as it is registered; not a copy."""
     return _REGISTERED[method].config.pipeline

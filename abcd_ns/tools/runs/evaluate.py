@@ -1,7 +1,7 @@
 """Held-out views, drawn and scored without leaving a trace in the training that goes on around it."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -73,12 +73,13 @@ def mean_psnr(pipeline: VanillaPipeline) -> float:
     return sum(scores) / len(scores)
 
 
-def draw_held_out(pipeline: VanillaPipeline) -> Iterator[Drawn]:
-    """Every held-out view, drawn both ways."""
+def draw_held_out(pipeline: VanillaPipeline, rows: Collection[int] | None = None) -> Iterator[Drawn]:
+    """Every held-out view, or those at `rows`, drawn both ways, in the order of the rows."""
     merged, composited = merged_drawer(pipeline.model), composited_drawer(pipeline.model)
     with undisturbed(pipeline):
         for view in held_out_views(pipeline):
-            yield Drawn(view, merged(view.camera), composited(view.camera))
+            if rows is None or view.row in rows:
+                yield Drawn(view, merged(view.camera), composited(view.camera))
 
 
 def score(drawn: Drawn) -> ViewScore:

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, Union
 
@@ -57,12 +57,28 @@ def change_options(pipeline: Any, variant: Variant) -> None:
         UserError: a name or value does not fit.
     """
     for change in variant.changes:
-        value = read_value(change, pipeline)
-        *way, last = change.path.split(".")
-        place = pipeline
-        for step in way:
-            place = getattr(place, step)
-        setattr(place, last, value)
+        _set(pipeline, change.path, read_value(change, pipeline))
+
+
+def set_options(config: Any, values: Mapping[str, bool | int | float | str | None], where: str) -> None:
+    """Set options to what a file says of them, in place. What is not one word keeps its default.
+
+    Args:
+        where: the file; begins every message.
+
+    Raises:
+        UserError: there is no such option, or the value is not of its type.
+    """
+    known = option_names(config)
+    for path, value in values.items():
+        if path not in known and not _leads_somewhere(config, path):
+            raise UserError(f"{where}: there is no option {path!r} in this version of abcd_ns.")
+        if path not in known:
+            continue
+        found = _read(known[path], str(value))
+        if found is _NOT_OF_TYPE:
+            raise UserError(f"{where}: {path} is {value!r}; it must be {_words(known[path])}.")
+        _set(config, path, found)
 
 
 def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -100,6 +116,22 @@ def read_value(change: Change, pipeline: Any) -> Any:
 
 
 _NOT_OF_TYPE = object()
+
+
+def _set(config: Any, path: str, value: Any) -> None:
+    way, _, last = path.rpartition(".")
+    setattr(value_of(config, way) if way else config, last, value)
+
+
+def _leads_somewhere(config: Any, path: str) -> bool:
+    """Whether the path is that of a value that is not one word, or of a part of one."""
+    for step in path.split("."):
+        if not dataclasses.is_dataclass(config):
+            return True
+        if not hasattr(config, step):
+            return False
+        config = getattr(config, step)
+    return True
 
 
 def _options(config: Any, prefix: str) -> Iterator[tuple[str, Any]]:

@@ -11,6 +11,7 @@ import math
 import types
 import typing
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -111,8 +112,11 @@ def _value(hint: Any, value: Any, where: str) -> Any:
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in args:
             return None
-        (hint,) = (arg for arg in args if arg is not type(None))
-        return _value(hint, value, where)
+        *others, last = (arg for arg in args if arg is not type(None))
+        for hint in others:
+            with suppress(RecordError):
+                return _value(hint, value, where)
+        return _value(last, value, where)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
             raise RecordError(f"{where} must be a list, not {value!r}.")

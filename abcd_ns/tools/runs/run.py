@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from abcd_ns.tools.runs.machine import Versions
+from abcd_ns.plugin.machine import Versions
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from pathlib import Path
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.plugin.machine import Machine
 from abcd_ns.tools.runs.job import Job, Plan, Settings
-from abcd_ns.tools.runs.machine import Machine
 from abcd_ns.tools.runs.records import RecordError, decode, encode, read_json, write_json
 from abcd_ns.tools.runs.run import Failure, Run
 

@@ -1,11 +1,16 @@
 """How charts look: colours, marks and type, the same in all of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+P, R = ParamSpec("P"), TypeVar("R")
 
 COLORS = {
     "abcd-monolithic": "#D55E00",
@@ -69,32 +74,60 @@ def save(figure: Figure, out: Path, name: str) -> list[Path]:
     return paths
 
 
+def in_style(draw: Callable[P, R]) -> Callable[P, R]:
+    """A function that draws in the style of all charts."""
+
+    @wraps(draw)
+    def styled(*args: P.args, **kwargs: P.kwargs) -> R:
+        with matplotlib.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return styled
+
+
 def lay_grid(axes: Axes) -> None:
     """Pale lines behind everything."""
     axes.grid(color="#d9d9d9", linewidth=0.5)
     axes.set_axisbelow(True)
 
 
-def label_ends(axes: Axes, ends: dict[str, tuple[float, float]], right: float) -> None:
-    """Each method's name and last value beside the end of its curve, in its colour.
+def name_and_score(name: str, psnr: float) -> str:
+    """What stands at the end of a curve of PSNR."""
+    return f"{name}  {psnr:.2f}"
+
+
+def label_ends(
+    axes: Axes,
+    ends: dict[str, tuple[float, float]],
+    right: float,
+    colors: Mapping[str, str] = COLORS,
+    write: Callable[[str, float], str] = name_and_score,
+    gap: float = LABEL_GAP,
+) -> None:
+    """Each curve's name and last value beside its end, in its colour.
 
     Args:
-        ends: (x, PSNR) by method.
+        ends: (x, y) by name; on charts of PSNR the method's.
         right: where the labels begin, on the axis of x.
+        colors: by name.
+        write: the label, from name and y.
+        gap: least distance of two labels, as a share of the axis' height.
     """
     low, high = axes.get_ylim()
-    heights = spread([psnr for _, psnr in ends.values()], LABEL_GAP * (high - low))
-    for (method, (x, psnr)), height in zip(ends.items(), heights, strict=True):
+    heights = spread([y for _, y in ends.values()], gap * (high - low))
+    # Below the axis they would run into its numbers.
+    lift = max(low + gap * (high - low) / 2 - min(heights), 0)
+    for (name, (x, y)), height in zip(ends.items(), heights, strict=True):
         axes.annotate(
-            f"{method}  {psnr:.2f}",
-            xy=(x, psnr),
-            xytext=(right, height),
-            color=COLORS[method],
+            write(name, y),
+            xy=(x, y),
+            xytext=(right, height + lift),
+            color=colors[name],
             va="center",
             annotation_clip=False,
             arrowprops={
                 "arrowstyle": "-",
-                "color": COLORS[method],
+                "color": colors[name],
                 "linewidth": 0.5,
                 "shrinkB": 3,
                 "relpos": (0, 0.5),

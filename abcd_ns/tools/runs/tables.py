@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from abcd_ns.tools.runs.machine import Machine
+from abcd_ns.plugin.machine import Machine
 from abcd_ns.tools.runs.run import Run
 
 NOTHING = "-"

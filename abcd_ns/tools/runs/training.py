@@ -6,7 +6,7 @@ from collections.abc import Callable
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 
-from abcd_ns.engine.events import Event, StepTaken, VisitEnded
+from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitEnded
 from abcd_ns.engine.run_state import Budget, Stopwatch
 from abcd_ns.tools.runs.evaluate import mean_psnr
 from abcd_ns.tools.runs.job import Settings
@@ -74,7 +74,7 @@ class Training:
             self.stopwatch,
             lambda: coordinator.progress,
             lambda: coordinator.state.step,
-            lambda: mean_psnr(self.pipeline),
+            self._score_aloud,
             lambda: self.gaussians,
         )
 
@@ -85,6 +85,11 @@ class Training:
                 self.layer_seconds += event.layer_seconds
 
         coordinator.announce.subscribe(listen)
+
+    def _score_aloud(self) -> float:
+        found = mean_psnr(self.pipeline)
+        self.coordinator.announce(HeldOutScored(found, None))
+        return found
 
     def _follow_steps(self, settings: Settings) -> None:
         """For a trainer that is not ABCD's: count the time here, and stop when it is up."""

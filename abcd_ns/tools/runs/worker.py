@@ -17,6 +17,7 @@ from torch import Tensor
 
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.config import AbcdTrainerConfig
+from abcd_ns.plugin.machine import describe_versions, disk_bytes, peak_rss_bytes, without_home
 from abcd_ns.plugin.metrics import lpips_missing
 from abcd_ns.plugin.pipeline import CACHE, STORE
 from abcd_ns.tools.runs.configs import trainer_config
@@ -28,7 +29,6 @@ from abcd_ns.tools.runs.evaluate import (
     squared_gap,
 )
 from abcd_ns.tools.runs.job import Job, evenly
-from abcd_ns.tools.runs.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
 from abcd_ns.tools.runs.run import CurvePoint, Run, ViewScore
 from abcd_ns.tools.runs.training import Training
@@ -122,7 +122,7 @@ def _record(
         train_seconds=end.seconds,
         total_seconds=total,
         **means,
-        lpips_reason=_without_home(lpips_missing()),
+        lpips_reason=without_home(lpips_missing() or "") or None,
         ordering_gap_db=gap,
         ordering_gap_note=note,
         gaussians=training.gaussians,
@@ -134,11 +134,6 @@ def _record(
         views=tuple(scores),
         versions=describe_versions(),
     )
-
-
-def _without_home(text: str | None) -> str | None:
-    """Results are published: whose home folder it was is nobody's business."""
-    return text and text.replace(str(Path.home()), "~")
 
 
 def main(args: list[str] | None = None) -> int:

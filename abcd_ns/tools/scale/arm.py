@@ -21,7 +21,7 @@ from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.tools.runs.machine import disk_bytes, peak_rss_bytes
+from abcd_ns.plugin.machine import disk_bytes, peak_rss_bytes
 from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
 from abcd_ns.tools.scale.land import Land
 

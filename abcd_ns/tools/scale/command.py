@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.runs.machine import describe_machine, describe_versions
+from abcd_ns.plugin.machine import describe_machine, describe_versions
 from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
 from abcd_ns.tools.scale.arm import RESULT_FILE, Arm, ArmJob
 from abcd_ns.tools.scale.chart import draw

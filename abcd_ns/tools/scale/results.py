@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from abcd_ns.tools.runs.machine import Machine, Versions
+from abcd_ns.plugin.machine import Machine, Versions
 from abcd_ns.tools.runs.tables import GIB, MIB, NOTHING, about_machine, markdown, print_rows
 from abcd_ns.tools.scale.arm import Arm
 

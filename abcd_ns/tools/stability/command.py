@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.progress import TimeRemainingColumn as TimeLeft
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.runs.machine import describe_machine, describe_versions
+from abcd_ns.plugin.machine import describe_machine, describe_versions
 from abcd_ns.tools.stability.catalogue import SCENARIOS
 from abcd_ns.tools.stability.curves import Curve, Study, studies
 from abcd_ns.tools.stability.lab import Lab

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from abcd_ns.tools.runs.machine import Machine, Versions
+from abcd_ns.plugin.machine import Machine, Versions
 from abcd_ns.tools.runs.records import encode, read_record, write_json
 from abcd_ns.tools.runs.tables import about_machine
 from abcd_ns.tools.stability.charts import draw_curves

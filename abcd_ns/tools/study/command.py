@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from abcd_ns.plugin.machine import Machine, describe_machine, describe_versions
 from abcd_ns.tools.runs.job import HELD_OUT_EVERY
-from abcd_ns.tools.runs.machine import Machine, describe_machine, describe_versions
 from abcd_ns.tools.runs.run import Failure, Run
 from abcd_ns.tools.runs.runner import claim, run_jobs
 from abcd_ns.tools.study.charts import draw_study

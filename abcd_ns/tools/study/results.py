@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from abcd_ns.tools.runs.machine import Machine, Versions
+from abcd_ns.plugin.machine import Machine, Versions
 from abcd_ns.tools.runs.records import encode, read_record, write_json
 from abcd_ns.tools.runs.run import Failure, Run
 

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -62,6 +63,12 @@ def describe_versions() -> Versions:
         abcd_ns=abcd_ns.__version__,
         commit=_commit(Path(abcd_ns.__file__).resolve().parent.parent),
     )
+
+
+def without_home(text: str) -> str:
+    """Results are published: whose home folder it was is nobody's business."""
+    home = str(Path.home())
+    return text if home == "/" else re.sub(rf"{re.escape(home)}(?![\w.-])", "~", text)
 
 
 def peak_rss_bytes() -> int:

@@ -1,0 +1,114 @@
+"""The lines of a run's log: what each kind of them says."""
+
+from dataclasses import dataclass
+
+SCHEMA = 1
+"""Raised whenever a line changes its form or meaning."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """What all lines say."""
+
+    step: int
+    """Optimisation steps taken by then."""
+    seconds: float
+    """Of training by then."""
+
+
+@dataclass(frozen=True)
+class TrainingLine(Line):
+    """Training began, or went on after a resume."""
+
+    schema: int
+    blocks: int
+    gaussians: int
+    limit: int | None
+    """On the number of Gaussians in the scene."""
+    budgets: dict[str, int]
+    """Limits of what is kept at hand, bytes, by name."""
+
+
+@dataclass(frozen=True)
+class VisitLine(Line):
+    """A visit began."""
+
+    visit: int
+    sweep: int
+    block: int | None
+    """None for the warm-up."""
+    steps: int
+    views: int
+    gaussians: int
+    """That are trained in it."""
+
+
+@dataclass(frozen=True)
+class SampleLine(Line):
+    """How things stand; written every now and then."""
+
+    psnr: float | None
+    """Mean over the steps since the last sample, of the crops that were trained on, dB."""
+    gaussians: int
+    """In the whole scene."""
+    rss_bytes: int
+    """RAM of the process."""
+    device_bytes: int | None
+    """That torch has given out on the CUDA device; None without one."""
+    held: dict[str, int]
+    """Of each budget, what is in use, bytes."""
+
+
+@dataclass(frozen=True)
+class VisitEndLine(Line):
+    """A visit ended and its block is at rest."""
+
+    visit: int
+    sweep: int
+    block: int | None
+    gaussians: int
+    """In the block, after migration."""
+    migrated: int
+    """Gaussians that left for other blocks."""
+    layer_seconds: float
+    visit_seconds: float
+    psnr: float | None
+    """Mean over the visit's later half, of the crops that were trained on, dB."""
+
+
+@dataclass(frozen=True)
+class SweepEndLine(Line):
+    """Every block that some view sees was visited once more."""
+
+    sweep: int
+
+
+@dataclass(frozen=True)
+class HeldOutLine(Line):
+    """The held-out views were looked at; means over them."""
+
+    psnr: float | None
+    """dB; None where it is not finite."""
+    ssim: float | None
+
+
+@dataclass(frozen=True)
+class EndLine(Line):
+    """Training is over."""
+
+    gaussians: int
+    peak_rss_bytes: int
+    peak_device_bytes: int | None
+
+
+KINDS: dict[str, type[Line]] = {
+    "training": TrainingLine,
+    "visit": VisitLine,
+    "sample": SampleLine,
+    "visit end": VisitEndLine,
+    "sweep end": SweepEndLine,
+    "held out": HeldOutLine,
+    "end": EndLine,
+}
+"""By the value of a line's field "kind"."""
+KIND_OF = {cls: kind for kind, cls in KINDS.items()}

@@ -1,0 +1,1 @@
+"""`abcd report`: one training run as one HTML page."""
