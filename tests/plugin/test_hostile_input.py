@@ -1,4 +1,4 @@
-"""Input that is rarer than a missing photo: each fault is one line, found before training, and all at once."""
+"""Faults rarer than a missing photo: each is one line, found before training, and all at once."""
 
 import json
 import os

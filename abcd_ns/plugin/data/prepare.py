@@ -38,6 +38,8 @@ class Prepared:
     """From the scene's world to that of training."""
     points: dict[str, Tensor]
     """points3D_xyz float32 [n, 3], world of training, and points3D_rgb uint8 [n, 3]; empty without any."""
+    points_in_model: np.ndarray
+    """The same points, float64 [n, 3], in the scene's world."""
     notes: tuple[str, ...]
     """What the user should know but need not repair."""
 
@@ -93,11 +95,12 @@ def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
     similarity = normalizing_similarity(
         poses, config.orientation_method, config.center_method, config.auto_scale_poses, config.scale_factor
     )
-    points, more = _points(scene, similarity)
+    points, in_model, more = _points(scene, similarity)
     both = scene.split_lists.in_both if scene.split_lists else 0
     if both:
         more.append(f"{both} views are trained on and held out: scores on them say nothing about new views.")
-    return Prepared(scene, sources, lenses, similarity, points, tuple(scene.notes + notes + more))
+    notes = (*scene.notes, *notes, *more)
+    return Prepared(scene, sources, lenses, similarity, points, in_model, notes)
 
 
 def check_masks(sources: list[PhotoSource]) -> None:
@@ -175,17 +178,19 @@ def _undistortion(frame: Frame, lens: Lens) -> Undistortion:
         raise InputError(f"{frame.name}: {error}") from None
 
 
-def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], list[str]]:
-    """Metadata as splatfacto expects it; without points it starts from random ones."""
+def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np.ndarray, list[str]]:
+    """(metadata as splatfacto expects it, the points in the scene's world, notes)."""
     with np.errstate(over="ignore", invalid="ignore"):
         xyz = similarity.points(scene.points_xyz).astype(np.float32)
     good = np.isfinite(xyz).all(axis=1)
     left_out = f"{scene.model}: {(~good).sum()} points with NaN, infinity or absurd numbers are left out."
     notes = [] if good.all() else [left_out]
     if not good.any():
-        return {}, [
-            *notes,
-            f"{scene.model} has no points: Gaussians start at random places, which costs quality.",
-        ]
+        notes.append(
+            f"{scene.model} has no points: Gaussians start at random places, which costs quality; make some "
+            "with `colmap point_triangulator`."
+        )
+        return {}, np.empty((0, 3)), notes
     rgb = np.ascontiguousarray(scene.points_rgb[good])
-    return {"points3D_xyz": torch.from_numpy(xyz[good]), "points3D_rgb": torch.from_numpy(rgb)}, notes
+    metadata = {"points3D_xyz": torch.from_numpy(xyz[good]), "points3D_rgb": torch.from_numpy(rgb)}
+    return metadata, scene.points_xyz[good], notes

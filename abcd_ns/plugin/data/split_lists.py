@@ -34,15 +34,15 @@ class SplitLists:
 
 
 def split_lists(
-    found: Mapping[str, Sequence[str]], known: Sequence[str], labels: Mapping[str, str]
+    found: Mapping[str, Sequence[str]], known: Mapping[str, str], labels: Mapping[str, str]
 ) -> SplitLists | None:
     """The lists that there are as one split; None without any.
 
     What is held out is val and test together. If only one side is listed, the other is all the rest.
 
     Args:
-        found: names of frames by split.
-        known: names of all frames.
+        found: what each list names, by split.
+        known: the name of each frame, by what lists call it.
         labels: what each list is called in messages, by split.
 
     Raises:
@@ -50,16 +50,16 @@ def split_lists(
     """
     if not found:
         return None
-    problems, everything = Problems(), frozenset(known)
+    problems, everything = Problems(), frozenset(known.values())
     for split, names in found.items():
-        unknown = [name for name in dict.fromkeys(names) if name not in everything]
+        unknown = [name for name in dict.fromkeys(names) if name not in known]
         if unknown:
             few = ", ".join(unknown[:_NAMED]) + (", ..." if len(unknown) > _NAMED else "")
             problems.add(
                 f"{labels[split]} names {len(unknown)} photos that have no pose ({few}); correct the list."
             )
     problems.raise_if_any()
-    listed = {split: frozenset(names) for split, names in found.items()}
+    listed = {split: frozenset(known[name] for name in names) for split, names in found.items()}
     held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
     train = listed.get("train", everything - held_out)
     if not held_out and not {"val", "test"} & listed.keys():
@@ -87,4 +87,4 @@ def read_list_files(data: Path, known: Sequence[str]) -> SplitLists | None:
                 raise InputError(f"{path} cannot be read ({error.strerror}); remove or replace it.") from None
             found[split] = [line.strip() for line in lines if line.strip()]
             labels[split] = str(path)
-    return split_lists(found, known, labels)
+    return split_lists(found, {name: name for name in known}, labels)

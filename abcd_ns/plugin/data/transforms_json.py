@@ -82,21 +82,21 @@ def _load(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _split_lists(path: Path, meta: dict[str, Any], folder: Path, known: list[str]) -> SplitLists | None:
+def _split_lists(path: Path, meta: dict[str, Any], folder: Path, names: list[str]) -> SplitLists | None:
     """train_filenames, val_filenames and test_filenames: file_paths of frames, as nerfstudio has it."""
     found: dict[str, list[str]] = {}
     for split in SPLITS:
         key = f"{split}_filenames"
         if key not in meta:
             continue
-        names = meta[key]
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        listed = meta[key]
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{path}: {key} must be a list of file_paths.")
-        found[split] = [os.path.relpath(name or ".", folder) for name in names]
+        found[split] = [os.path.normpath(name) for name in listed]
+    called = {str(folder / name): name for name in names}
     # As for the frames' own file_paths, the ending may be left out.
-    endless = {os.path.splitext(name)[0]: name for name in known if name.endswith(".png")}
-    named = {split: [endless.get(name, name) for name in names] for split, names in found.items()}
-    return split_lists(named, known, {split: f"{path}: {split}_filenames" for split in found})
+    called |= {call.removesuffix(".png"): name for call, name in called.items()}
+    return split_lists(found, called, {split: f"{path}: {split}_filenames" for split in found})
 
 
 def _number(values: dict[str, Any], key: str, label: str, default: float | None = None) -> float:
