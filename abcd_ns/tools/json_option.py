@@ -1,4 +1,4 @@
-"""The option --json FILE of commands that report: refused before any work if nothing could be written there."""
+"""The option --json FILE of commands that report; refused before any work where nothing can be written."""
 
 from pathlib import Path
 from typing import Any

@@ -106,19 +106,17 @@ def names_in(report: dict) -> list[str]:
 
 
 def test_near_plane_is_that_of_training(sound, found):
-    """Half the depth of the nearest point in a picture, in training's units."""
-    prepared = found.prepared
-    nearest = min(
-        depth.min()
-        for depth in (
-            ((points := found.points - frame.camera_to_world[:, 3]) @ -frame.camera_to_world[:, 2])[
-                inside(points @ frame.camera_to_world[:, :3], lens)
-            ]
-            for frame, lens in zip(prepared.scene.frames, prepared.lenses, strict=True)
-        )
-        if len(depth)
+    """Half the depth of the nearest point in a picture that is trained on."""
+    depths = []
+    for row in found.train:
+        pose = found.prepared.scene.frames[row].camera_to_world
+        local = (found.points - pose[:, 3]) @ pose[:, :3]
+        depths.extend(-local[inside(local, found.prepared.lenses[row]), 2])
+    summary = examine(sound).summary
+    assert summary.near_plane_model == pytest.approx(min(depths) / 2, rel=0.05)
+    assert summary.near_plane == pytest.approx(
+        summary.near_plane_model * found.prepared.similarity.scale, rel=1e-6
     )
-    assert examine(sound).summary.near_plane_model == pytest.approx(nearest / 2, rel=0.05)
 
 
 def inside(local: np.ndarray, lens) -> np.ndarray:
