@@ -102,8 +102,8 @@ def test_wrong_arguments_exit_with_2(greet, capsys):
     ("name", "hint"),
     [
         ("snyth", "did you mean 'abcd synth'?"),
-        ("xyz", "there are: demo, synth, compare, study."),
-        ("--verbose", "there are: demo, synth, compare, study."),
+        ("xyz", "there are: demo, check, doctor, synth, compare, study."),
+        ("--verbose", "there are: demo, check, doctor, synth, compare, study."),
     ],
 )
 def test_an_unknown_command_is_one_line_with_a_hint(name, hint, capsys):
