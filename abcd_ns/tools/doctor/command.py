@@ -81,27 +81,30 @@ def _hardware(hardware: Hardware) -> dict[str, str]:
     gpu = hardware.gpu
     device = "none"
     if gpu is not None:
-        device = (
-            f"{gpu.name}, {_gib(gpu.memory_bytes)}, capability {gpu.capability}, driver {hardware.driver}"
-        )
+        device = f"{gpu.name}, {_gib(gpu.memory_bytes)}, capability {gpu.capability}"
     return {
         "OS": hardware.os,
         "CPU": f"{hardware.cpu}, {hardware.cores} cores",
         "RAM": f"{_gib(hardware.ram_bytes)}, {_gib(hardware.ram_free_bytes)} free",
         "disk": f"{_gib(hardware.disk_free_bytes)} free",
         "GPU": device,
+        "driver": hardware.driver or "none",
         "torch's CUDA": hardware.torch_cuda or "none",
     }
 
 
 def _kernels(kernels: Kernels) -> dict[str, str]:
+    compilers = (
+        kernels.compiler or "no C++ compiler",
+        f"nvcc {kernels.nvcc}" if kernels.nvcc else "no nvcc",
+        "ninja" if kernels.ninja else "no ninja",
+    )
     checks = [f"{name} differs by {error:.0e}" for name, error in kernels.self_check.items()]
     checks += [f"{name} FAILED" for name in kernels.failed]
     return {
         "CPU kernels": f"{kernels.built} of {kernels.wanted} built, in {kernels.folder}",
         "gsplat's": kernels.gsplat or "not built",
-        "compilers": f"{kernels.compiler or 'no C++'}, {f'nvcc {kernels.nvcc}' if kernels.nvcc else 'no nvcc'}, "
-        f"{'ninja' if kernels.ninja else 'no ninja'}",
+        "compilers": ", ".join(compilers),
         "self-check": ", ".join(checks),
         "LPIPS": "no weights" if kernels.lpips_missing else "weights are there",
     }

@@ -25,7 +25,7 @@ def missing_packages(facts: Facts) -> Iterator[Finding]:
             "error",
             "missing-packages",
             f"Not installed: {', '.join(missing)}.",
-            "`pip install abcd-ns`'s checkout again into this environment (`pip install .`), or `make setup`.",
+            "In the checkout of abcd_ns: pip install .",
         )
 
 
@@ -61,7 +61,7 @@ def not_registered(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "error",
             "not-registered",
-            "nerfstudio does not find the methods of abcd_ns: the package is not installed in this environment.",
+            "nerfstudio does not know the methods of abcd_ns: it is not installed in this environment.",
             "In its checkout: pip install .",
         )
     if not facts.packages.has_ns_train:
@@ -94,7 +94,7 @@ def viewer(facts: Facts) -> Iterator[Finding]:
             "warning",
             "viewer-hole",
             f"viser {version} sends every file that you can read to whoever reaches the viewer's port, and "
-            "nerfstudio listens on all networks unless told. Training with abcd listens on this machine alone.",
+            "nerfstudio listens on all networks unless told. `ns-train abcd` listens on this machine alone.",
             "For other methods, and with ns-viewer: --viewer.websocket-host 127.0.0.1; from another machine "
             "use ssh -L 7007:127.0.0.1:7007 HOST",
         )
@@ -123,12 +123,13 @@ def disk(facts: Facts) -> Iterator[Finding]:
 
 def ram(facts: Facts) -> Iterator[Finding]:
     """Little RAM."""
-    if facts.hardware is not None and facts.hardware.ram_free_bytes < LITTLE_RAM:
+    free = facts.hardware.ram_free_bytes if facts.hardware else LITTLE_RAM
+    if free < LITTLE_RAM:
         yield Finding(
             "warning",
             "little-ram",
-            f"Only {facts.hardware.ram_free_bytes / GIB:.1f} GiB of RAM are free. By default 2 GiB of blocks and "
-            "a tenth of the RAM as photos are kept there.",
+            f"Only {free / GIB:.1f} GiB of RAM are free. By default blocks take up to 2 GiB there, and decoded "
+            "photos a tenth of all.",
             "Close other programs, or reduce photos: --pipeline.datamanager.dataparser.downscale-factor 2",
         )
 
@@ -149,7 +150,7 @@ def gpu(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "torch-without-cuda",
-            f"There is an NVIDIA device (driver {hardware.driver}), but this torch is built for the CPU only.",
+            f"There is an NVIDIA device (driver {hardware.driver}), but torch is built for the CPU only.",
             "Install torch and torchvision as built for CUDA.",
         )
     else:
@@ -195,16 +196,16 @@ def gsplat_extension(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "error",
             "gsplat-cannot-be-built",
-            f"gsplat's CUDA kernels are not built, and cannot be: {' and '.join(missing)} not found on the PATH.",
-            f"Install the CUDA toolkit {hardware.torch_cuda or ''} (nvcc), g++ and ninja; or train slowly with "
-            "--pipeline.model.rasterizer torch",
+            f"gsplat's CUDA kernels are neither built nor can be: not on the PATH are {', '.join(missing)}.",
+            f"Install the CUDA toolkit {hardware.torch_cuda or ''} (nvcc), g++ and ninja; or train slowly, "
+            "with --pipeline.model.rasterizer torch",
         )
     elif _numbers(kernels.nvcc)[:1] != _numbers(hardware.torch_cuda or "")[:1]:
         yield Finding(
             "error",
             "gsplat-cannot-be-built",
-            f"gsplat's CUDA kernels are not built, and nvcc is of CUDA {kernels.nvcc}, while torch is built for "
-            f"{hardware.torch_cuda}: torch refuses to compile with it.",
+            f"gsplat's CUDA kernels are not built, and nvcc is of CUDA {kernels.nvcc}, but torch is built "
+            f"for {hardware.torch_cuda} and refuses to compile with another.",
             f"Put the nvcc of CUDA {hardware.torch_cuda} first on the PATH, or install torch for "
             f"{kernels.nvcc}.",
         )
@@ -212,9 +213,9 @@ def gsplat_extension(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "note",
             "gsplat-not-built",
-            "gsplat's CUDA kernels are not built; the first training compiles them. That takes some 20 minutes "
-            "of CPU time, spread over the cores, and up to 2 GiB of RAM a core.",
-            "If RAM is short, set MAX_JOBS=2 for it.",
+            "gsplat's CUDA kernels are not built; the first training compiles them, once: some 20 minutes of "
+            "CPU time, spread over up to 10 processes.",
+            "If that takes too much RAM, set MAX_JOBS=2 for it.",
         )
 
 
@@ -224,7 +225,8 @@ def self_check(facts: Facts) -> Iterator[Finding]:
         if name.startswith("torch"):
             fix = f"Delete {facts.kernels.folder}, so that its kernels are built anew."
         else:
-            fix = "Train with --pipeline.model.rasterizer torch, or compile gsplat anew: delete its build folder."
+            fix = f"Train with --pipeline.model.rasterizer torch; or delete {facts.kernels.gsplat}: it is "
+            fix += "built anew when training begins."
         yield Finding("error", "self-check", f"{name}: {error}", fix)
 
 
