@@ -128,8 +128,8 @@ def ram(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "little-ram",
-            f"Only {free / GIB:.1f} GiB of RAM are free. By default blocks take up to 2 GiB there, and decoded "
-            "photos a tenth of all.",
+            f"Only {free / GIB:.1f} GiB of RAM are free. By default, blocks take up to 2 GiB of it, and "
+            "decoded photos a tenth of all.",
             "Close other programs, or reduce photos: --pipeline.datamanager.dataparser.downscale-factor 2",
         )
 
