@@ -11,6 +11,7 @@ from rich.console import Console
 from abcd_ns.tools.findings import Finding, print_findings
 
 ROOT = Path(__file__).resolve().parents[2]
+DOCUMENT = (ROOT / "docs/troubleshooting.md").read_text()
 MAKERS = [*(ROOT / "abcd_ns/tools/check").glob("*.py"), *(ROOT / "abcd_ns/tools/doctor").glob("*.py")]
 LONG = "A sentence of many words that says what was found and why it matters. " * 3
 
@@ -37,11 +38,8 @@ def test_text_is_wrapped_and_errors_are_not():
 
 
 def test_names_of_files_are_no_markup():
-    assert printed(Finding("note", "n", "[red]a.png[/red] :smile:")) == [
-        "",
-        "note",
-        "  n: [red]a.png[/red] :smile:",
-    ]
+    name = "[red]a.png[/red] :smile:"
+    assert printed(Finding("note", "n", name))[-1] == f"  n: {name}"
 
 
 def names_in_code() -> set[str]:
@@ -56,8 +54,7 @@ def names_in_code() -> set[str]:
 
 
 def names_in_document() -> set[str]:
-    text = (ROOT / "docs/troubleshooting.md").read_text()
-    headings = re.findall(r"^#### (.+)$", text, re.MULTILINE)
+    headings = re.findall(r"^#### (.+)$", DOCUMENT, re.MULTILINE)
     return {name for heading in headings for name in heading.split(", ")}
 
 
@@ -66,10 +63,8 @@ def test_the_document_explains_every_finding_and_no_other():
     assert names_in_document() == names_in_code()
 
 
-@pytest.mark.parametrize(
-    "link", re.findall(r"\]\(#([\w-]+)\)", (ROOT / "docs/troubleshooting.md").read_text())
-)
+@pytest.mark.parametrize("link", re.findall(r"\]\(#([\w-]+)\)", DOCUMENT))
 def test_links_within_the_document_lead_somewhere(link):
-    headings = re.findall(r"^#+ (.+)$", (ROOT / "docs/troubleshooting.md").read_text(), re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", DOCUMENT, re.MULTILINE)
     anchors = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
     assert link in anchors
