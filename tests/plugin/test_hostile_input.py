@@ -51,6 +51,12 @@ def test_formats_that_pillow_gives_to_other_programs_are_refused(scene):
     assert refusal(scene).startswith(f"{path} is not a picture of a known kind")
 
 
+def test_photo_with_another_ending_is_named(scene):
+    path = scene / "images" / NAMES[0]
+    path.rename(path.with_suffix(".PNG"))
+    assert refusal(scene).endswith("(No such file or directory); 0000.PNG is there: rename it.")
+
+
 @pytest.mark.parametrize("bad", [21, 30])
 def test_the_rest_of_a_long_list_is_counted_once(tmp_path, bad):
     names = [f"{i:02d}.png" for i in range(40)]

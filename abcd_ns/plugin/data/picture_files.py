@@ -1,5 +1,6 @@
 """Looks at picture files without decoding them: size, kind, and whether the end is there."""
 
+import os
 import stat
 import warnings
 from dataclasses import dataclass
@@ -45,11 +46,20 @@ def check_regular(path: Path) -> None:
         status = path.stat()
     except OSError as error:
         what = "is a link to nothing" if path.is_symlink() else f"cannot be read ({error.strerror})"
-        raise InputError(f"{path} {what}; copy the photo there.") from None
+        other = _other_ending(path)
+        fix = "copy the photo there" if other is None else f"{other.name} is there: rename it"
+        raise InputError(f"{path} {what}; {fix}.") from None
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is not a regular file; copy the photo there.")
     if status.st_size == 0:
         raise InputError(f"{path} is empty; copy the photo again.")
+
+
+def _other_ending(path: Path) -> Path | None:
+    """A photo of the same name with another ending, as .JPG for .jpg, if there is one."""
+    endings = (ending for suffix in sorted(SUFFIXES) for ending in (suffix, suffix.upper()))
+    found = (path.with_suffix(ending) for ending in endings if ending != path.suffix)
+    return next((other for other in found if os.path.lexists(other)), None) if path.stem else None
 
 
 def open_picture(path: Path) -> Image.Image:
