@@ -7,6 +7,8 @@ from typing import Literal
 
 from rich.console import Console
 
+from abcd_ns.plugin.input_errors import one_line
+
 Level = Literal["error", "warning", "note"]
 STYLES: dict[Level, str] = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 """Of the levels' titles, the most serious first."""
@@ -51,13 +53,14 @@ def print_findings(findings: Sequence[Finding], console: Console) -> None:
 
 
 def _print(finding: Finding, console: Console) -> None:
-    width = min(console.width, WIDEST)
+    # Names of files may hold newlines, and bytes that no terminal takes.
+    width, what, fix = min(console.width, WIDEST), one_line(finding.what), one_line(finding.fix)
     if finding.level == "error":
-        lines = [f"  {finding.name}: {finding.what}"]
+        lines = [f"  {finding.name}: {what}"]
     else:
-        lines = _wrap(f"{finding.name}: {finding.what}", width, "  ", "    ")
-    if finding.fix:
-        lines += _wrap(finding.fix, width, "    -> ", "       ")
+        lines = _wrap(f"{finding.name}: {what}", width, "  ", "    ")
+    if fix:
+        lines += _wrap(fix, width, "    -> ", "       ")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 

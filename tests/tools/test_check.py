@@ -1,6 +1,7 @@
 """`abcd check`: refuses what training refuses, in its words, and explains what is doubtful."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -173,6 +174,17 @@ def test_long_lists_of_errors_are_cut_in_the_terminal_only(tmp_path, capsys):
     assert printed.count("cannot be read") == 20
     assert "and 10 more (30 in all)" in printed
     assert len(examine(tmp_path).findings) == 30
+
+
+def test_names_that_no_terminal_takes_are_escaped(scene, capsys):
+    """A byte that is no UTF-8, and a newline."""
+    written, path = b"right/0000.png", scene / "sparse/0/images.bin"
+    odd = b"right/\xff\n00.png"
+    path.write_bytes(path.read_bytes().replace(written, odd))
+    (scene / "images" / os.fsdecode(written)).unlink()
+    Image.new("RGB", SIZES[0]).save(scene / "images" / os.fsdecode(odd))
+    assert check(data=scene) == 0
+    assert "over: right/\\udcff\\n00.png." in capsys.readouterr().out
 
 
 def test_findings_are_sorted_by_how_serious_they_are():

@@ -1,13 +1,12 @@
 """`abcd check`: look at a data set as training would, without training."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.plugin.input_errors import InputError
+from abcd_ns.plugin.input_errors import InputError, one_line
 from abcd_ns.tools.check import about_cameras, about_photos, about_points
 from abcd_ns.tools.check.summary import Summary, print_summary, summarize
 from abcd_ns.tools.check.survey import Survey, survey
@@ -84,12 +83,9 @@ def findings_of(found: Survey) -> list[Finding]:
 
 
 def _verdict(report: Report) -> str:
+    data = one_line(report.data)
     if report.refused:
-        return f"\nTraining would refuse {report.data}: mend the errors first."
-    if _count(report.findings, "warning"):
-        return f"\n{report.data} can be trained on; see whether the warnings matter to you."
-    return f"\n{report.data} is fine: ns-train abcd --data {report.data}"
-
-
-def _count(findings: Sequence[Finding], level: str) -> int:
-    return sum(finding.level == level for finding in findings)
+        return f"\nTraining would refuse {data}: mend the errors first."
+    if any(finding.level == "warning" for finding in report.findings):
+        return f"\n{data} can be trained on; see whether the warnings matter to you."
+    return f"\n{data} is fine: ns-train abcd --data {data}"

@@ -10,6 +10,7 @@ from rich.table import Table
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.plugin.data.photos import default_budget
 from abcd_ns.plugin.data.scene import Lens
+from abcd_ns.plugin.input_errors import one_line
 from abcd_ns.tools.check.about_photos import photo_bytes
 from abcd_ns.tools.check.survey import Survey
 from abcd_ns.tools.check.words import few
@@ -77,7 +78,7 @@ def print_summary(summary: Summary, console: Console) -> None:
     """Two columns."""
     table = Table.grid(padding=(0, 2))
     for name, value in _rows(summary):
-        table.add_row(name, value)
+        table.add_row(name, one_line(value))
     console.print(table, highlight=False, markup=False)
 
 
