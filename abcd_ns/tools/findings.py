@@ -62,7 +62,7 @@ def _print(finding: Finding, console: Console) -> None:
     if fix:
         lines += _wrap(fix, width, "    -> ", "       ")
     for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def _wrap(text: str, width: int, first: str, then: str) -> list[str]:

@@ -291,7 +291,8 @@ def test_lists_that_name_unknown_photos_are_refused(scene, where):
     assert len(lines) == 2
     assert "train" in lines[0]
     assert "elsewhere.png" in lines[0]
-    assert "names 4 photos that have no pose (gone.png, a.png, b.png, ...)" in lines[1]
+    shown = ", ".join(("" if where == "files" else "images/") + name for name in unknown[:3])
+    assert f"names 4 photos that have no pose ({shown}, ...)" in lines[1]
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,14 @@ from tests.plugin.dataparser_scenes import write_model, write_photos
 POINTS = 600
 
 
+def wide(width: int, height: int) -> tuple[str, list[float]]:
+    """A lens that sees all points from everywhere."""
+    return "PINHOLE", [width * 0.3, width * 0.3, width / 2, height / 2]
+
+
 def write_sound(folder: Path) -> Path:
     """Nothing about it is doubtful; it is noted that photos have two sizes."""
-    write_model(folder / "sparse/0", points=POINTS)
+    write_model(folder / "sparse/0", points=POINTS, params=wide)
     write_photos(folder / "images")
     return folder
 

@@ -13,7 +13,7 @@ from abcd_ns.tools.check.command import examine, findings_of
 from abcd_ns.tools.check.looks import Look
 from abcd_ns.tools.check.survey import Survey, survey
 from tests.plugin.dataparser_scenes import NAMES, SIZES, write_model, write_photos, write_transforms
-from tests.tools.check_scenes import POINTS, changed, names, the, with_looks, write_sound
+from tests.tools.check_scenes import POINTS, changed, names, the, wide, with_looks, write_sound
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def found(sound) -> Survey:
 
 
 def test_few_photos_and_a_split_that_leaves_one(tmp_path):
-    write_model(tmp_path / "sparse/0", points=POINTS, names=NAMES[:2])
+    write_model(tmp_path / "sparse/0", points=POINTS, names=NAMES[:2], params=wide)
     write_photos(tmp_path / "images", names=NAMES[:2])
     said = names(examine(tmp_path).findings)
     assert "few-photos" in said
@@ -50,7 +50,7 @@ def test_copies_of_a_photo_are_named_and_leaks_counted(scene):
     shutil.copy(scene / "images" / ordered[0], scene / "images" / ordered[2])
     what = the("duplicate-photos", survey(scene, 1)).what
     assert f"{ordered[0]} = {ordered[2]}" in what
-    assert "1 of them are trained on and held out" in what
+    assert "1 of them is both trained on and held out" in what
 
 
 def test_photos_that_only_look_alike_are_no_copies(scene):
@@ -74,8 +74,8 @@ def test_brightness_is_the_mean_luma(scene, kind):
 def test_exposure_that_varies_is_told_from_blank_photos(found):
     evenly = [Look(0.3 + 0.02 * i) for i in range(len(NAMES))]
     assert not {"exposure", "blank-photos"} & set(names(findings_of(with_looks(found, *evenly))))
-    wide = [Look(0.1 + 0.08 * i) for i in range(len(NAMES))]
-    assert "factor of" in the("exposure", with_looks(found, *wide)).what
+    uneven = [Look(0.1 + 0.08 * i) for i in range(len(NAMES))]
+    assert "factor of" in the("exposure", with_looks(found, *uneven)).what
     blank = [Look(0.0), Look(0.999), *evenly[2:]]
     assert "2 photos are black or white" in the("blank-photos", with_looks(found, *blank)).what
     assert "exposure" not in names(findings_of(with_looks(found, *blank)))
@@ -166,8 +166,14 @@ def test_views_without_points_are_named(found):
     assert found.names[3] in what
 
 
+def behind(found: Survey, count: int) -> np.ndarray:
+    """Points behind all cameras, far off."""
+    backwards = found.prepared.scene.frames[5].camera_to_world[:, 2]
+    return found.centers.mean(axis=0) + 1000 * backwards + found.points[:count]
+
+
 def test_points_of_another_model_are_seen_by_no_view(found):
-    said = names(findings_of(changed(found, points=found.points + 1e4)))
+    said = names(findings_of(changed(found, points=behind(found, POINTS))))
     assert "no-view-sees-points" in said
     assert "views-without-points" not in said
     assert "unseen-points" not in said
@@ -189,16 +195,14 @@ def test_points_far_off_are_counted(found):
 
 
 def test_points_in_no_picture_are_counted(found):
-    back = found.centers.mean(axis=0) - 50 * found.points[:150].mean(axis=0)
-    looking = found.prepared.scene.frames[5].camera_to_world[:, 2]
-    behind = back + 1000 * looking + found.points[:150]
-    what = the("unseen-points", changed(found, points=np.concatenate([found.points, behind]))).what
+    points = np.concatenate([found.points, behind(found, 150)])
+    what = the("unseen-points", changed(found, points=points)).what
     assert what.startswith("20% of the points")
     assert "20% behind every camera" in what
 
 
 def test_geo_referenced_scenes_are_noted(tmp_path):
-    write_model(tmp_path / "sparse/0", points=POINTS, offset=5e6)
+    write_model(tmp_path / "sparse/0", points=POINTS, offset=5e6, params=wide)
     write_photos(tmp_path / "images")
     report = examine(tmp_path)
     assert names(report.findings) == ["mixed-sizes", "far-origin"]

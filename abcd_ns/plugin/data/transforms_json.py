@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from abcd_ns.plugin.input_errors import InputError, Problems
 
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYES = ("OPENCV_FISHEYE",)
+LARGEST = sys.float_info.max
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
 
 
@@ -103,7 +105,7 @@ def _number(values: dict[str, Any], key: str, label: str, default: float | None 
     """values[key] as a finite float."""
     value = values.get(key, default)
     # Compared rather than converted: JSON's whole numbers may be larger than any float.
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
         raise InputError(f"{label}: {key} must be a number, not {value}.")
     return float(value)
 

@@ -12,7 +12,7 @@ from abcd_ns.tools.findings import Finding
 SMALL_BASELINE = 0.02
 """Extent of the cameras, as a share of the median distance to what they see, below which depth is a guess."""
 FAR_OFF = 10.0
-"""A camera this many times farther from the middle than nine tenths of the cameras are is far off."""
+"""A camera this many times farther from the middle than three quarters of the cameras are is far off."""
 FEW_POINTS = 20
 """In a picture."""
 FIELDS = 3.0
@@ -36,7 +36,7 @@ def one_place(survey: Survey) -> Iterator[Finding]:
 def far_cameras(survey: Survey) -> Iterator[Finding]:
     """Cameras far from all others: as a rule, photos that were registered wrongly."""
     away = np.linalg.norm(survey.centers - np.median(survey.centers, axis=0), axis=1)
-    usual = float(np.quantile(away, 0.9)) if len(away) >= 10 else float(np.median(away))
+    usual = float(np.quantile(away, 0.75, method="lower"))
     rows = np.flatnonzero(away > FAR_OFF * usual) if usual > 0 else []
     if len(rows):
         yield Finding(

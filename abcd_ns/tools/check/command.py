@@ -59,7 +59,7 @@ def check(*, data: Path, downscale: int = 1, json: Path | None = None) -> int:
     if report.summary is not None:
         print_summary(report.summary, console)
     print_findings(report.findings, console)
-    console.print(_verdict(report), highlight=False, markup=False, soft_wrap=True)
+    console.print(_verdict(report), highlight=False, markup=False, emoji=False, soft_wrap=True)
     write_report(json, report)
     return REFUSED if report.refused else 0
 

@@ -55,7 +55,7 @@ def summarize(survey: Survey) -> Summary:
     sizes = Counter("{} x {}".format(*source.size) for source in survey.sources)
     lenses = Counter(_in_words(frame.lens) for frame in prepared.scene.frames)
     spread = np.diff(np.quantile(points, MIDDLE, axis=0), axis=0)[0] if len(points) else []
-    floats = sum(value[0].numel() for _, value in Gaussians.empty().items())
+    floats = sum(value.shape[1:].numel() for _, value in Gaussians.empty().items())
     return Summary(
         model=str(prepared.scene.model),
         photos=len(survey.names),
@@ -79,27 +79,28 @@ def print_summary(summary: Summary, console: Console) -> None:
     table = Table.grid(padding=(0, 2))
     for name, value in _rows(summary):
         table.add_row(name, one_line(value))
-    console.print(table, highlight=False, markup=False)
+    console.print(table, highlight=False, markup=False, emoji=False)
 
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     sizes = _counted({f"{size} px": n for size, n in summary.sizes.items()})
     lenses = _counted(summary.lenses)
-    extent = f"cameras {_box(summary.camera_extent)}"
+    points = f"{summary.points:,}"
     if summary.point_extent:
-        extent += f"; nine tenths of the points {_box(summary.point_extent)}"
-    kept = min(summary.photo_bytes, summary.photo_budget_bytes)
+        points += f", nine tenths of them within {_box(summary.point_extent)}"
+    photos = _size(summary.photo_bytes)
+    if summary.photo_bytes > summary.photo_budget_bytes:
+        photos = f"{_size(summary.photo_budget_bytes)} of {photos}"
     return [
         ("model", summary.model),
         ("photos", f"{summary.photos:,}, {few(sizes)}"),
         ("lenses", few(lenses)),
-        ("points", f"{summary.points:,}"),
         ("views", f"{summary.train:,} to train on, {summary.held_out:,} held out"),
-        ("extent", f"{extent} (model units)"),
+        ("cameras", f"within {_box(summary.camera_extent)} model units"),
+        ("points", points),
         ("near plane", f"{summary.near_plane_model:.3g} model units, {summary.near_plane:.3g} in training"),
-        ("RAM", f"{_size(kept)} of {_size(summary.photo_bytes)} decoded photos, "
-                f"{_size(summary.gaussian_bytes)} of Gaussians to begin with"),
-    ]  # fmt: skip
+        ("RAM", f"{photos} of photos, {_size(summary.gaussian_bytes)} of Gaussians to begin with"),
+    ]
 
 
 def _in_words(lens: Lens) -> str:

@@ -46,7 +46,7 @@ def doctor(*, json: Path | None = None) -> int:
     report = diagnose(gather())
     console = Console()
     for line in _lines(report.facts):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
     print_findings(report.findings, console)
     ill = any(finding.level == "error" for finding in report.findings)
     verdict = "Training cannot work here yet: mend the errors." if ill else "Training can work here."

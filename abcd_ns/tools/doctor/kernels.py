@@ -4,6 +4,7 @@ Nothing is built here, and no folder is made.
 """
 
 import importlib.util
+import logging
 import os
 import re
 import shutil
@@ -83,6 +84,9 @@ def find_extension() -> Path | None:
 def build_folder() -> Path:
     """Where torch compiles gsplat's extension. Its own `_get_build_directory` would make the folder."""
     import torch
+
+    # Its import says that there is no GPU, where there is none.
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
     from torch.utils.cpp_extension import get_default_build_root
 
     if root := os.environ.get("TORCH_EXTENSIONS_DIR"):
