@@ -45,7 +45,7 @@ def print_findings(findings: Sequence[Finding], console: Console) -> None:
         if not group:
             continue
         title = level if len(group) == 1 else f"{level}s ({len(group)})"
-        console.print(f"\n{title}", style=style)
+        console.print(f"\n{title}", style=style, highlight=False)
         for finding in group[:SHOWN]:
             _print(finding, console)
         if len(group) > SHOWN:
