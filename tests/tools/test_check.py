@@ -57,6 +57,7 @@ def test_a_sound_scene_is_summed_up(sound, tmp_path, capsys):
     assert summary["sizes"] == {f"{w} x {h}": 5 for w, h in SIZES}
     assert (summary["train"], summary["held_out"], summary["points"]) == (8, 2, POINTS)
     assert summary["photo_bytes"] == sum(5 * 3 * w * h for w, h in SIZES)
+    assert f"is fine: ns-train abcd --data {sound}\n" in printed
     for part in ("10, 5 of", "600", "8 to train on, 2 held out", "mixed-sizes"):
         assert part in printed
 

@@ -253,6 +253,16 @@ def test_a_rasterizer_that_computes_nonsense_is_caught(monkeypatch):
     assert kernels._self_checks(None) == ({}, {"torch on cpu": "off by half"})
 
 
+def test_an_extension_that_does_not_load_is_a_finding(monkeypatch, tmp_path):
+    """As one that was built for another torch."""
+    monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)
+    path = tmp_path / "gsplat_cuda.so"
+    path.write_bytes(b"no library")
+    _, failed = kernels._self_checks(path)
+    assert str(path) in failed["gsplat on cuda"]
+    assert "gsplat.cuda._backend" not in sys.modules
+
+
 @pytest.mark.parametrize(
     ("said", "version"),
     [("Cuda compilation tools, release 13.0, V13.0.48", "13.0"), ("something else", "unknown")],

@@ -1,5 +1,6 @@
 """`abcd check`: look at a data set as training would, without training."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from abcd_ns.tools.json_option import check_json, write_report
 
 SCHEMA = 1
 """Of the JSON file; changes with its fields."""
+DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
+"""Training's option for what is --downscale here."""
 REFUSED = 2
 """Exit code where training would refuse the data."""
 
@@ -88,4 +91,5 @@ def _verdict(report: Report) -> str:
         return f"\nTraining would refuse {data}: mend the errors first."
     if any(finding.level == "warning" for finding in report.findings):
         return f"\n{data} can be trained on; see whether the warnings matter to you."
-    return f"\n{data} is fine: ns-train abcd --data {data}"
+    reduced = f" {DOWNSCALE} {report.downscale}" if report.downscale > 1 else ""
+    return f"\n{data} is fine: ns-train abcd --data {shlex.quote(data)}{reduced}"

@@ -99,19 +99,27 @@ def build_folder() -> Path:
 
 def _self_checks(extension: Path | None) -> tuple[dict[str, float], dict[str, str]]:
     """Differences and faults by rasterizer: torch's on the CPU, and gsplat's where its kernels are built."""
-    from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer, self_check
+    from abcd_ns.engine.rasterizer import TorchRasterizer, self_check
 
     checks = {"torch on cpu": lambda: self_check(TorchRasterizer("auto"), "cpu")}
     if extension is not None:
-        _use(extension)
-        checks["gsplat on cuda"] = lambda: self_check(make_rasterizer("gsplat", "cuda"), "cuda")
+        checks["gsplat on cuda"] = lambda: _check_gsplat(extension)
     agree, failed = {}, {}
     for name, check in checks.items():
         try:
             agree[name] = check()
         except (RuntimeError, ImportError, OSError, AttributeError) as error:
-            failed[name] = str(error).splitlines()[0]
+            failed[name] = (str(error) or repr(error)).splitlines()[0]
     return agree, failed
+
+
+def _check_gsplat(extension: Path) -> float:
+    from abcd_ns.engine.rasterizer import self_check
+
+    _use(extension)
+    from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
+
+    return self_check(GsplatRasterizer(), "cuda")
 
 
 def _use(extension: Path) -> None:
