@@ -8,6 +8,9 @@ from rich.markup import escape
 
 from abcd_ns.errors import UserError
 
+SHOWN = 20
+"""Lines of one error that are shown; the others are counted."""
+
 
 def one_line(text: str) -> str:
     """`text` fit for a terminal: control characters and undecodable bytes of file names are escaped."""
@@ -36,22 +39,25 @@ class InputError(UserError):
     """The input cannot be used; a command shows `str(error)` alone and exits with code 2.
 
     Args:
-        lines: what is wrong, each a sentence that names the file or value and the fix.
+        lines: what is wrong, each a sentence that names the file or value and the fix; `lines` keeps all.
+        limit: how many of them `str(error)` has; the rest is counted.
     """
 
-    def __init__(self, *lines: str):
+    def __init__(self, *lines: str, limit: int = SHOWN):
         self.lines = tuple(one_line(line) for line in lines)
-        super().__init__("\n".join(self.lines))
+        rest = len(lines) - limit
+        more = [f"... and {rest} more like these ({len(lines)} in all)."] if rest > 0 else []
+        super().__init__("\n".join([*self.lines[:limit], *more]))
 
 
 class Problems:
     """Collects errors so that all bad files are named at once, instead of one per run.
 
     Args:
-        limit: how many lines are shown; the rest is counted.
+        limit: see InputError.
     """
 
-    def __init__(self, limit: int = 20):
+    def __init__(self, limit: int = SHOWN):
         self.limit = limit
         self.lines: list[str] = []
 
@@ -73,8 +79,5 @@ class Problems:
         Raises:
             InputError: something was noted.
         """
-        if not self.lines:
-            return
-        rest = len(self.lines) - self.limit
-        more = [f"... and {rest} more like these ({len(self.lines)} in all)."] if rest > 0 else []
-        raise InputError(*self.lines[: self.limit], *more)
+        if self.lines:
+            raise InputError(*self.lines, limit=self.limit)

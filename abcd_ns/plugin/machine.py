@@ -1,4 +1,7 @@
-"""On what runs were made: hardware and versions."""
+"""On what runs were made: hardware and versions.
+
+torch is imported on use: `abcd doctor` must say what is wrong where it does not start.
+"""
 
 import os
 import platform
@@ -10,7 +13,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import psutil
-import torch
 
 import abcd_ns
 
@@ -43,6 +45,8 @@ class Versions:
 
 def describe_machine() -> Machine:
     """This machine."""
+    import torch
+
     return Machine(
         cpu=_cpu_model(),
         cores=_usable_cores(),
@@ -55,13 +59,15 @@ def describe_machine() -> Machine:
 
 def describe_versions() -> Versions:
     """The versions in this environment."""
+    import torch
+
     return Versions(
         python=platform.python_version(),
         torch=torch.__version__,
-        nerfstudio=_version("nerfstudio"),
-        gsplat=_version("gsplat"),
+        nerfstudio=package_version("nerfstudio"),
+        gsplat=package_version("gsplat"),
         abcd_ns=abcd_ns.__version__,
-        commit=_commit(Path(abcd_ns.__file__).resolve().parent.parent),
+        commit=own_commit(),
     )
 
 
@@ -106,14 +112,17 @@ def _usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _version(package: str) -> str | None:
+def package_version(package: str) -> str | None:
+    """The installed version of a distribution, or None."""
     try:
         return version(package)
     except PackageNotFoundError:
         return None
 
 
-def _commit(checkout: Path) -> str | None:
+def own_commit() -> str | None:
+    """The commit of this checkout of abcd_ns, with "+changes" where files differ from it."""
+    checkout = Path(abcd_ns.__file__).resolve().parent.parent
     if not (checkout / ".git").exists():
         return None
     head = _git(checkout, "rev-parse", "HEAD")

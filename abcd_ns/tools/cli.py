@@ -35,6 +35,8 @@ COMMANDS = (
     Command(
         "demo", "abcd_ns.tools.demo:demo", "make a small scene, train it block by block, show the result"
     ),
+    Command("check", "abcd_ns.tools.check.command:check", "examine a data set before training on it"),
+    Command("doctor", "abcd_ns.tools.doctor.command:doctor", "examine this machine and its packages"),
     Command("synth", "abcd_ns.tools.synth.command:synth", "render a synthetic scene to train on"),
     Command("plan", "abcd_ns.tools.plan.command:plan", "say what a run will need, before it begins"),
     Command(
@@ -63,7 +65,8 @@ COMMANDS = (
 EXAMPLES = (
     ("abcd demo", "see it work, without a GPU or any data"),
     ("abcd synth --help", "the options of one command"),
-    ("ns-train abcd --data garden", "train on your own photographs"),
+    ("abcd check --data garden", "see whether your own photographs can be trained on"),
+    ("ns-train abcd --data garden", "train on them"),
 )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from abcd_ns.plugin.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
+from abcd_ns.plugin.data.split_lists import read_list_files
 from abcd_ns.plugin.input_errors import InputError, Problems
 
 MODEL_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
@@ -62,10 +63,14 @@ def read_colmap(data: Path, model: Path) -> Scene:
     """
     binary = (model / "cameras.bin").exists()
     suffix = ".bin" if binary else ".txt"
-    lenses = (_cameras_bin if binary else _cameras_txt)(model / f"cameras{suffix}")
-    images = (_images_bin if binary else _images_txt)(model / f"images{suffix}")
-    xyz, rgb = (_points_bin if binary else _points_txt)(model / f"points3D{suffix}")
     problems = Problems()
+    with problems.collect():
+        lenses = (_cameras_bin if binary else _cameras_txt)(model / f"cameras{suffix}")
+    with problems.collect():
+        images = (_images_bin if binary else _images_txt)(model / f"images{suffix}")
+    with problems.collect():
+        xyz, rgb = (_points_bin if binary else _points_txt)(model / f"points3D{suffix}")
+    problems.raise_if_any()
     for number, lens in lenses.items():
         with problems.collect():
             check_lens(lens, f"{model}/cameras{suffix}: camera {number}")
@@ -90,6 +95,7 @@ def read_colmap(data: Path, model: Path) -> Scene:
         points_xyz=xyz @ Z_UP[:, :3].T,
         points_rgb=rgb,
         applied_transform=Z_UP,
+        split_lists=read_list_files(data, [frame.name for frame in frames]),
     )
 
 
@@ -215,9 +221,10 @@ def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
     for i in range(n):
         starts[i] = at
         at += _POINT.itemsize
-        if at > end:
+        if at <= end:
+            at += 8 * track.unpack_from(cursor.data, at - 8)[0]
+        if at > end:  # at once: what a damaged length makes of `at` may not fit into `starts`
             break
-        at += 8 * track.unpack_from(cursor.data, at - 8)[0]
     cursor.skip(at - cursor.at)
     cursor.finish()
     raw = np.frombuffer(cursor.data, dtype=np.uint8)
@@ -277,7 +284,13 @@ def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
         except (ValueError, IndexError):
             raise _broken_line(path, number) from None
         images.append((name, pose[:4], pose[4:], camera))
-        next(lines, None)
+        number, observed = next(lines, (number + 1, ""))
+        # Editors drop empty lines; the next image would then be taken for this one's 2D points.
+        if observed and not observed.rsplit(maxsplit=1)[-1].removeprefix("-").isdigit():
+            raise InputError(
+                f"{path}, line {number}: not the 2D points of {name}; an image takes two lines, of which the "
+                "second may be empty: export the model again."
+            )
     return images
 
 

@@ -46,7 +46,7 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoFile], list[str]
                 f"{copies[factor]} does not fit and is not used; {full} is reduced instead ({error.lines[0]})"
             )
     if full.is_dir():
-        return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene.frames)
+        return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene)
     if not copies:
         count, example = len(scene.frames), scene.frames[0].name
         raise InputError(
@@ -121,12 +121,13 @@ def _check_size(path: Path, size: tuple[int, int], frame: Frame, of: int) -> Non
     )
 
 
-def _unposed(folder: Path, frames: list[Frame]) -> list[str]:
+def _unposed(folder: Path, scene: Scene) -> list[str]:
     """A note on photos that the model knows nothing of: training goes on without them."""
-    names = {os.path.normpath(frame.name) for frame in frames}
-    found = (p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES)
-    extra = sorted(str(p.relative_to(folder)) for p in found if str(p.relative_to(folder)) not in names)
+    posed = {os.path.abspath(folder / frame.name) for frame in scene.frames}
+    known = posed | {os.path.abspath(frame.mask_path) for frame in scene.frames if frame.mask_path}
+    found = (p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and not p.is_dir())
+    extra = sorted(str(p.relative_to(folder)) for p in found if os.path.abspath(p) not in known)
     if not extra:
         return []
-    few = " Fewer than half have one: see whether the model is complete." if len(extra) > len(names) else ""
+    few = " Fewer than half have one: see whether the model is complete." if len(extra) > len(posed) else ""
     return [f"{len(extra)} photos in {folder} have no pose and are not used ({extra[0]}, ...).{few}"]

@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from abcd_ns.engine.types import Crop
+from abcd_ns.plugin.data.picture_files import has_alpha, open_picture, undecodable
 from abcd_ns.plugin.data.undistort import Undistortion
 from abcd_ns.plugin.input_errors import InputError
 
@@ -125,21 +126,17 @@ def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UIn
     return reduced.reshape(size[1], size[0], image.shape[2])
 
 
-def _decode(path: Path, has_alpha: Callable[[Image.Image], bool]) -> np.ndarray:
+def _decode(path: Path, keeps_alpha: Callable[[Image.Image], bool]) -> np.ndarray:
     """uint8 [H, W, 3 or 4] as stored."""
     try:
-        with Image.open(path) as picture:
-            return np.array(picture.convert("RGBA" if has_alpha(picture) else "RGB"))
+        with open_picture(path) as picture:
+            return np.array(picture.convert("RGBA" if keeps_alpha(picture) else "RGB"))
     except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path} can no longer be read ({error}); copy the photo again.") from None
-
-
-def _has_alpha(picture: Image.Image) -> bool:
-    return "A" in picture.getbands() or "transparency" in picture.info
+        raise undecodable(path, error) from None
 
 
 def _read_photo(source: PhotoSource) -> Tensor:
-    image = _decode(source.path, _has_alpha)
+    image = _decode(source.path, has_alpha)
     if (image.shape[1], image.shape[0]) != source.stored:
         wanted = f"{source.stored[0]} x {source.stored[1]}"
         raise InputError(

@@ -2,16 +2,19 @@
 
 import math
 import os
+from collections import Counter
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from abcd_ns.plugin.input_errors import InputError
+from abcd_ns.plugin.data.split_lists import SplitLists
+from abcd_ns.plugin.input_errors import InputError, Problems
 
 MAX_SIDE = 100_000
 """Pixels along one side beyond which a width or height is taken for a broken file."""
+MAX_COORDINATE = 1e12
+"""World units beyond which a camera's place is taken for a broken file."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,8 @@ class Scene:
     applied_transform: np.ndarray = field(default_factory=lambda: np.eye(4)[:3])
     """float64 [3, 4]: world of the Scene = applied_scale x (applied_transform @ original coordinates)."""
     applied_scale: float = 1.0
+    split_lists: SplitLists | None = None
+    """Which frames are trained on and which are held out, if the data say so."""
     notes: list[str] = field(default_factory=list)
     """What the user should know but need not repair."""
 
@@ -94,6 +99,10 @@ def inside(root: Path, relative: str, said_by: Path) -> Path:
     Raises:
         InputError: the path leaves `root`.
     """
+    try:
+        os.fsencode(relative)
+    except UnicodeEncodeError:
+        raise InputError(f"{said_by}: no file can have the name {relative}; correct the path.") from None
     path = Path(os.path.abspath(root / relative))
     if not path.is_relative_to(os.path.abspath(root)) or "\0" in relative:
         raise InputError(
@@ -131,7 +140,7 @@ def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
     """`matrix` [3 or 4, 4] as float64 [3, 4] with its rotation made exact (the nearest one).
 
     Raises:
-        InputError: named `label`: wrong shape, NaN, infinite, a scale, a shear or a reflection.
+        InputError: named `label`: wrong shape, NaN, infinite, a scale, a shear, a reflection, or too far off.
     """
     if matrix.shape not in ((3, 4), (4, 4)):
         raise InputError(
@@ -139,9 +148,14 @@ def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
         )
     if not np.isfinite(matrix).all():
         raise InputError(f"{label} holds NaN or infinity; remove the frame or repair its pose.")
+    if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
+        raise InputError(
+            f"{label} is {np.abs(matrix[:3, 3]).max():.1g} units from the origin; remove the frame or repair "
+            "its pose."
+        )
     rotation = matrix[:3, :3].astype(np.float64)
     u, stretch, vt = np.linalg.svd(rotation)
-    if np.abs(stretch - 1).max() > 1e-2 or np.linalg.det(rotation) < 0:
+    if not np.abs(stretch - 1).max() <= 1e-2 or np.linalg.det(rotation) < 0:
         raise InputError(
             f"{label} is no rotation (it scales, shears or mirrors); remove the frame or repair its pose."
         )
@@ -158,10 +172,12 @@ def check_layout(scene: Scene) -> None:
         raise InputError(
             f"{scene.model} has {len(scene.frames)} camera(s); at least 2 are needed: add photos."
         )
-    names = [frame.name for frame in scene.frames]
-    if len(set(names)) < len(names):
-        twice = next(a for a, b in pairwise(names) if a == b)
-        raise InputError(f"{scene.model} names the photo {twice} twice; remove one of the two.")
+    problems = Problems()
+    for name, times in Counter(frame.name for frame in scene.frames).items():
+        if times > 1:
+            many = "twice" if times == 2 else f"{times} times"
+            problems.add(f"{scene.model} names the photo {name} {many}; keep one pose of it.")
+    problems.raise_if_any()
     centers = np.stack([frame.camera_to_world[:, 3] for frame in scene.frames])
     if np.abs(centers - centers[0]).max() <= 1e-12 * np.abs(centers).max():
         raise InputError(

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import numpy as np
 from abcd_ns.plugin.data.picture_files import read_header
 from abcd_ns.plugin.data.ply import read_points
 from abcd_ns.plugin.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
+from abcd_ns.plugin.data.split_lists import SPLITS, SplitLists, split_lists
 from abcd_ns.plugin.input_errors import InputError, Problems
 
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYES = ("OPENCV_FISHEYE",)
+LARGEST = sys.float_info.max
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
 
 
@@ -64,7 +67,8 @@ def read_transforms(path: Path) -> Scene:
     problems.raise_if_any()
     folder, frames = _photo_folder(root, frames)
     frames.sort(key=lambda frame: frame.name)
-    return Scene(path, root, folder, frames, xyz, rgb, transform, scale)
+    lists = _split_lists(path, meta, folder.relative_to(root), [frame.name for frame in frames])
+    return Scene(path, root, folder, frames, xyz, rgb, transform, scale, lists)
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -72,7 +76,7 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not a regular file; put nerfstudio's transforms.json there.")
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid JSON ({error}); copy or make it again.") from None
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
@@ -80,10 +84,28 @@ def _load(path: Path) -> dict[str, Any]:
     return meta
 
 
+def _split_lists(path: Path, meta: dict[str, Any], folder: Path, names: list[str]) -> SplitLists | None:
+    """train_filenames, val_filenames and test_filenames: file_paths of frames, as nerfstudio has it."""
+    found: dict[str, list[str]] = {}
+    for split in SPLITS:
+        key = f"{split}_filenames"
+        if key not in meta:
+            continue
+        listed = meta[key]
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise InputError(f"{path}: {key} must be a list of file_paths.")
+        found[split] = [os.path.normpath(name) for name in listed]
+    called = {str(folder / name): name for name in names}
+    # As for the frames' own file_paths, the ending may be left out.
+    called |= {call.removesuffix(".png"): name for call, name in called.items()}
+    return split_lists(found, called, {split: f"{path}: {split}_filenames" for split in found})
+
+
 def _number(values: dict[str, Any], key: str, label: str, default: float | None = None) -> float:
     """values[key] as a finite float."""
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    # Compared rather than converted: JSON's whole numbers may be larger than any float.
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
         raise InputError(f"{label}: {key} must be a number, not {value}.")
     return float(value)
 
@@ -91,7 +113,7 @@ def _number(values: dict[str, Any], key: str, label: str, default: float | None 
 def _matrix(value: Any, label: object) -> np.ndarray:
     try:
         return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{label}: a matrix must be rows of numbers, all of one length.") from None
 
 

@@ -120,5 +120,8 @@ def _splatfacto(job: Job) -> TrainerConfig:
 def _parser(job: Job) -> AbcdDataParserConfig:
     settings = job.settings
     return AbcdDataParserConfig(
-        data=Path(settings.data), downscale_factor=settings.downscale, eval_interval=HELD_OUT_EVERY
+        data=Path(settings.data),
+        downscale_factor=settings.downscale,
+        eval_mode="interval",
+        eval_interval=HELD_OUT_EVERY,
     )

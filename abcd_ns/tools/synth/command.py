@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -13,9 +12,9 @@ from typing import Annotated
 import tyro
 from PIL import Image
 from rich.console import Console
-from rich.progress import Progress
 
 from abcd_ns.errors import UserError
+from abcd_ns.plugin.late_bar import LateBar
 from abcd_ns.tools.synth.cameras import Camera, Lens, court_cameras
 from abcd_ns.tools.synth.colmap_writer import write_model
 from abcd_ns.tools.synth.court import Layout, Site
@@ -26,8 +25,6 @@ from abcd_ns.tools.synth.world import World
 FORMAT = 1
 """Raised whenever the same settings would draw another scene."""
 _MARKER = "synth.json"
-_PROGRESS_AFTER = 2.0
-"""Seconds of work after which a progress bar appears."""
 
 
 class SynthError(UserError):
@@ -135,8 +132,8 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[list[Camera]
         picture = render(world, camera, lens, settings.supersample)
         Image.fromarray(picture).save(out / "images" / camera.name, optimize=False)
 
-    parts = []
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool, _LateBar(len(cameras), console) as bar:
+    parts, bar = [], LateBar("Drawing", len(cameras), console)
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool, bar:
         for court in range(settings.courts):
             own = range(court * count, (court + 1) * count)
             for _ in pool.map(draw, (cameras[c] for c in own)):
@@ -149,30 +146,6 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[list[Camera]
         raise SynthError("No point is seen by two views; raise --views-per-court or --points-per-court.")
     write_model(out / "sparse" / "0", cameras, lens, points)
     return cameras, points
-
-
-class _LateBar:
-    """A progress bar that appears only when the work takes a while."""
-
-    def __init__(self, total: int, console: Console) -> None:
-        self._progress = Progress(console=console, transient=True)
-        self._task = self._progress.add_task("Drawing", total=total)
-        self._start = time.monotonic()
-        self._shown = False
-
-    def __enter__(self) -> "_LateBar":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._shown:
-            self._progress.stop()
-
-    def advance(self) -> None:
-        """One more picture is done."""
-        self._progress.advance(self._task)
-        if not self._shown and time.monotonic() - self._start > _PROGRESS_AFTER:
-            self._progress.start()
-            self._shown = True
 
 
 def _prepare(out: Path, settings: Settings, overwrite: bool) -> bool:

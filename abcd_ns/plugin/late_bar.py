@@ -1,0 +1,39 @@
+"""A progress bar for work that may be over before anybody has looked."""
+
+import time
+
+from rich.console import Console
+from rich.progress import Progress
+
+APPEARS_AFTER = 2.0
+"""Seconds of work after which the bar appears."""
+
+
+class LateBar:
+    """A progress bar with the time left that appears only when the work takes a while, and goes at its end.
+
+    Args:
+        title: what is being done.
+        total: how often `advance` will be called.
+        console: where to; None is stderr, so that the bar is in no output that is piped on.
+    """
+
+    def __init__(self, title: str, total: int, console: Console | None = None) -> None:
+        self._progress = Progress(console=console or Console(stderr=True), transient=True)
+        self._task = self._progress.add_task(title, total=total)
+        self._start = time.monotonic()
+        self._shown = False
+
+    def __enter__(self) -> "LateBar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            self._progress.stop()
+
+    def advance(self) -> None:
+        """One more is done."""
+        self._progress.advance(self._task)
+        if not self._shown and time.monotonic() - self._start > APPEARS_AFTER:
+            self._progress.start()
+            self._shown = True

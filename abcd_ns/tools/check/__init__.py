@@ -1,0 +1,1 @@
+"""`abcd check`: what training would refuse, and what is readable but doubtful."""

@@ -1,0 +1,1 @@
+"""`abcd doctor`: whether this machine and environment can train, and what to do where not."""
