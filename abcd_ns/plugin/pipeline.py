@@ -27,6 +27,8 @@ from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
 from abcd_ns.plugin.views import views_of
+from abcd_ns.viewer import guard
+from abcd_ns.viewer.panel import AbcdPanel
 
 if TYPE_CHECKING:
     from abcd_ns.plugin.config import AbcdPipelineConfig
@@ -45,8 +47,11 @@ class AbcdPipeline(VanillaPipeline):
 
     def __init__(self, config: "AbcdPipelineConfig", *args: Any, **kwargs: Any) -> None:
         config.model.mirror(config.training)
+        # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
+        guard.install()
         super().__init__(config, *args, **kwargs)
         self._coordinator: Coordinator | None = None
+        self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
 
     @property
     def coordinator(self) -> Coordinator | None:
@@ -63,6 +68,7 @@ class AbcdPipeline(VanillaPipeline):
         self.model.follow(self._coordinator)
         report = ProgressReport(self._coordinator)
         self._coordinator.announce.subscribe(report)
+        self.panel.follow(self._coordinator)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
         def end_step(step: int) -> None:  # noqa: ARG001 - the coordinator counts

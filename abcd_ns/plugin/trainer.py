@@ -47,6 +47,13 @@ class AbcdTrainer(Trainer):
         self.step = step
         CONSOLE.print(f"Going on after step {step + 1} of {self.total_steps} from {path}")
 
+    def _update_viewer_state(self, step: int) -> None:
+        """As nerfstudio's, which lets a client that goes away, or sends nonsense, end the run."""
+        try:
+            super()._update_viewer_state(step)
+        except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError) as error:
+            CONSOLE.print(f"The viewer failed at step {step} ({error!r}); training goes on.", markup=False)
+
     def _checkpoint_to_load(self) -> Path | None:
         config = self.config
         if config.load_dir is None:
