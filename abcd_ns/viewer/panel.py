@@ -138,13 +138,13 @@ class AbcdPanel(ViewerControl):
             ),
         )
         self._controls.progress(coordinator.progress, share)
-        if self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
+        if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
             self._curve_drawn = self._updated
             self._controls.draw_curve(board.curve)
 
     def _where(self, active: ActiveVisit | None) -> str:
         if active is None:
-            return "Between visits"
+            return "All blocks at once" if self._coordinator.config.exact else "Between visits"
         steps = f" of {active.steps}" if 0 < active.steps < UNLIMITED else ""
         step = self._layers or f"step {active.done}{steps}"
         if active.is_whole:
@@ -156,6 +156,8 @@ class AbcdPanel(ViewerControl):
         if self._coordinator is None:
             state = (Status.UNTRAINED, Status.DONE)
             return [BlockRow(b, state[scene.count(b) > 0], scene.count(b), None, None) for b in blocks]
+        if self._coordinator.config.exact:
+            return [BlockRow(b, Status.ACTIVE, None, None, None) for b in blocks]
         active = self._coordinator.state.active
         whole = active is not None and active.is_whole
         counts = {block: None if whole else scene.count(block) for block in blocks}
