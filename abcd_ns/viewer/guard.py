@@ -7,6 +7,7 @@ module another `websockets.serve`: one that asks first, and reads frames before 
 """
 
 import sys
+import warnings
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from typing import Any
@@ -45,7 +46,10 @@ def install() -> bool:
     if isinstance(package, _Overlay):
         return True
     if hasattr(infra, "WebSocketServerProtocol") and hasattr(package, "server"):  # viser 0.2
-        server = _Overlay(package.server, serve=guard_legacy(package.server.serve))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of the older API, which is viser's choice
+            serve = package.server.serve
+        server = _Overlay(package.server, serve=guard_legacy(serve))
         infra.websockets = _Overlay(package, server=server)
     elif hasattr(infra, "ServerConnection") and hasattr(package, "asyncio"):  # viser 1
         server = _Overlay(package.asyncio.server, serve=guard_asyncio(package.asyncio.server.serve))
