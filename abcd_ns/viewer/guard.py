@@ -10,6 +10,7 @@ import sys
 import warnings
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
+from importlib.metadata import version
 from typing import Any
 
 import msgspec
@@ -55,8 +56,9 @@ def install() -> bool:
         server = _Overlay(package.asyncio.server, serve=guard_asyncio(package.asyncio.server.serve))
         infra.websockets = _Overlay(package, asyncio=_Overlay(package.asyncio, server=server))
     else:
+        found = version("viser")
         CONSOLE.print(
-            f"[bold yellow]warning:[/] the viewer is unguarded: viser {viser.__version__} is built otherwise "
+            f"[bold yellow]warning:[/] the viewer is unguarded: viser {found} is built otherwise "
             "than the versions that are known. Use --vis tensorboard on a machine that others use, too."
         )
         return False

@@ -127,9 +127,9 @@ def test_paths_that_are_none(path):
 
 
 def test_a_refusal_quotes_a_stranger_harmlessly():
-    reason = HOME.refusal("/", headers("\x1b[31m" + "x" * 500))
-    assert "\x1b" not in reason
-    assert len(reason) < 200
+    reasons = [HOME.refusal("/\x1b[31m" + "x" * 500, headers()), HOME.refusal("/", headers("x" * 500))]
+    assert "\x1b" not in reasons[0]
+    assert max(map(len, reasons)) < 200
 
 
 def camera(**changes):
