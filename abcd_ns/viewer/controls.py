@@ -1,18 +1,17 @@
 """The panel's controls in the browser, by the calls that viser 0.2 and 1 have in common."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import viser
 
+from abcd_ns.viewer.chart import curve_image
 from abcd_ns.viewer.pictures import Show
-
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
 
 FOLLOW = "the one in training"
 """The entry of the list of blocks that stands for whichever is active."""
-CURVE_COLOR = "#ffd369"
+CURVE = "PSNR of training crops in dB over seconds of training"
 
 
 class Controls:
@@ -43,7 +42,9 @@ class Controls:
                 self._texts["memory"] = gui.add_markdown("")
             if trains:
                 with gui.add_folder("Accuracy over time", expand_by_default=True):
-                    self._curve = gui.add_plotly(curve_figure([]), aspect=1.7)
+                    # A root for pictures' files, which viser asks for although there are none.
+                    self._texts["curve"] = gui.add_markdown(curve_image([], CURVE), image_root=Path())
+                    gui.add_markdown(CURVE)
         for handle in (self._show, self._block, self._boxes, self._cameras):
             handle.on_update(lambda _: changed())
 
@@ -73,7 +74,7 @@ class Controls:
         self._block.options = (FOLLOW, *names) if self._trains else names
 
     def write(self, **texts: str) -> None:
-        """Set texts: headline, sweep, blocks, memory."""
+        """Set texts: headline, sweep, blocks, memory, curve."""
         for name, text in texts.items():
             if self._texts[name].content != text:
                 self._texts[name].content = text
@@ -85,29 +86,10 @@ class Controls:
 
     def draw_curve(self, points: Sequence[tuple[float, float]]) -> None:
         """Redraw the curve of accuracy over time."""
-        self._curve.figure = curve_figure(points)
+        self.write(curve=curve_image(points, CURVE))
 
 
 def _move(bar: Any, share: float) -> None:
     value = round(100 * min(max(share, 0.0), 1.0), 1)
     if bar.value != value:
         bar.value = value
-
-
-def curve_figure(points: Sequence[tuple[float, float]]) -> "Figure":
-    """PSNR over seconds of training, small and dark as the panel is."""
-    import plotly.graph_objects as go  # takes half a second: not for every ns-* command
-
-    seconds, psnr = zip(*points, strict=True) if points else ((), ())
-    line = go.Scatter(x=seconds, y=psnr, mode="lines", line={"color": CURVE_COLOR, "width": 2})
-    figure = go.Figure(line)
-    axis = {"gridcolor": "#3a3f4b", "zerolinecolor": "#3a3f4b", "color": "#c1c2c5"}
-    figure.update_layout(
-        margin={"l": 44, "r": 8, "t": 8, "b": 36},
-        paper_bgcolor="rgba(0,0,0,0)",
-        plot_bgcolor="rgba(0,0,0,0)",
-        font={"size": 10},
-        xaxis={"title": {"text": "seconds of training"}, **axis},
-        yaxis={"title": {"text": "PSNR of training crops, dB"}, **axis},
-    )
-    return figure

@@ -5,8 +5,10 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
 import psutil
 import torch
+import viser
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from abcd_ns.engine.blocks import BlockTree
@@ -21,7 +23,7 @@ from abcd_ns.viewer.boxes import boxes_of, bulk
 from abcd_ns.viewer.controls import Controls
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Choice
-from abcd_ns.viewer.scenery import Scenery, views_that_see
+from abcd_ns.viewer.scenery import Scenery, overview, views_that_see
 from abcd_ns.viewer.words import block_table, headline, memory_table, sweep_line
 
 if TYPE_CHECKING:
@@ -65,6 +67,7 @@ class AbcdPanel(ViewerControl):
         self._cameras_of: int | None = None
         self._layers = ""
         self._laid_out = False
+        self._overview: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
     def _setup(self, viewer: "Viewer") -> None:
@@ -79,6 +82,7 @@ class AbcdPanel(ViewerControl):
         trains = viewer.trainer is not None
         self._controls = Controls(server.gui, viewer.stats_markdown.order + 0.5, self._choose, trains)
         self._scenery = Scenery(server.scene, viewer.config.camera_frustum_scale)
+        server.on_client_connect(self._welcome)
         if not trains:
             self._lay_out()
             self._update()
@@ -109,7 +113,9 @@ class AbcdPanel(ViewerControl):
             means = self._model.initial.means
         else:
             means = torch.cat([scene.gaussians(block).means for block in range(tree.num_blocks)])
-        self._scenery.set_boxes(boxes_of(tree, bulk(means)))
+        bounds = bulk(means)
+        self._scenery.set_boxes(boxes_of(tree, bounds))
+        self._overview = overview(bounds, self._views())
         self._controls.set_blocks(tree.num_blocks)
         self._laid_out = True
 
@@ -126,17 +132,13 @@ class AbcdPanel(ViewerControl):
 
     def _report(self, coordinator: Coordinator) -> None:
         board, state, seconds = self._board, coordinator.state, self._seconds
-        left = seconds_left(seconds, coordinator.progress)
-        share = sweep_share(board, state)
-        visits = board.sweep_visits + len(state.queue) + (board.visit is not None)
-        self._controls.write(
-            headline=headline(self._where(state.active), coordinator.progress, left),
-            sweep=""
-            if board.sweep is None
-            else sweep_line(
-                board.sweep, board.sweep_visits, visits, seconds_left(seconds - board.sweep_began, share)
-            ),
-        )
+        share, sweep = sweep_share(board, state), ""
+        if board.sweep is not None and not coordinator.finished:
+            visits = board.sweep_visits + len(state.queue) + (board.visit is not None)
+            left = seconds_left(seconds - board.sweep_began, share)
+            sweep = sweep_line(board.sweep, board.sweep_visits, visits, left)
+        where, left = self._where(state.active), seconds_left(seconds, coordinator.progress)
+        self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)
         self._controls.progress(coordinator.progress, share)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
             self._curve_drawn = self._updated
@@ -176,6 +178,11 @@ class AbcdPanel(ViewerControl):
     @property
     def _seconds(self) -> float:
         return 0.0 if self._coordinator is None else self._coordinator.stopwatch.seconds
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Let a browser begin with a view of the whole scene."""
+        if self._overview is not None:
+            client.camera.position, client.camera.look_at = self._overview
 
     # -- what the user chooses -----------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import torch
 import viser
 import viser.transforms as vtf
@@ -20,14 +21,18 @@ COLORS = {
     Status.DONE: (40, 190, 140),
     Status.UNDER_OBSERVED: (235, 70, 70),
 }
-THICKNESS = 0.0025
+THICKNESS = 0.0018
 """Of a box's edges, as a share of the diagonal of all boxes."""
-STRONGER = 2.5
+STRONGER = 3.0
 """How much thicker the edges of the active block are."""
 MOST_LABELS = 64
 """Blocks that get their number in the scene; with more they would hide it."""
 MOST_FRUSTA = 200
 """Cameras shown at a time; evenly chosen of more."""
+OVERVIEW = 0.8
+"""How far from its middle a scene is first looked at, in diagonals of its bulk."""
+ELEVATION = 0.6
+"""Tangent of the angle from which it is looked down on."""
 SEEN_SHARE = 0.05
 """Share of a block's Gaussians that must lie in a view's image for it to count as one that sees the block."""
 
@@ -95,6 +100,24 @@ class Scenery:
             wxyz=turn.wxyz,
             position=(view.center.double().cpu() * SCENE_SCALE).numpy(),
         )
+
+
+def overview(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Where to look at the whole scene from, and at what, in the viewer's units: from behind the cameras.
+
+    Args:
+        box: holds the bulk of the scene.
+        views: the training views; without any, the scene is looked at from one side.
+    """
+    target, size = (box.lower + box.upper) / 2, float((box.upper - box.lower).norm())
+    centers = torch.stack([view.center.double().cpu() for view in views] or [target + 1])
+    level = torch.tensor([1.0, 1.0, 0.0]).double()
+    away = (centers.mean(dim=0) - target) * level
+    if float(away.norm()) < 0.05 * size:  # cameras all around
+        away = (centers[0] - target) * level
+    direction = torch.nn.functional.normalize(away, dim=0) + ELEVATION * (1 - level)
+    eye = target + OVERVIEW * size * torch.nn.functional.normalize(direction, dim=0)
+    return (eye * SCENE_SCALE).numpy(), (target * SCENE_SCALE).numpy()
 
 
 def views_that_see(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:

@@ -24,7 +24,7 @@ def headline(where: str, progress: float, left: float | None) -> str:
 
 def sweep_line(sweep: int, over: int, visits: int, left: float | None) -> str:
     """Where the sweep stands."""
-    return f"Sweep {sweep}: {over} of {visits} blocks visited, {clock(left)} left"
+    return f"Sweep {sweep}: {over} of {visits} blocks" + ("" if left is None else f", {clock(left)} left")
 
 
 def block_table(rows: Sequence[BlockRow]) -> str:
@@ -34,7 +34,7 @@ def block_table(rows: Sequence[BlockRow]) -> str:
         urgent = (Status.ACTIVE, Status.UNDER_OBSERVED)
         first = sorted(rows, key=lambda row: (row.status not in urgent, row.block))[:MOST_ROWS]
         shown = sorted(first, key=lambda row: row.block)
-    lines = ["| block | state | Gaussians | PSNR | views |", "| ---: | --- | ---: | ---: | ---: |"]
+    lines = ["| # | state | Gaussians | PSNR | views |", "| ---: | --- | ---: | ---: | ---: |"]
     lines += [_row(row) for row in shown]
     if len(rows) > len(shown):
         counts = Counter(row.status.value for row in rows)

@@ -48,6 +48,8 @@ class Watched:
         self.trainer.setup()
         self.server = self.trainer.viewer_state.viser_server
         self.browser = Browser(self.server, origin=f"http://127.0.0.1:{self.server.get_port()}")
+        self.browser.send(CAMERA)
+        self.browser.wait_for(lambda m: m["type"] == "SetCameraLookAtMessage")
         self.browser.send(camera_of(self.trainer.pipeline))
         self.trainer.train()
 
@@ -126,9 +128,10 @@ def test_the_panel_reports_the_run(watched):
     assert any(text.startswith("**Block ") and " left" in text for text in said)
     assert any(text.startswith("Sweep ") for text in said)
     assert any("| RAM |" in text and "| layers on disk |" in text for text in said)
-    table = [text for text in said if text.startswith("| block | state |")][-1]
+    table = [text for text in said if text.startswith("| # | state |")][-1]
     assert table.count("| done |") == BLOCKS
     assert any(text == "**Trained.**" for text in said)
+    assert any("](data:image/svg+xml;base64," in text for text in said)
 
 
 def test_pictures_came_while_it_trained_and_show_the_scene(watched):
@@ -222,7 +225,9 @@ def test_ns_viewer_stays_on_this_machine_and_shows_blocks(finished):
     assert tuple(choices["options"]) == ("1",)
     browser.wait_for(lambda m: "options" in m.get("updates", {}) and len(m["updates"]["options"]) == BLOCKS)
     browser.wait_for(lambda m: m["type"] == "MeshMessage" and m["name"] == f"/abcd/block_{BLOCKS}")
-    browser.wait_for(lambda m: "| block | state |" in m.get("updates", {}).get("markdown", ""))
+    browser.wait_for(lambda m: "| # | state |" in m.get("updates", {}).get("markdown", ""))
+    browser.send(CAMERA)
+    browser.wait_for(lambda m: m["type"] == "SetCameraLookAtMessage")
     browser.send(camera_of(viewer.pipeline))
     picture = browser.wait_for(lambda m: m["type"] == "BackgroundImageMessage" and covered(pixels(m)) > 0.5)
     everything, since = covered(pixels(picture)), browser.heard
@@ -255,19 +260,18 @@ def test_every_method_listens_on_this_machine_alone():
     assert {s.config.viewer.websocket_host for s in specifications} == {"127.0.0.1"}
 
 
-@pytest.mark.parametrize(
-    "error", [KeyError(3), ValueError("wxyz"), TypeError("max_res"), RuntimeError("full")]
-)
-def test_a_viewer_that_fails_does_not_end_the_run(data, tmp_path, error, monkeypatch, capsys):
-    def fail(*_: object) -> None:
-        raise error
+def test_a_viewer_that_fails_does_not_end_the_run(data, tmp_path, monkeypatch, capsys):
+    errors = [KeyError(3), ValueError("wxyz"), TypeError("max_res"), RuntimeError("full"), AssertionError()]
+
+    def fail(viewer: Viewer, step: int, *_: object) -> None:  # noqa: ARG001
+        raise errors[step]
 
     monkeypatch.setattr(Viewer, "update_scene", fail)
     config = configure_viewer(data, tmp_path)
-    config.max_num_iterations = 3
+    config.max_num_iterations = len(errors)
     trainer = run(config)
-    assert trainer.pipeline.coordinator.state.step == 3
-    assert "iewer failed" in capsys.readouterr().out
+    assert trainer.pipeline.coordinator.state.step == len(errors)
+    assert capsys.readouterr().out.count("iewer failed") == len(errors)
 
 
 def test_neither_training_nor_viewing_needs_a_network(data, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, center, clipped, frame_mesh
-from abcd_ns.viewer.scenery import views_that_see
+from abcd_ns.viewer.scenery import overview, views_that_see
 from tests.reference.scenes import ring_of_views
 
 
@@ -93,3 +93,16 @@ def test_a_twentieth_of_a_block_in_the_image_suffices():
     few = torch.cat([torch.zeros(1, 3), behind.expand(20, 3)])
     assert len(views_that_see(some, views)) == 1
     assert views_that_see(few, views) == []
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 8])
+def test_the_first_look_is_from_behind_the_cameras(count):
+    views = ring_of_views(8)[:count]
+    shown = box((-1, -1, -1), (1, 1, 1))
+    eye, target = overview(shown, views)
+    assert target.tolist() == [0.0, 0.0, 0.0]
+    # Far enough out to have all of the box in view, and from above.
+    assert np.linalg.norm(eye) > SCENE_SCALE * float(shown.upper.norm())
+    assert eye[2] > 0
+    if count == 1:
+        assert np.dot(eye[:2], views[0].center[:2].numpy()) > 0
