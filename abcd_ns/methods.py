@@ -5,6 +5,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig, FusedAdamConfig
+from abcd_ns.viewer.rules import THIS_MACHINE
 
 LEARNING_RATES = {
     "means": 1.6e-4,
@@ -50,7 +51,7 @@ def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
             name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
             for name, rate in LEARNING_RATES.items()
         },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host=THIS_MACHINE),
         vis="viewer",
     )
 

@@ -1,10 +1,13 @@
 """What a user sets: the trainer's, pipeline's, datamanager's and model's options."""
 
 import dataclasses
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
+from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
@@ -21,6 +24,7 @@ from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.pipeline import AbcdPipeline
 from abcd_ns.plugin.room import check_room, device_budget
 from abcd_ns.plugin.trainer import AbcdTrainer
+from abcd_ns.viewer.rules import THIS_MACHINE, WILDCARDS
 
 MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
 """Splatfacto's model options that nerfstudio's tools read; `AbcdModelConfig.mirror` sets them."""
@@ -146,11 +150,28 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Stop after this many seconds of training; evaluation and saving do not count."""
 
 
+def at_home(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerConfig:
+    """Options of the viewer, on this machine alone unless the command line names a host.
+
+    ns-viewer replaces a run's viewer section by its own options, whose default is to listen on all networks.
+    """
+    flags = ("--viewer.websocket-host", "--viewer.websocket_host")
+    named = any(argument.partition("=")[0] in flags for argument in arguments)
+    if named or viewer.websocket_host not in WILDCARDS:
+        return viewer
+    return dataclasses.replace(viewer, websocket_host=THIS_MACHINE)
+
+
 @dataclass
 class AbcdTrainerConfig(TrainerConfig):
     """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""
 
     _target: type = field(default_factory=lambda: AbcdTrainer)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "viewer" and "viewer" in self.__dict__:
+            value = at_home(value, sys.argv)
+        super().__setattr__(name, value)
 
     def print_to_terminal(self) -> None:
         """A few lines instead of nerfstudio's some hundred; all of it is in config.yml."""
@@ -188,6 +209,8 @@ class AbcdTrainerConfig(TrainerConfig):
                 raise UserError(
                     f"--pipeline.ram-budget-gb must be 0 or more, not {self.pipeline.ram_budget_gb}."
                 )
+            if self.is_viewer_legacy_enabled():
+                raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
             check_training(self.pipeline.training)
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")

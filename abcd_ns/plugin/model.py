@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.config import resolve_ownership
+from abcd_ns.engine.config import TrainingConfig, resolve_ownership
 from abcd_ns.engine.coordinator import Batch, Coordinator
 from abcd_ns.engine.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.loss import mean_psnr, photometric_loss, ssim_windows
-from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import live_gaussians
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import Raster, Rasterizer, make_rasterizer
@@ -28,6 +28,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.plugin.datamanager import BATCH
 from abcd_ns.plugin.metrics import image_metrics
 from abcd_ns.plugin.views import view_of
+from abcd_ns.viewer.pictures import BlockPictures, Choice, Cropped, Show, asked_by_viewer, bounded
 
 if TYPE_CHECKING:
     from abcd_ns.plugin.config import AbcdModelConfig
@@ -61,6 +62,7 @@ class AbcdModel(SplatfactoModel):
         self.background_color = (
             torch.tensor(VIEWER_BACKGROUND) if random else get_color(self.config.background_color)
         )
+        self.choice = Choice()
         self._coordinator: Coordinator | None = None
         self._rasterizer: Rasterizer | None = None
 
@@ -162,12 +164,17 @@ class AbcdModel(SplatfactoModel):
 
     def _whole_outputs(self, view: View) -> dict[str, Tensor]:
         background = self.background_color.to(self.device)
-        merged = self.draw_merged(view)
-        layer = self.draw_composited(view) if self.config.render == "composited" else merged.layer
+        if asked_by_viewer():
+            view = bounded(view)
+            raster = self.draw_for_viewer(view)
+            layer = raster.layer
+        else:
+            raster = self.draw_merged(view)
+            layer = self.draw_composited(view) if self.config.render == "composited" else raster.layer
         transmittance = layer.transmittance[..., None]
-        alpha = 1 - merged.transmittance[..., None]
+        alpha = 1 - raster.transmittance[..., None]
         # Where nothing is, splatfacto shows the farthest depth of the picture.
-        depth = torch.where(alpha > 0, merged.depth[..., None] / alpha.clamp_min(1e-10), merged.depth.max())
+        depth = torch.where(alpha > 0, raster.depth[..., None] / alpha.clamp_min(1e-10), raster.depth.max())
         return {
             "rgb": (layer.color + transmittance * background).clamp(0, 1),
             "depth": depth,
@@ -177,10 +184,14 @@ class AbcdModel(SplatfactoModel):
 
     @torch.no_grad()
     def draw_merged(self, view: View) -> Raster:
-        """All Gaussians at once, sorted by depth: what every ordinary viewer shows."""
-        gaussians = self.merged().to(self.device)
-        if self.crop_box is not None:
-            gaussians = gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
+        """All Gaussians at once, sorted by depth: what every ordinary viewer shows.
+
+        In training, where the scene is larger than a pass and units can be drawn one by one without changing
+        the picture, it is drawn so: the device need not hold it all.
+        """
+        if self._exceeds_a_pass() and self._ownership() == "fragments":
+            return self._by_units(view).everything()
+        gaussians = self._crop(self.merged().to(self.device))
         return self.draws_with()(
             gaussians,
             view,
@@ -191,17 +202,45 @@ class AbcdModel(SplatfactoModel):
     @torch.no_grad()
     def draw_composited(self, view: View) -> Layer:
         """Each block alone, then folded front to back: what block training composites."""
-        rasterizer = self.draws_with()
+        pictures = self._by_units(view, pass_gaussians=0)
+        return pictures.painter.picture(view, pictures.settings)
+
+    def draw_for_viewer(self, view: View) -> Raster:
+        """What the viewer's user chose to see; never more than a pass of the scene on the device."""
+        choice, block = self.choice, self.choice.block
+        if block is None and self._coordinator is not None:
+            active = self._coordinator.state.active
+            block = None if active is None or active.is_whole else active.geometry.block
+        chosen = choice.show is not Show.EVERYTHING and block is not None and block < self.tree.num_blocks
+        if not chosen and not self._exceeds_a_pass():
+            return self.draw_merged(view)
+        return self._by_units(view).draw(choice.show, block if chosen else None)
+
+    def _by_units(self, view: View, pass_gaussians: int | None = None) -> BlockPictures:
+        scene = Cropped(self.scene(), self._crop)
         painter = Painter(
-            self.scene(),
+            scene,
             [view],
-            rasterizer,
-            ownership=resolve_ownership(self.config.ownership, rasterizer),
-            pass_gaussians=0,
+            self.draws_with(),
+            ownership=self._ownership(),
+            pass_gaussians=default_pass(scene) if pass_gaussians is None else pass_gaussians,
             device=self.device,
         )
         settings = PaintSettings(self.config.sh_degree, self.config.rasterize_mode == "antialiased")
-        return painter.picture(view, settings)
+        training = TrainingConfig() if self._coordinator is None else self._coordinator.config
+        return BlockPictures(painter, view, settings, training.window_weight)
+
+    def _ownership(self) -> Literal["fragments", "means"]:
+        return resolve_ownership(self.config.ownership, self.draws_with())
+
+    def _exceeds_a_pass(self) -> bool:
+        """Whether the device should not hold the whole scene; a loaded one it holds already."""
+        return self._coordinator is not None and self._coordinator.count() > default_pass(self.scene())
+
+    def _crop(self, gaussians: Gaussians) -> Gaussians:
+        if self.crop_box is None:
+            return gaussians
+        return gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
 
     # -- loss and metrics ----------------------------------------------------------------------------
 

@@ -35,6 +35,8 @@ from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, open_cache, tak
 from abcd_ns.plugin.run_folder import STORE as STORE
 from abcd_ns.plugin.run_log import keep_log
 from abcd_ns.plugin.views import views_of
+from abcd_ns.viewer import guard
+from abcd_ns.viewer.panel import AbcdPanel
 
 if TYPE_CHECKING:
     from abcd_ns.plugin.config import AbcdPipelineConfig
@@ -53,8 +55,11 @@ class AbcdPipeline(VanillaPipeline):
         self._ram = share_out(budget_bytes(config.ram_budget_gb))
         if not config.datamanager.photo_cache_gb:
             config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / 2**30
+        # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
+        guard.install()
         super().__init__(config, *args, **kwargs)
         self._coordinator: Coordinator | None = None
+        self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
 
     @property
     def coordinator(self) -> Coordinator | None:
@@ -73,6 +78,7 @@ class AbcdPipeline(VanillaPipeline):
         self._coordinator.announce.subscribe(report)
         log = keep_log(trainer, self._coordinator)
         self._coordinator.announce.subscribe(log)
+        self.panel.follow(self._coordinator)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
         def end_step(step: int) -> None:  # noqa: ARG001 - the coordinator counts

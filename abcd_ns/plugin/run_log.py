@@ -188,7 +188,7 @@ def keep_log(trainer: "AbcdTrainer", coordinator: Coordinator) -> RunLog:
     meters = (
         Meter("photos", lambda: photos.cached_bytes, photos.budget_bytes),
         Meter("frozen blocks", lambda: scene.cached_bytes, scene.ram_bytes),
-        Meter("layers on disk", lambda: cache.nbytes, cache.map_size),
+        Meter("layers on disk", lambda: cache.nbytes, cache.limit),
     )
     earlier = None if trainer.resumed_from is None else trainer.resumed_from.store.parent / LOG_FILE
     return RunLog(coordinator, folder / LOG_FILE, meters, earlier)

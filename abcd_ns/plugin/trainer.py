@@ -116,6 +116,13 @@ class AbcdTrainer(Trainer):
         which = "where it was left" if start.pin is None else start.pin
         self._say(f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}")
 
+    def _update_viewer_state(self, step: int) -> None:
+        """As nerfstudio's, which lets a client that goes away, or sends nonsense, end the run."""
+        try:
+            super()._update_viewer_state(step)
+        except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError) as error:
+            CONSOLE.print(f"The viewer failed at step {step} ({error!r}); training goes on.", markup=False)
+
     def save_checkpoint(self, step: int) -> None:
         """Save the merged scene for nerfstudio's tools, and everything else in the store.
 

@@ -330,6 +330,8 @@ def test_binary_ply(tmp_path, order):
         head + table.tobytes() + b"!",
         b"",
         head.replace(b"4\n", b"-4\n"),
+        head.replace(b"4\n", b"1152921504606846976\n") + table.tobytes(),
+        head.replace(b"4\n", b"9" * 5000 + b"\n") + table.tobytes(),
     ):
         path.write_bytes(broken)
         with pytest.raises(InputError, match=r"points\.ply"):

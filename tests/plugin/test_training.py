@@ -221,6 +221,7 @@ def test_the_saved_config_is_the_config(trained):
         (lambda c: setattr(c.machine, "num_devices", 2), "one device"),
         (lambda c: setattr(c, "mixed_precision", True), "float32"),
         (lambda c: setattr(c.pipeline, "blocks", -1), "--pipeline.blocks"),
+        (lambda c: setattr(c, "vis", "viewer_legacy"), "viewer_legacy"),
         (lambda c: setattr(c.pipeline, "near_plane", -1.0), "--pipeline.near-plane"),
         (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
         (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),

@@ -86,7 +86,8 @@ class LayerCache:
             OSError: the folder cannot be made or written to.
         """
         self.bits = bits
-        self.map_size = map_size
+        self.limit = map_size
+        """Bytes that it may take."""
         self.hits = 0
         self.misses = 0
         self.corrupt = 0

@@ -1,0 +1,1 @@
+"""The viewer: what keeps strangers out of it, and the panel that shows blocks, progress and memory."""

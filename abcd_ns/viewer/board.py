@@ -1,0 +1,142 @@
+"""What the panel knows of a run: pure functions of the coordinator's events and state."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from abcd_ns.engine.events import Event, StepTaken, VisitBegan, VisitEnded
+from abcd_ns.engine.run_state import UNLIMITED, RunState
+
+FEW_VIEWS = 3
+"""A block that fewer views are worth training on is under-observed."""
+SECONDS_BETWEEN_POINTS = 2.0
+"""Of the curve, where visits are shorter, longer or do not exist."""
+MOST_POINTS = 400
+"""Of the curve; then every second one goes."""
+
+
+class Status(str, Enum):
+    """Of a block; the values are the panel's words."""
+
+    UNTRAINED = "untrained"
+    ACTIVE = "active"
+    DONE = "done"
+    UNDER_OBSERVED = "under-observed"
+
+
+@dataclass(frozen=True)
+class BlockRow:
+    """A line of the table of blocks."""
+
+    block: int
+    status: Status
+    gaussians: int | None
+    """None while a scaffold of all blocks is trained."""
+    psnr: float | None
+    """Mean over the crops of its last visit, dB."""
+    views: int | None
+    """Worth training it on; None while that is unknown."""
+
+
+@dataclass
+class Board:
+    """Follows a run, event by event."""
+
+    visits: dict[int, int] = field(default_factory=dict)
+    """By block, how many are over."""
+    psnr: dict[int, float] = field(default_factory=dict)
+    curve: list[tuple[float, float]] = field(default_factory=list)
+    """(seconds of training, mean PSNR of the crops since the last point)."""
+    visit: VisitBegan | None = None
+    """The one that is under way."""
+    sweep: int | None = None
+    """None before the first."""
+    sweep_began: float = 0.0
+    """Seconds of training when the sweep began."""
+    sweep_visits: int = 0
+    """Visits that are over in this sweep."""
+    _crops: list[float] = field(default_factory=list)
+    """PSNR of the visit's steps."""
+    _recent: list[float] = field(default_factory=list)
+    """PSNR of the steps since the last point of the curve."""
+
+    @staticmethod
+    def resumed(state: RunState, seconds: float) -> "Board":
+        """The board of a run that goes on: which blocks had a visit follows from the plan of the sweep."""
+        waiting = {plan.block for plan in state.queue}
+        if state.active is not None:
+            waiting.add(state.active.geometry.block)
+        seen = [block for block, views in state.views.items() if views > 0]
+        visits = {block: state.sweep + (block not in waiting) for block in seen}
+        over = sum(block not in waiting for block in seen)
+        board = Board(visits={b: n for b, n in visits.items() if n}, sweep_began=seconds, sweep_visits=over)
+        board.sweep = state.sweep if state.views else None
+        if (active := state.active) is not None:
+            block = None if active.is_whole else active.geometry.block
+            board.visit = VisitBegan(
+                active.number, state.sweep, block, active.steps, len(active.geometry.views), 0
+            )
+        return board
+
+    def note(self, event: Event, seconds: float) -> None:
+        """Take an event in; `seconds` of training have passed."""
+        match event:
+            case VisitBegan():
+                if event.block is not None and event.sweep != self.sweep:
+                    self.sweep, self.sweep_began, self.sweep_visits = event.sweep, seconds, 0
+                self.visit, self._crops = event, []
+            case StepTaken() if math.isfinite(event.psnr):
+                self._crops.append(event.psnr)
+                self._recent.append(event.psnr)
+                if not self.curve or seconds - self.curve[-1][0] >= SECONDS_BETWEEN_POINTS:
+                    self._add_point(seconds)
+            case VisitEnded():
+                self.visit = None
+                if event.block is not None:
+                    self._end_visit(event.block)
+
+    def _end_visit(self, block: int) -> None:
+        self.visits[block] = self.visits.get(block, 0) + 1
+        self.sweep_visits += 1
+        if self._crops:
+            self.psnr[block] = sum(self._crops) / len(self._crops)
+
+    def _add_point(self, seconds: float) -> None:
+        self.curve.append((seconds, sum(self._recent) / len(self._recent)))
+        self._recent = []
+        if len(self.curve) > MOST_POINTS:
+            del self.curve[-2::-2]
+
+    def status(self, block: int, views: int | None) -> Status:
+        """Of one block, on which so many views are worth training, if that is known."""
+        if self.visit is not None and self.visit.block == block:
+            return Status.ACTIVE
+        if views is not None and views < FEW_VIEWS:
+            return Status.UNDER_OBSERVED
+        return Status.DONE if self.visits.get(block) else Status.UNTRAINED
+
+    def rows(self, counts: Mapping[int, int | None], views: Mapping[int, int]) -> list[BlockRow]:
+        """The table: a row for each block of `counts`, in its order."""
+        return [
+            BlockRow(
+                block, self.status(block, views.get(block)), count, self.psnr.get(block), views.get(block)
+            )
+            for block, count in counts.items()
+        ]
+
+
+def sweep_share(board: Board, state: RunState) -> float:
+    """Share of the sweep's visits that is done, 0..1; a visit whose steps are planned counts in part."""
+    active = state.active
+    if active is None or active.is_whole:
+        return 0.0
+    part = active.done / active.steps if 0 < active.steps < UNLIMITED else 0.0
+    return (board.sweep_visits + part) / (board.sweep_visits + 1 + len(state.queue))
+
+
+def seconds_left(elapsed: float, share: float) -> float | None:
+    """How long the rest takes at the pace so far; None if nothing is done yet."""
+    if not share > 0:
+        return None
+    return elapsed * (1 - min(share, 1.0)) / min(share, 1.0)

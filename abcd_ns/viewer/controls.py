@@ -1,0 +1,95 @@
+"""The panel's controls in the browser, by the calls that viser 0.2 and 1 have in common."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from abcd_ns.viewer.chart import curve_image
+from abcd_ns.viewer.pictures import Show
+
+FOLLOW = "the one in training"
+"""The entry of the list of blocks that stands for whichever is active."""
+CURVE = "PSNR of training crops in dB over seconds of training"
+
+
+class Controls:
+    """A folder of controls; texts are sent only when they change.
+
+    Args:
+        order: where in the sidebar; viser sorts by it.
+        changed: called, in a thread of viser's, when the user has chosen something.
+        trains: whether a run is under way, and not a finished scene looked at.
+    """
+
+    def __init__(self, gui: viser.GuiApi, order: float, changed: Callable[[], None], trains: bool) -> None:
+        self._gui, self._trains = gui, trains
+        self._texts: dict[str, viser.GuiMarkdownHandle] = {}
+        with gui.add_folder("Blocks (ABCD)", order=order):
+            if trains:
+                self._texts["headline"] = gui.add_markdown("Training has not begun.")
+                self._run = gui.add_progress_bar(0.0)
+                self._texts["sweep"] = gui.add_markdown("")
+                self._sweep = gui.add_progress_bar(0.0, color="teal")
+            self._show = gui.add_dropdown("Show", options=tuple(show.value for show in Show))
+            self._block = gui.add_dropdown("Block", options=(FOLLOW,) if trains else ("1",))
+            self._boxes = gui.add_checkbox("Boxes", initial_value=True)
+            self._cameras = gui.add_checkbox("Its cameras", initial_value=False)
+            with gui.add_folder("Table", expand_by_default=True):
+                self._texts["blocks"] = gui.add_markdown("")
+            with gui.add_folder("Memory", expand_by_default=trains):
+                self._texts["memory"] = gui.add_markdown("")
+            if trains:
+                with gui.add_folder("Accuracy over time", expand_by_default=True):
+                    # A root for pictures' files, which viser asks for although there are none.
+                    self._texts["curve"] = gui.add_markdown(curve_image([], CURVE), image_root=Path())
+                    gui.add_markdown(CURVE)
+        for handle in (self._show, self._block, self._boxes, self._cameras):
+            handle.on_update(lambda _: changed())
+
+    @property
+    def show(self) -> Show:
+        """What is to be drawn."""
+        return Show(self._show.value)
+
+    @property
+    def block(self) -> int | None:
+        """The chosen block; None for the one in training."""
+        return None if self._block.value == FOLLOW else int(self._block.value) - 1
+
+    @property
+    def boxes(self) -> bool:
+        """Whether to show boxes."""
+        return bool(self._boxes.value)
+
+    @property
+    def cameras(self) -> bool:
+        """Whether to show the cameras of the chosen block."""
+        return bool(self._cameras.value)
+
+    def set_blocks(self, count: int) -> None:
+        """Offer so many blocks for choice."""
+        names = tuple(str(block + 1) for block in range(count))
+        self._block.options = (FOLLOW, *names) if self._trains else names
+
+    def write(self, **texts: str) -> None:
+        """Set texts: headline, sweep, blocks, memory, curve."""
+        for name, text in texts.items():
+            if self._texts[name].content != text:
+                self._texts[name].content = text
+
+    def progress(self, run: float, sweep: float) -> None:
+        """Move the bars; 0..1."""
+        _move(self._run, run)
+        _move(self._sweep, sweep)
+
+    def draw_curve(self, points: Sequence[tuple[float, float]]) -> None:
+        """Redraw the curve of accuracy over time."""
+        self.write(curve=curve_image(points, CURVE))
+
+
+def _move(bar: Any, share: float) -> None:
+    value = round(100 * min(max(share, 0.0), 1.0), 1)
+    if bar.value != value:
+        bar.value = value

@@ -1,0 +1,217 @@
+"""The panel of blocks in nerfstudio's viewer, while a run trains (ns-train) and afterwards (ns-viewer)."""
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import psutil
+import torch
+import viser
+from nerfstudio.viewer.viewer_elements import ViewerControl
+
+from abcd_ns.engine.blocks import BlockTree
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.events import Event, LayersDrawn, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.influence import worth_training
+from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
+from abcd_ns.engine.scene import BlockScene
+from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.viewer.board import BlockRow, Board, Status, seconds_left, sweep_share
+from abcd_ns.viewer.boxes import boxes_of, bulk
+from abcd_ns.viewer.controls import Controls
+from abcd_ns.viewer.guard import rules_of
+from abcd_ns.viewer.pictures import Choice
+from abcd_ns.viewer.scenery import Scenery, overview, views_that_see
+from abcd_ns.viewer.words import block_table, headline, memory_table, sweep_line
+
+if TYPE_CHECKING:
+    from nerfstudio.viewer.viewer import Viewer
+
+SECONDS_BETWEEN_UPDATES = 1.0
+SECONDS_BETWEEN_CURVES = 5.0
+MOST_POINTS = 2000
+"""Gaussians of a block that tell which cameras see it."""
+
+
+class Drawn(Protocol):
+    """What the panel wants of a model."""
+
+    tree: BlockTree
+    choice: Choice
+    initial: Gaussians
+    """What training began with."""
+
+    def scene(self) -> BlockScene:
+        """The scene by blocks."""
+        ...
+
+
+class AbcdPanel(ViewerControl):
+    """Shows where a run stands, and lets the user choose what is drawn.
+
+    nerfstudio finds it as an attribute of the pipeline and calls `_setup`. All else happens under the
+    training lock: events come from the training thread, which holds it, and the user's choices take it.
+
+    Args:
+        views: gives the training views when asked.
+    """
+
+    def __init__(self, model: Drawn, views: Callable[[], list[View]]) -> None:
+        self._model, self._views = model, views
+        self._coordinator: Coordinator | None = None
+        self._board = Board()
+        self._controls: Controls | None = None
+        self._scenery: Scenery | None = None
+        self._cameras_of: int | None = None
+        self._layers = ""
+        self._laid_out = False
+        self._overview: tuple[np.ndarray, np.ndarray] | None = None
+        self._updated = self._curve_drawn = 0.0
+
+    def _setup(self, viewer: "Viewer") -> None:
+        super()._setup(viewer)
+        share, server = viewer.config.make_share_url, viewer.viser_server
+        if (rules := rules_of(server)) is not None:
+            rules.share = share
+        # nerfstudio's title bar fetches a picture from its site; viser's offers everyone a public tunnel.
+        server.gui.configure_theme(
+            control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105), show_share_button=share
+        )
+        trains = viewer.trainer is not None
+        self._controls = Controls(server.gui, viewer.stats_markdown.order + 0.5, self._choose, trains)
+        self._scenery = Scenery(server.scene, viewer.config.camera_frustum_scale)
+        server.on_client_connect(self._welcome)
+        if not trains:
+            self._lay_out()
+            self._update()
+
+    def follow(self, coordinator: Coordinator) -> None:
+        """From now on show how this run goes."""
+        self._coordinator = coordinator
+        self._board = Board.resumed(coordinator.state, coordinator.stopwatch.seconds)
+        if self._controls is not None:
+            self._lay_out()
+            coordinator.announce.subscribe(self)
+            self._update()
+
+    def __call__(self, event: Event) -> None:
+        """Take an event in; the browser is told at visits' ends and otherwise once in a while."""
+        self._board.note(event, self._seconds)
+        self._layers = f"layers {event.done} of {event.total}" if isinstance(event, LayersDrawn) else ""
+        waited = time.monotonic() - self._updated
+        if isinstance(event, (VisitBegan, VisitEnded, SweepEnded)) or waited > SECONDS_BETWEEN_UPDATES:
+            self._update()
+
+    # -- what is shown -------------------------------------------------------------------------------
+
+    def _lay_out(self) -> None:
+        """Boxes and the list of blocks, once the cut of space is known."""
+        tree, scene = self._model.tree, self._model.scene()
+        if self._coordinator is not None:
+            means = self._model.initial.means
+        else:
+            means = torch.cat([scene.gaussians(block).means for block in range(tree.num_blocks)])
+        bounds = bulk(means)
+        self._scenery.set_boxes(boxes_of(tree, bounds))
+        self._overview = overview(bounds, self._views())
+        self._controls.set_blocks(tree.num_blocks)
+        self._laid_out = True
+
+    def _update(self) -> None:
+        if not self._laid_out:
+            return
+        self._updated = time.monotonic()
+        rows = self._rows()
+        self._controls.write(blocks=block_table(rows), memory=memory_table(self._memory()))
+        self._scenery.show_boxes({row.block: row.status for row in rows}, self._controls.boxes)
+        self._show_cameras()
+        if self._coordinator is not None:
+            self._report(self._coordinator)
+
+    def _report(self, coordinator: Coordinator) -> None:
+        board, state, seconds = self._board, coordinator.state, self._seconds
+        share, sweep = sweep_share(board, state), ""
+        if board.sweep is not None and not coordinator.finished:
+            visits = board.sweep_visits + len(state.queue) + (board.visit is not None)
+            left = seconds_left(seconds - board.sweep_began, share)
+            sweep = sweep_line(board.sweep, board.sweep_visits, visits, left)
+        where, left = self._where(state.active), seconds_left(seconds, coordinator.progress)
+        self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)
+        self._controls.progress(coordinator.progress, share)
+        if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
+            self._curve_drawn = self._updated
+            self._controls.draw_curve(board.curve)
+
+    def _where(self, active: ActiveVisit | None) -> str:
+        if active is None:
+            return "All blocks at once" if self._coordinator.config.exact else "Between visits"
+        steps = f" of {active.steps}" if 0 < active.steps < UNLIMITED else ""
+        step = self._layers or f"step {active.done}{steps}"
+        if active.is_whole:
+            return f"Warm-up of the whole scene, {step}"
+        return f"Block {active.geometry.block + 1}, {step}"
+
+    def _rows(self) -> list[BlockRow]:
+        scene, blocks = self._model.scene(), range(self._model.tree.num_blocks)
+        if self._coordinator is None:
+            state = (Status.UNTRAINED, Status.DONE)
+            return [BlockRow(b, state[scene.count(b) > 0], scene.count(b), None, None) for b in blocks]
+        if self._coordinator.config.exact:
+            return [BlockRow(b, Status.ACTIVE, None, None, None) for b in blocks]
+        active = self._coordinator.state.active
+        whole = active is not None and active.is_whole
+        counts = {block: None if whole else scene.count(block) for block in blocks}
+        return self._board.rows(counts, self._coordinator.state.views)
+
+    def _memory(self) -> list[tuple[str, int, int]]:
+        rows = [("RAM", psutil.Process().memory_info().rss, psutil.virtual_memory().total)]
+        if torch.cuda.is_available():
+            total = torch.cuda.get_device_properties(0).total_memory
+            rows.append(("GPU, most so far", torch.cuda.max_memory_allocated(), total))
+        if self._coordinator is not None:
+            cache = self._coordinator.cache
+            rows.append(("layers on disk", cache.nbytes, cache.limit))
+        return rows
+
+    @property
+    def _seconds(self) -> float:
+        return 0.0 if self._coordinator is None else self._coordinator.stopwatch.seconds
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Let a browser begin with a view of the whole scene."""
+        if self._overview is not None:
+            client.camera.position, client.camera.look_at = self._overview
+
+    # -- what the user chooses -----------------------------------------------------------------------
+
+    def _choose(self) -> None:
+        with self._lock():
+            self._model.choice.show, self._model.choice.block = self._controls.show, self._controls.block
+            self._cameras_of = None
+            self._update()
+        self.viewer._trigger_rerender()
+
+    def _lock(self) -> AbstractContextManager:
+        return self.viewer.train_lock or nullcontext()
+
+    def _chosen_block(self) -> int | None:
+        if self._controls.block is not None or self._board.visit is None:
+            return self._controls.block
+        return self._board.visit.block
+
+    def _show_cameras(self) -> None:
+        block = self._chosen_block() if self._controls.cameras else None
+        if block != self._cameras_of or block is None:
+            self._scenery.show_cameras([] if block is None else self._views_of(block))
+        self._cameras_of = block
+
+    def _views_of(self, block: int) -> list[View]:
+        """The views that the block is trained on, or, as far as that is unknown, those that see it."""
+        if self._coordinator is not None and block in self._coordinator.state.influence:
+            known = self._coordinator.state.influence[block]
+            kept = worth_training(known, self._coordinator.config.influence_share)
+            return [self._coordinator.views[index] for index in kept]
+        means = self._model.scene().gaussians(block).means
+        return views_that_see(means[:: max(len(means) // MOST_POINTS, 1)], self._views())

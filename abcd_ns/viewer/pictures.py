@@ -1,0 +1,153 @@
+"""The pictures that the viewer asks for: the whole scene by parts, or what belongs to one block."""
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import torch
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+from abcd_ns.engine.compositing import empty_layer, over
+from abcd_ns.engine.influence import coarser
+from abcd_ns.engine.intervals import ray_interval
+from abcd_ns.engine.painter import Painter, PaintSettings, Parts
+from abcd_ns.engine.rasterizer import Raster, Shot, ZWindow
+from abcd_ns.engine.rasterizer.projection import Splats
+from abcd_ns.engine.scene import BlockScene
+from abcd_ns.engine.types import Gaussians, Layer, View
+
+MOST_PIXELS = 2048 * 2048
+"""Of a picture for the viewer, whatever size a client asks for; nerfstudio's slider ends there."""
+OPAQUE = 1e-4
+"""Transmittance below which nothing behind can be seen; where rasterizers stop."""
+FAR = 1e4
+"""Depth of pictures that have none; world units."""
+
+
+class Show(str, Enum):
+    """What the viewer shows; the values are its words."""
+
+    EVERYTHING = "everything"
+    BLOCK = "the block alone"
+    FRONT = "F: all in front of it"
+    BACK = "B: all behind it"
+    COMPOSITE = "composite: F, block, B"
+
+
+@dataclass
+class Choice:
+    """What the user chose to see. Written by the panel, read where pictures are drawn."""
+
+    show: Show = Show.EVERYTHING
+    block: int | None = None
+    """None follows the block in training."""
+
+
+def asked_by_viewer() -> bool:
+    """Whether this thread draws for a browser, and not for training, evaluation or export."""
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+def bounded(view: View) -> View:
+    """The view in as many pixels as a client may ask for, and at least one."""
+    times = math.ceil(math.sqrt(view.width * view.height / MOST_PIXELS))
+    smaller = coarser(view, times) if times > 1 else view
+    return replace(smaller, width=max(smaller.width, 1), height=max(smaller.height, 1))
+
+
+class Cropped:
+    """A scene without what a filter takes away; for nerfstudio's crop box."""
+
+    def __init__(self, scene: BlockScene, keep: Callable[[Gaussians], Gaussians]) -> None:
+        self.tree, self._scene, self._keep = scene.tree, scene, keep
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._keep(self._scene.gaussians(block))
+
+    def version(self, block: int) -> int:
+        return self._scene.version(block)
+
+    def count(self, block: int) -> int:
+        return self._scene.count(block)
+
+
+@dataclass(frozen=True)
+class BlockPictures:
+    """Draws one view of a scene unit by unit, so that the device never holds more than one of them."""
+
+    painter: Painter
+    view: View
+    settings: PaintSettings
+    window_weight: float = 0.0
+    """See TrainingConfig: F and B are cut as training cuts them."""
+
+    @torch.no_grad()
+    def draw(self, show: Show, block: int | None) -> Raster:
+        """What was chosen; everything if no block is given. `info` is empty.
+
+        F, B and the composite have no depth: they lie far behind whatever the browser draws over them.
+        """
+        if show is Show.EVERYTHING or block is None:
+            return self.everything()
+        own = self.painter.scene.gaussians(block).to(self.painter.device)
+        if show is Show.BLOCK:
+            return self._raster(own)
+        window = self._window(own)
+        around = self._around(block, window)
+        if show is Show.COMPOSITE:
+            active = self._raster(own, around.inside, window if around.inside is not None else None)
+            return _far_away(over(around.front, over(active.layer, around.back)))
+        return _far_away(around.front if show is Show.FRONT else around.back)
+
+    @torch.no_grad()
+    def everything(self) -> Raster:
+        """The whole scene, nearest unit first, until nothing behind can be seen."""
+        painter, view = self.painter, self.view
+        whole = self._nothing()
+        for unit in painter.order(painter.units(), view):
+            if float(whole.transmittance.max()) < OPAQUE:
+                break
+            window = None
+            if painter.ownership == "fragments" and unit != 0:
+                window = ray_interval(painter.tree.box(unit), view, view.full)
+            next_one = self._raster(painter.load(unit).gaussians, None, window)
+            layer = over(whole.layer, next_one.layer)
+            depth = whole.depth + whole.transmittance * next_one.depth
+            whole = Raster(layer.color, layer.transmittance, depth, {})
+        return whole
+
+    def _raster(
+        self, gaussians: Gaussians, frozen: Splats | None = None, window: ZWindow | None = None
+    ) -> Raster:
+        if len(gaussians) == 0 and frozen is None:
+            return self._nothing()
+        shot = Shot(self.view, self.view.full, frozen, window)
+        options = {"sh_degree": self.settings.sh_degree, "antialiased": self.settings.antialiased}
+        return self.painter.rasterizer.draw(gaussians, [shot], **options)[0]
+
+    def _nothing(self) -> Raster:
+        view = self.view
+        layer = empty_layer(view.height, view.width, self.painter.device, view.viewmat.dtype)
+        return Raster(layer.color, layer.transmittance, torch.zeros_like(layer.transmittance), {})
+
+    def _window(self, own: Gaussians) -> ZWindow | None:
+        if self.painter.ownership == "means":
+            return None
+        options = {"visible": self.window_weight, "antialiased": self.settings.antialiased}
+        rasterizer, view = self.painter.rasterizer, self.view
+        return rasterizer.depth_window(own, view, crop=view.full, **options).by_pixel()
+
+    def _around(self, block: int, window: ZWindow | None) -> Parts:
+        painter, view = self.painter, self.view
+        parts = {}
+        for unit in painter.units(exclude=block):
+            loaded = painter.load(unit, block)
+            cut = {"active": block, "window": window}
+            parts[unit] = painter.paint(unit, loaded, view, view.full, self.settings, **cut)
+        return painter.fold(parts, view, view.full)
+
+
+def _far_away(layer: Layer) -> Raster:
+    return Raster(layer.color, layer.transmittance, FAR * (1 - layer.transmittance), {})

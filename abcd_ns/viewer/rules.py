@@ -1,0 +1,148 @@
+"""Who may talk to the viewer, and about what: rules over requests and messages. They know no server.
+
+A viewer on 127.0.0.1 is still open to every page in the user's browser: a page may connect a websocket to
+any address (its Origin tells), and a name that its owner points at 127.0.0.1 makes the viewer look like the
+page's own server (DNS rebinding; the Host header tells). A name in the Host header is trusted only if its
+owner is us; an address needs no trust, since nobody can point an address elsewhere.
+"""
+
+import ipaddress
+import math
+import re
+import socket
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+THIS_MACHINE = "127.0.0.1"
+"""The host to listen on: reached from this machine alone."""
+WILDCARDS = ("0.0.0.0", "::", "")
+"""Hosts that a server binds to in order to be reached under all addresses of the machine."""
+SHARE_DOMAIN = ".share.viser.studio"
+"""Names under which viser's public tunnel makes a viewer available."""
+SHARE_MESSAGES = ("ShareUrlRequest", "ShareUrlDisconnect")
+ASPECTS = (0.01, 100.0)
+"""Width over height of a window that pictures are drawn for."""
+
+_HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::[0-9]{1,5})?")
+# Every segment begins with something else than a dot. No percent sign, backslash, control character or //.
+_PATH = re.compile(r"/|(/[A-Za-z0-9_~-][A-Za-z0-9_~.,-]*)+")
+
+
+class Headers(Protocol):
+    """The header fields of a request, under names of any case."""
+
+    def get_all(self, key: str) -> list[str]:
+        """All values of a field, none if it is missing."""
+        ...
+
+
+@dataclass
+class Rules:
+    """What one server answers to.
+
+    Args:
+        host: the name or address that the server was told to listen on.
+        share: whether viser's public tunnel may be used.
+    """
+
+    host: str
+    share: bool = False
+
+    def refusal(self, path: str, headers: Headers) -> str | None:
+        """Why a request is not answered, for a person to read; None if it is."""
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        if len(hosts) != 1 or not self.knows(hosts[0]):
+            return f"the Host {_quoted(hosts)} is not this viewer's"
+        # A browser sends the Origin with every websocket; what sends none is no page.
+        if origins and not (len(origins) == 1 and same_origin(origins[0], hosts[0])):
+            return f"the Origin {_quoted(origins)} is another page's"
+        if not plain_path(path):
+            return f"the path {_quoted([path])} is not one of a viewer's file"
+        return None
+
+    def knows(self, host: str) -> bool:
+        """Whether a Host header, with or without a port, names this server."""
+        found = _HOST.fullmatch(host)
+        if found is None:
+            return False
+        name, configured = _plain_name(found.group(1)), _plain_name(self.host)
+        if name in ("localhost", configured) and name not in WILDCARDS:
+            return True
+        address = _address(name)
+        if address is not None:
+            return address.is_loopback or configured in WILDCARDS
+        if configured in WILDCARDS and name in _own_names():
+            return True
+        return self.share and name.endswith(SHARE_DOMAIN)
+
+    def admits(self, message: Any) -> bool:
+        """Whether to act on a message of viser's protocol that a client sent."""
+        kind = type(message).__name__
+        if kind in SHARE_MESSAGES:
+            return self.share
+        if kind == "ViewerCameraMessage":
+            return is_camera(message)
+        if kind == "GuiUpdateMessage":
+            # Browsers set values alone; viser would set any attribute of the control.
+            return isinstance(message.updates, dict) and set(message.updates) <= {"value"}
+        return True
+
+
+def plain_path(path: str) -> bool:
+    """Whether a request's path can name a file below the server's root, and nothing else."""
+    return _PATH.fullmatch(path.partition("?")[0]) is not None
+
+
+def same_origin(origin: str, host: str) -> bool:
+    """Whether a page with this Origin came from the server that this Host names."""
+    return origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
+
+
+def is_camera(message: Any) -> bool:
+    """Whether a camera message describes a camera; nerfstudio's training loop computes with it unseen."""
+    sizes = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}
+    vectors = [getattr(message, name, None) for name in sizes]
+    if not all(isinstance(vector, (tuple, list)) for vector in vectors):
+        return False
+    aspect = getattr(message, "aspect", 1.0)  # viser 1 sends a size instead
+    numbers = [message.fov, aspect, *(x for vector in vectors for x in vector)]
+    if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers):
+        return False
+    turned = any(abs(x) > 1e-6 for x in vectors[0])
+    sized = [len(vector) for vector in vectors] == list(sizes.values())
+    return sized and turned and 0 < message.fov < math.pi and ASPECTS[0] <= aspect <= ASPECTS[1]
+
+
+def content_policy(hosts: Iterable[str]) -> str:
+    """A Content-Security-Policy under which the viewer's page talks to its own server and to nobody else.
+
+    viser's page asks a tracker for a script, and nerfstudio's title bar its site for a picture.
+    """
+    sockets = " ".join(f"ws://{host} wss://{host}" for host in hosts)
+    return (
+        "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
+        f"connect-src 'self' data: blob: {sockets}; frame-ancestors 'none'; form-action 'none'"
+    )
+
+
+def _plain_name(name: str) -> str:
+    return name.strip("[]").lower().rstrip(".")
+
+
+def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(name)
+    except ValueError:
+        return None
+
+
+def _own_names() -> tuple[str, ...]:
+    name = _plain_name(socket.gethostname())
+    short = name.partition(".")[0]
+    return name, short, f"{short}.local"
+
+
+def _quoted(values: Iterable[str]) -> str:
+    """Values from a stranger as printable ASCII of bounded length."""
+    return ", ".join(ascii(value[:80]) for value in values) or "(none)"

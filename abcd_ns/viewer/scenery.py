@@ -1,0 +1,137 @@
+"""What the panel puts into the viewer's scene: boxes of blocks and frusta of cameras."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+import viser
+import viser.transforms as vtf
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.blocks import Box
+from abcd_ns.engine.types import View
+from abcd_ns.viewer.board import Status
+from abcd_ns.viewer.boxes import SCENE_SCALE, center, frame_mesh
+
+COLORS = {
+    Status.UNTRAINED: (150, 150, 160),
+    Status.ACTIVE: (255, 190, 40),
+    Status.DONE: (40, 190, 140),
+    Status.UNDER_OBSERVED: (235, 70, 70),
+}
+THICKNESS = 0.0018
+"""Of a box's edges, as a share of the diagonal of all boxes."""
+STRONGER = 3.0
+"""How much thicker the edges of the active block are."""
+MOST_LABELS = 64
+"""Blocks that get their number in the scene; with more they would hide it."""
+MOST_FRUSTA = 200
+"""Cameras shown at a time; evenly chosen of more."""
+OVERVIEW = 0.8
+"""How far from its middle a scene is first looked at, in diagonals of its bulk."""
+ELEVATION = 0.6
+"""Tangent of the angle from which it is looked down on."""
+SEEN_SHARE = 0.05
+"""Share of a block's Gaussians that must lie in a view's image for it to count as one that sees the block."""
+
+
+class Scenery:
+    """Keeps boxes and frusta in a viser scene as they should be, sending only what changed."""
+
+    def __init__(self, scene: viser.SceneApi, frustum_scale: float) -> None:
+        self._scene, self._frustum_scale = scene, frustum_scale
+        self._boxes: dict[int, Box] = {}
+        self._thickness = 0.0
+        self._status: dict[int, Status] = {}
+        self._shown = True
+        self._nodes: dict[int, list[viser.SceneNodeHandle]] = {}
+        self._frusta: list[viser.SceneNodeHandle] = []
+
+    def set_boxes(self, boxes: Mapping[int, Box]) -> None:
+        """The boxes to show, by block; drawn when their states are known."""
+        self._boxes = dict(boxes)
+        corners = torch.stack([c for box in boxes.values() for c in (box.lower, box.upper)])
+        self._thickness = THICKNESS * float((corners.amax(dim=0) - corners.amin(dim=0)).norm())
+
+    def show_boxes(self, status: Mapping[int, Status], shown: bool) -> None:
+        """Colour the boxes by the states of their blocks."""
+        for block, box in self._boxes.items():
+            if status.get(block) != self._status.get(block):
+                self._nodes[block] = self._draw_box(block, box, status[block], shown)
+        if shown != self._shown:
+            for node in (node for nodes in self._nodes.values() for node in nodes):
+                node.visible = shown
+        self._status, self._shown = dict(status), shown
+
+    def _draw_box(self, block: int, box: Box, status: Status, shown: bool) -> list[viser.SceneNodeHandle]:
+        active = status is Status.ACTIVE
+        vertices, faces = frame_mesh(box, self._thickness * (STRONGER if active else 1))
+        name = f"/abcd/block_{block + 1}"
+        nodes = [
+            self._scene.add_mesh_simple(
+                name, vertices=vertices, faces=faces, color=COLORS[status], visible=shown
+            )
+        ]
+        if len(self._boxes) <= MOST_LABELS:
+            text = f"{block + 1} {status.value}" if active else str(block + 1)
+            position = tuple(center(box).tolist())
+            nodes.append(
+                self._scene.add_label(f"/abcd/label_{block + 1}", text, position=position, visible=shown)
+            )
+        return nodes
+
+    def show_cameras(self, views: Sequence[View]) -> None:
+        """Frusta of these cameras and no others."""
+        for node in self._frusta:
+            node.remove()
+        chosen = views[:: -(-len(views) // MOST_FRUSTA)] if views else []
+        self._frusta = [self._draw_frustum(view) for view in chosen]
+
+    def _draw_frustum(self, view: View) -> viser.SceneNodeHandle:
+        turn = vtf.SO3.from_matrix(view.viewmat[:3, :3].T.double().cpu().numpy())
+        return self._scene.add_camera_frustum(
+            f"/abcd/camera_{view.index:05d}",
+            fov=2 * math.atan(view.height / 2 / float(view.K[1, 1])),
+            aspect=view.width / view.height,
+            scale=1.5 * self._frustum_scale,
+            color=COLORS[Status.ACTIVE],
+            wxyz=turn.wxyz,
+            position=(view.center.double().cpu() * SCENE_SCALE).numpy(),
+        )
+
+
+def overview(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Where to look at the whole scene from, and at what, in the viewer's units: from behind the cameras.
+
+    Args:
+        box: holds the bulk of the scene.
+        views: the training views; without any, the scene is looked at from one side.
+    """
+    target, size = (box.lower + box.upper) / 2, float((box.upper - box.lower).norm())
+    centers = torch.stack([view.center.double().cpu() for view in views] or [target + 1])
+    level = torch.tensor([1.0, 1.0, 0.0]).double()
+    away = (centers.mean(dim=0) - target) * level
+    if float(away.norm()) < 0.05 * size:  # cameras all around
+        away = (centers[0] - target) * level
+    direction = torch.nn.functional.normalize(away, dim=0) + ELEVATION * (1 - level)
+    eye = target + OVERVIEW * size * torch.nn.functional.normalize(direction, dim=0)
+    return (eye * SCENE_SCALE).numpy(), (target * SCENE_SCALE).numpy()
+
+
+def views_that_see(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:
+    """The views in whose image at least SEEN_SHARE of the points lie, occluded or not."""
+    if len(points) == 0:
+        return []
+    return [view for view in views if _share_in_image(points, view) >= SEEN_SHARE]
+
+
+def _share_in_image(points: Float[Tensor, "n 3"], view: View) -> float:
+    matrix, K = view.viewmat.double().cpu(), view.K.double().cpu()
+    camera = points.double().cpu() @ matrix[:3, :3].T + matrix[:3, 3]
+    z = camera[:, 2]
+    pixels = camera @ K.T
+    x, y = pixels[:, 0] / z, pixels[:, 1] / z
+    inside = (z > view.near) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+    return float(inside.double().mean())

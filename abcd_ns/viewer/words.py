@@ -1,0 +1,68 @@
+"""The panel's texts, as Markdown."""
+
+from collections import Counter
+from collections.abc import Sequence
+from datetime import timedelta
+
+from abcd_ns.viewer.board import BlockRow, Status
+
+MOST_ROWS = 24
+"""Of the table of blocks; with more blocks those that are active or under-observed come first."""
+
+
+def clock(seconds: float | None) -> str:
+    """A duration as h:mm:ss."""
+    return "unknown" if seconds is None else str(timedelta(seconds=int(seconds)))
+
+
+def headline(where: str, progress: float, left: float | None) -> str:
+    """What is being trained, and how long the run takes yet."""
+    if progress >= 1:
+        return "**Trained.**"
+    return f"**{where}**  \n{progress:.0%} of the run, {clock(left)} left"
+
+
+def sweep_line(sweep: int, over: int, visits: int, left: float | None) -> str:
+    """Where the sweep stands."""
+    return f"Sweep {sweep}: {over} of {visits} blocks" + ("" if left is None else f", {clock(left)} left")
+
+
+def block_table(rows: Sequence[BlockRow]) -> str:
+    """The blocks by number, counted from 1 as in the terminal."""
+    shown = list(rows)
+    if len(rows) > MOST_ROWS:
+        urgent = (Status.ACTIVE, Status.UNDER_OBSERVED)
+        first = sorted(rows, key=lambda row: (row.status not in urgent, row.block))[:MOST_ROWS]
+        shown = sorted(first, key=lambda row: row.block)
+    lines = ["| # | state | Gaussians | PSNR | views |", "| ---: | --- | ---: | ---: | ---: |"]
+    lines += [_row(row) for row in shown]
+    if len(rows) > len(shown):
+        counts = Counter(row.status.value for row in rows)
+        said = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
+        lines += ["", f"{len(rows)} blocks: {said}."]
+    return "\n".join(lines)
+
+
+def _row(row: BlockRow) -> str:
+    state = f"**{row.status.value}**" if row.status is Status.ACTIVE else row.status.value
+    gaussians = "-" if row.gaussians is None else f"{row.gaussians:,}"
+    psnr = "-" if row.psnr is None else f"{row.psnr:.2f}"
+    views = "-" if row.views is None else str(row.views)
+    return f"| {row.block + 1} | {state} | {gaussians} | {psnr} | {views} |"
+
+
+def memory_table(rows: Sequence[tuple[str, int, int]]) -> str:
+    """What is held, against what it may grow to.
+
+    Args:
+        rows: (what, bytes, limit in bytes).
+    """
+    lines = ["| memory | used | of |", "| --- | ---: | ---: |"]
+    lines += [f"| {what} | {_size(used)} | {_size(limit)} |" for what, used, limit in rows]
+    return "\n".join(lines)
+
+
+def _size(count: int) -> str:
+    if count < 2**30:
+        return f"{count / 2**20:.0f} MB"
+    return f"{count / 2**30:.1f} GB"

@@ -1,0 +1,166 @@
+"""What the panel makes of a run's events: states of blocks, the table, the curve, time left."""
+
+import math
+
+import pytest
+
+from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, RunState
+from abcd_ns.engine.scaffold import WHOLE
+from abcd_ns.engine.schedule import VisitPlan
+from abcd_ns.engine.types import Crop
+from abcd_ns.engine.visit import VisitGeometry
+from abcd_ns.viewer.board import MOST_POINTS, Board, Status, seconds_left, sweep_share
+from abcd_ns.viewer.words import MOST_ROWS, block_table, clock, headline, memory_table, sweep_line
+
+
+def began(visit: int, block: int | None, sweep: int = 0, steps: int = 10) -> VisitBegan:
+    return VisitBegan(visit, sweep, block, steps, views=5, gaussians=100)
+
+
+def ended(visit: int, block: int | None, sweep: int = 0) -> VisitEnded:
+    return VisitEnded(visit, sweep, block, gaussians=100, migrated=0, layer_seconds=0.1, seconds=1.0)
+
+
+def step(psnr: float, visit: int = 0) -> StepTaken:
+    return StepTaken(1, visit, 1, psnr)
+
+
+def active(block: int, done: int = 0, steps: int = 10) -> ActiveVisit:
+    geometry = VisitGeometry(block, {0: Crop(0, 0, 8, 8)})
+    return ActiveVisit(0, geometry, sh_degree=0, steps=steps, views=(0,), done=done)
+
+
+def test_a_block_is_untrained_then_active_then_done():
+    board = Board()
+    assert board.status(1, views=9) is Status.UNTRAINED
+    board.note(began(0, 1), 0.0)
+    assert board.status(1, views=9) is Status.ACTIVE
+    assert board.status(0, views=9) is Status.UNTRAINED
+    board.note(ended(0, 1), 1.0)
+    assert board.status(1, views=9) is Status.DONE
+
+
+@pytest.mark.parametrize(
+    ("views", "expected"),
+    [(0, Status.UNDER_OBSERVED), (2, Status.UNDER_OBSERVED), (3, Status.UNTRAINED), (None, Status.UNTRAINED)],
+)
+def test_a_block_that_hardly_any_view_shows_says_so(views, expected):
+    assert Board().status(0, views) is expected
+
+
+def test_during_the_warm_up_no_block_is_active():
+    board = Board()
+    board.note(began(0, None), 0.0)
+    rows = board.rows({0: None, 1: None}, {})
+    assert [row.status for row in rows] == [Status.UNTRAINED] * 2
+    board.note(ended(0, None), 1.0)
+    assert board.visits == {}
+
+
+def test_the_table_gives_each_blocks_last_psnr():
+    board = Board()
+    board.note(began(0, 0), 0.0)
+    board.note(step(10.0), 0.1)
+    board.note(step(20.0), 0.2)
+    board.note(step(math.nan), 0.3)
+    board.note(ended(0, 0), 1.0)
+    rows = board.rows({0: 1234, 1: 5}, {0: 9, 1: 1})
+    assert [row.psnr for row in rows] == [15.0, None]
+    table = block_table(rows)
+    assert "| 1 | done | 1,234 | 15.00 | 9 |" in table
+    assert "| 2 | under-observed | 5 | - | 1 |" in table
+
+
+def test_of_many_blocks_the_table_shows_the_urgent_ones():
+    board = Board()
+    board.note(began(0, 90), 0.0)
+    rows = board.rows(dict.fromkeys(range(100), 1), {**dict.fromkeys(range(100), 9), 70: 0})
+    lines = block_table(rows).splitlines()
+    shown = [int(line.split("|")[1]) for line in lines if line.startswith("| ") and line[2].isdigit()]
+    assert shown == [*range(1, MOST_ROWS - 1), 71, 91]
+    assert lines[-1] == "100 blocks: 1 active, 1 under-observed, 98 untrained."
+
+
+def test_the_curve_has_a_point_every_other_second():
+    board = Board()
+    for tick in range(100):
+        board.note(step(10.0 + tick), 0.1 * tick)
+    assert board.curve[0] == (0.0, 10.0)
+    gaps = [b - a for (a, _), (b, _) in zip(board.curve, board.curve[1:], strict=False)]
+    assert min(gaps) >= 2.0 - 1e-9
+    # Each point is the mean of the steps since the last one: 1 to 20, then 21 to 40.
+    assert board.curve[1][1] == pytest.approx(10 + 10.5)
+    assert board.curve[2][1] == pytest.approx(10 + 30.5)
+
+
+def test_a_long_curve_is_thinned_and_keeps_its_end():
+    board = Board()
+    for tick in range(3 * MOST_POINTS):
+        board.note(step(float(tick)), 3.0 * tick)
+        assert board.curve[-1][0] == 3.0 * tick
+        assert len(board.curve) <= MOST_POINTS
+    assert board.curve == sorted(board.curve)
+    assert len(board.curve) > MOST_POINTS / 2
+
+
+def test_progress_through_the_sweep():
+    board, state = Board(), RunState(queue=[VisitPlan(1, 10), VisitPlan(2, 10), VisitPlan(3, 10)])
+    board.note(began(0, 0), 4.0)
+    state.active = active(0, done=5)
+    assert board.sweep_began == 4.0
+    assert sweep_share(board, state) == pytest.approx(0.5 / 4)
+    board.note(ended(0, 0), 6.0)
+    board.note(began(1, 1), 6.0)
+    state.queue.pop(0)
+    state.active = active(1)
+    assert sweep_share(board, state) == pytest.approx(1 / 4)
+    assert board.sweep_began == 4.0
+    board.note(ended(1, 1), 8.0)
+    board.note(SweepEnded(0, 20), 8.0)
+    board.note(began(2, 3, sweep=1), 9.0)
+    assert (board.sweep, board.sweep_began, board.sweep_visits) == (1, 9.0, 0)
+
+
+def test_visits_without_planned_steps_count_when_they_are_over():
+    state = RunState(queue=[VisitPlan(1, 10)], active=active(0, done=500, steps=UNLIMITED))
+    assert sweep_share(Board(), state) == 0.0
+    assert sweep_share(Board(sweep_visits=1), state) == pytest.approx(1 / 3)
+    assert sweep_share(Board(), RunState()) == 0.0
+    assert sweep_share(Board(), RunState(active=active(WHOLE))) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("elapsed", "share", "left"),
+    [(10.0, 0.5, 10.0), (10.0, 0.1, 90.0), (5.0, 1.0, 0.0), (5.0, 1.5, 0.0), (5.0, 0.0, None)],
+)
+def test_time_left(elapsed, share, left):
+    assert seconds_left(elapsed, share) == (None if left is None else pytest.approx(left))
+
+
+def test_a_resumed_run_knows_which_blocks_had_their_visit():
+    state = RunState(
+        sweep=0, visit=3, queue=[VisitPlan(2, 10)], views={0: 9, 1: 9, 2: 9, 3: 0}, active=active(1, done=4)
+    )
+    board = Board.resumed(state, seconds=7.0)
+    statuses = [board.status(block, state.views[block]) for block in range(4)]
+    assert statuses == [Status.DONE, Status.ACTIVE, Status.UNTRAINED, Status.UNDER_OBSERVED]
+    assert sweep_share(board, state) == pytest.approx((1 + 0.4) / 3)
+    state.sweep = 1
+    assert Board.resumed(state, 7.0).status(2, 9) is Status.DONE
+    assert Board.resumed(RunState(), 0.0) == Board()
+
+
+def test_words():
+    assert clock(3725.9) == "1:02:05"
+    assert clock(None) == "unknown"
+    assert headline("Block 3, step 4 of 9", 0.25, 90.0) == (
+        "**Block 3, step 4 of 9**  \n25% of the run, 0:01:30 left"
+    )
+    assert headline("Between visits", 1.0, 0.0) == "**Trained.**"
+    assert sweep_line(2, 3, 8, None) == "Sweep 2: 3 of 8 blocks"
+    assert sweep_line(2, 3, 8, 61.0) == "Sweep 2: 3 of 8 blocks, 0:01:01 left"
+    assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers on disk", 2**20, 2**32)]).splitlines()[2:] == [
+        "| RAM | 1.5 GB | 16.0 GB |",
+        "| layers on disk | 1 MB | 4.0 GB |",
+    ]

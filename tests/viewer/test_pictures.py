@@ -1,0 +1,146 @@
+"""The viewer's pictures: the whole scene by units, and what belongs to one block."""
+
+import threading
+from dataclasses import replace
+
+import pytest
+import torch
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
+from abcd_ns.engine.compositing import over
+from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+from abcd_ns.engine.scene import MemoryScene
+from abcd_ns.viewer.pictures import (
+    FAR,
+    MOST_PIXELS,
+    BlockPictures,
+    Cropped,
+    Show,
+    asked_by_viewer,
+    bounded,
+)
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+SETTINGS = PaintSettings(sh_degree=1)
+DRAW = TorchRasterizer(compile="never")
+GAUSSIANS = random_gaussians(400, size=0.03, dtype=torch.float64)
+VIEW = ring_of_views(3, dtype=torch.float64)[1]
+TREE = build_kd(GAUSSIANS.means, 6)
+
+
+def pictures(ownership="fragments", pass_gaussians=0, scene=None, tree=TREE, window_weight=0.0):
+    scene = scene or MemoryScene(tree, GAUSSIANS)
+    painter = Painter(scene, [VIEW], DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
+    return BlockPictures(painter, VIEW, SETTINGS, window_weight)
+
+
+@pytest.mark.parametrize("pass_gaussians", [0, 150, 10**6])
+def test_the_scene_by_units_is_the_scene_at_once(pass_gaussians):
+    merged = DRAW(GAUSSIANS, VIEW, sh_degree=1)
+    found = pictures(pass_gaussians=pass_gaussians).draw(Show.EVERYTHING, None)
+    for name in ("color", "transmittance", "depth"):
+        assert float((getattr(found, name) - getattr(merged, name)).abs().max()) < 2e-3, name
+
+
+def test_the_device_holds_one_unit_at_a_time(monkeypatch):
+    drawn = []
+    draw = TorchRasterizer.draw
+    monkeypatch.setattr(
+        TorchRasterizer, "draw", lambda self, g, *a, **k: drawn.append(len(g)) or draw(self, g, *a, **k)
+    )
+    pictures("means").everything()
+    assert len(drawn) == 6
+    assert max(drawn) < len(GAUSSIANS) / 4
+
+
+def test_what_cannot_be_seen_is_not_drawn(monkeypatch):
+    wall = replace(
+        GAUSSIANS, opacities=torch.full_like(GAUSSIANS.opacities, 9.0), scales=GAUSSIANS.scales + 3
+    )
+    drawn = []
+    draw = TorchRasterizer.draw
+    monkeypatch.setattr(TorchRasterizer, "draw", lambda self, *a, **k: drawn.append(1) or draw(self, *a, **k))
+    found = pictures("means", scene=MemoryScene(TREE, wall)).everything()
+    assert len(drawn) < 6
+    assert float(found.transmittance.max()) < 1e-3
+
+
+def test_a_block_alone_is_its_own_gaussians():
+    owner = TREE.assign(GAUSSIANS.means)
+    found = pictures().draw(Show.BLOCK, 2)
+    expected = DRAW(GAUSSIANS[owner == 2], VIEW, sh_degree=1)
+    assert torch.equal(found.color, expected.color)
+    assert torch.equal(found.depth, expected.depth)
+
+
+@pytest.mark.parametrize("block", range(6))
+def test_by_fragments_the_composite_is_the_merged_picture(block):
+    found = pictures().draw(Show.COMPOSITE, block)
+    merged = DRAW(GAUSSIANS, VIEW, sh_degree=1)
+    assert float((found.color - merged.color).abs().max()) < 2e-3
+
+
+@pytest.mark.parametrize("ownership", ["fragments", "means"])
+def test_by_either_ownership_front_and_back_are_what_the_composite_is_made_of(ownership):
+    made = pictures(ownership)
+    front, back = made.draw(Show.FRONT, 3), made.draw(Show.BACK, 3)
+    whole = made.draw(Show.COMPOSITE, 3)
+    assert float(front.transmittance.min()) < 0.9
+    # F alone over B shows no more than the composite does.
+    without = over(front.layer, back.layer)
+    assert bool((without.transmittance >= whole.transmittance - 1e-9).all())
+    if ownership == "means":
+        alone = made.draw(Show.BLOCK, 3)
+        expected = over(front.layer, over(alone.layer, back.layer))
+        assert float((expected.color - whole.color).abs().max()) < 1e-12
+
+
+def test_layers_lie_far_behind_the_boxes():
+    front = pictures().draw(Show.FRONT, 3)
+    alpha = 1 - front.transmittance
+    assert torch.allclose(front.depth, FAR * alpha)
+
+
+def test_an_empty_block_shows_nothing():
+    owner = TREE.assign(GAUSSIANS.means)
+    scene = MemoryScene(TREE, GAUSSIANS[owner != 2])
+    nothing = pictures(scene=scene).draw(Show.BLOCK, 2)
+    assert float(nothing.transmittance.min()) == 1.0
+    assert nothing.depth.shape == (VIEW.height, VIEW.width)
+    assert torch.isfinite(pictures(scene=scene).draw(Show.COMPOSITE, 2).color).all()
+
+
+def test_a_cropped_scene():
+    upper = Cropped(MemoryScene(TREE, GAUSSIANS), lambda gaussians: gaussians[gaussians.means[:, 2] > 0])
+    found = pictures(scene=upper).draw(Show.EVERYTHING, None)
+    expected = DRAW(GAUSSIANS[GAUSSIANS.means[:, 2] > 0], VIEW, sh_degree=1)
+    assert float((found.color - expected.color).abs().max()) < 2e-3
+
+
+def test_no_client_makes_a_picture_of_any_size():
+    huge = bounded(replace(VIEW, width=100_000, height=50_000))
+    assert huge.width * huge.height <= MOST_PIXELS
+    assert huge.width == pytest.approx(2 * huge.height, rel=0.01)
+    assert float(huge.K[0, 0]) == pytest.approx(float(VIEW.K[0, 0]) * huge.width / 100_000, rel=0.01)
+    assert bounded(VIEW) == VIEW
+    nothing = bounded(replace(VIEW, width=0))
+    assert (nothing.width, nothing.height) == (1, VIEW.height)
+
+
+def test_only_the_viewers_threads_draw_for_the_viewer():
+    assert not asked_by_viewer()
+    answers = []
+
+    class Renders(RenderStateMachine):
+        def __init__(self) -> None:
+            threading.Thread.__init__(self)
+
+        def run(self) -> None:
+            answers.append(asked_by_viewer())
+
+    thread = Renders()
+    thread.start()
+    thread.join()
+    assert answers == [True]

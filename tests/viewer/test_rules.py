@@ -1,0 +1,196 @@
+"""Who may talk to the viewer: the rules, without a server."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+from websockets.datastructures import Headers
+
+from abcd_ns.viewer import rules as rules_module
+from abcd_ns.viewer.rules import Rules, content_policy, is_camera, plain_path
+
+
+def headers(host: str = "127.0.0.1:7007", origin: str | None = None) -> Headers:
+    fields = [("Host", host)] + ([] if origin is None else [("Origin", origin)])
+    return Headers(fields)
+
+
+HOME = Rules("127.0.0.1")
+EVERYWHERE = Rules("0.0.0.0")
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1:7007", "localhost:8080", "LOCALHOST", "127.8.9.1", "[::1]:7007", "localhost."]
+)
+def test_a_viewer_at_home_goes_by_the_names_of_this_machine(host):
+    assert HOME.knows(host)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example",
+        "evil.example:7007",
+        "localhost.evil.example",
+        "127.0.0.1.evil.example",
+        "192.168.1.5",
+        "0.0.0.0",
+        "user@localhost",
+        "localhost/..",
+        "localhost localhost",
+        "[::1",
+        "[::2]",
+        "localhost:99999999",
+        "",
+    ],
+)
+def test_and_by_no_others(host):
+    assert not HOME.knows(host)
+
+
+def test_a_name_that_was_configured_is_known():
+    assert Rules("workstation").knows("workstation:7007")
+    assert Rules("192.168.1.5").knows("192.168.1.5:7007")
+    assert not Rules("workstation").knows("workstation.evil.example")
+
+
+def test_a_viewer_on_all_networks_goes_by_addresses_and_own_names_alone(monkeypatch):
+    monkeypatch.setattr(rules_module.socket, "gethostname", lambda: "Lab7.example.org")
+    known = ["192.168.1.5:7007", "[fe80::1]:7007", "lab7:7007", "lab7.example.org", "lab7.local", "localhost"]
+    assert [host for host in known if not EVERYWHERE.knows(host)] == []
+    assert not EVERYWHERE.knows("rebound.evil.example:7007")
+
+
+def test_the_tunnels_name_is_known_only_where_sharing_is_on():
+    assert not HOME.knows("abc.share.viser.studio")
+    assert Rules("127.0.0.1", share=True).knows("abc.share.viser.studio")
+    assert not Rules("127.0.0.1", share=True).knows("share.viser.studio.evil.example")
+
+
+@pytest.mark.parametrize(
+    ("origin", "fine"),
+    [
+        (None, True),
+        ("http://127.0.0.1:7007", True),
+        ("https://127.0.0.1:7007", True),
+        ("HTTP://127.0.0.1:7007", True),
+        ("http://127.0.0.1:8080", False),
+        ("http://localhost:7007", False),
+        ("https://evil.example", False),
+        ("null", False),
+        ("", False),
+    ],
+)
+def test_the_origin_must_be_the_viewers_own(origin, fine):
+    assert (HOME.refusal("/", headers(origin=origin)) is None) == fine
+
+
+def test_two_hosts_or_two_origins_are_one_too_many():
+    twice = Headers([("Host", "localhost"), ("Host", "evil.example")])
+    assert "Host" in HOME.refusal("/", twice)
+    origins = Headers([("Host", "localhost"), ("Origin", "http://localhost"), ("Origin", "http://evil")])
+    assert "Origin" in HOME.refusal("/", origins)
+    assert "Host" in HOME.refusal("/", Headers())
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/?x=../..", "/index.html", "/assets/index-_lN.css", "/Inter-VariableFont_slnt,wght.ttf"]
+)
+def test_paths_of_the_viewers_files(path):
+    assert plain_path(path)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../secret",
+        "/assets/../../secret",
+        "/./secret",
+        "/%2e%2e/secret",
+        "/%2E%2E%2Fsecret",
+        "/..%5csecret",
+        "/assets\\..\\secret",
+        "/%252e%252e/secret",
+        "/a\0b",
+        "/.git/config",
+        "//etc/passwd",
+        "etc/passwd",
+        "http://127.0.0.1/index.html",
+        "/assets/",
+        "/\u2024\u2024/secret",
+        "/a\nb",
+        "",
+    ],
+)
+def test_paths_that_are_none(path):
+    assert not plain_path(path)
+
+
+def test_a_refusal_quotes_a_stranger_harmlessly():
+    reasons = [HOME.refusal("/\x1b[31m" + "x" * 500, headers()), HOME.refusal("/", headers("x" * 500))]
+    assert "\x1b" not in reasons[0]
+    assert max(map(len, reasons)) < 200
+
+
+def camera(**changes):
+    fields = {
+        "wxyz": (1.0, 0.0, 0.0, 0.0),
+        "position": (1.0, 2.0, 3.0),
+        "look_at": (0.0, 0.0, 0.0),
+        "up_direction": (0.0, 0.0, 1.0),
+        "fov": 1.0,
+        "aspect": 1.5,
+    }
+    return type("ViewerCameraMessage", (SimpleNamespace,), {})(**{**fields, **changes})
+
+
+def test_a_camera():
+    assert is_camera(camera())
+    assert HOME.admits(camera())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"wxyz": (1.0, 0.0, 0.0)},
+        {"wxyz": (0.0, 0.0, 0.0, 0.0)},
+        {"wxyz": None},
+        {"position": (math.nan, 0.0, 0.0)},
+        {"position": "123"},
+        {"position": {0: 1, 1: 2, 2: 3}},
+        {"look_at": (1.0, "2", 3.0)},
+        {"fov": 0.0},
+        {"fov": math.pi},
+        {"fov": "wide"},
+        {"aspect": math.inf},
+        {"aspect": 1e9},
+        {"aspect": -1.0},
+        {"aspect": [1.5]},
+    ],
+)
+def test_no_camera(changes):
+    assert not HOME.admits(camera(**changes))
+
+
+def message(kind: str, **fields):
+    return type(kind, (SimpleNamespace,), {})(**fields)
+
+
+def test_sharing_takes_permission():
+    for kind in ("ShareUrlRequest", "ShareUrlDisconnect"):
+        assert not HOME.admits(message(kind))
+        assert Rules("127.0.0.1", share=True).admits(message(kind))
+
+
+def test_of_a_control_only_the_value_can_be_set():
+    assert HOME.admits(message("GuiUpdateMessage", updates={"value": 3}))
+    assert not HOME.admits(message("GuiUpdateMessage", updates={"value": 3, "update_cb": []}))
+    assert not HOME.admits(message("GuiUpdateMessage", updates=["value"]))
+
+
+def test_the_page_may_connect_to_its_own_server_alone():
+    policy = content_policy(["127.0.0.1:7007"])
+    assert "connect-src 'self' data: blob: ws://127.0.0.1:7007 wss://127.0.0.1:7007;" in policy
+    assert "default-src 'self' " in policy
+    assert "https:" not in policy
+    assert "*" not in policy

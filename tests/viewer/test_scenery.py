@@ -1,0 +1,108 @@
+"""Boxes and cameras in the viewer's scene."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.blocks import Box
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, center, clipped, frame_mesh
+from abcd_ns.viewer.scenery import overview, views_that_see
+from tests.reference.scenes import ring_of_views
+
+
+def box(lower: tuple[float, ...], upper: tuple[float, ...]) -> Box:
+    return Box(torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64))
+
+
+def points(count: int = 4000, seed: int = 0) -> torch.Tensor:
+    return torch.rand((count, 3), generator=torch.Generator().manual_seed(seed)) * 2 - 1
+
+
+def test_outliers_do_not_stretch_the_bulk():
+    scene = points()
+    far = torch.cat([scene, torch.full((40, 3), 1e7), torch.full((3, 3), float("nan"))])
+    plain, found = bulk(scene), bulk(far)
+    assert float((plain.upper - found.upper).abs().max()) < 0.1
+    assert bool((found.upper < 1.2).all())
+    assert bool((found.lower > -1.2).all())
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_there_is_a_bulk_of_any_points(count):
+    found = bulk(points(count))
+    assert bool((found.upper > found.lower).all())
+    assert bool(torch.isfinite(found.upper - found.lower).all())
+
+
+@given(st.integers(1, 12), st.integers(0, 1000))
+def test_boxes_are_finite_inside_their_cells_and_apart(blocks, seed):
+    scene = points(500, seed)
+    tree, bounds = build_kd(scene, blocks), bulk(scene)
+    found = boxes_of(tree, bounds)
+    assert sorted(found) == list(range(blocks))
+    for block, shown in found.items():
+        cell = tree.cell(block)
+        assert bool((shown.lower >= cell.lower).all())
+        assert bool((shown.upper <= cell.upper).all())
+        assert bool((shown.lower >= bounds.lower).all())
+        assert bool((shown.upper <= bounds.upper).all())
+        assert bool((shown.lower < shown.upper).all())
+        others = [other for b, other in found.items() if b != block]
+        assert not any(shown.intersects(other) for other in others)
+
+
+def test_a_cell_beyond_the_bulk_has_no_box():
+    assert clipped(box((2, 0, 0), (3, 1, 1)), box((0, 0, 0), (1, 1, 1))) is None
+    inside = clipped(box((0.5, 0, 0), (np.inf, 1, 1)), box((0, 0, 0), (1, 1, 1)))
+    assert inside.upper.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_a_frame_is_twelve_beams_along_the_edges_in_the_viewers_units():
+    shown = box((0, 0, 0), (1, 2, 3))
+    vertices, faces = frame_mesh(shown, thickness=0.1)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.body_count == 12
+    volumes = sorted(part.volume for part in mesh.split())
+    expected = sorted(0.1 * 0.1 * (length + 0.1) * SCENE_SCALE**3 for length in (1, 2, 3) for _ in range(4))
+    assert volumes == pytest.approx(expected, rel=1e-4)
+    assert mesh.bounds.tolist() == pytest.approx(np.array([[-0.5] * 3, [10.5, 20.5, 30.5]]))
+    assert center(shown).tolist() == [5.0, 10.0, 15.0]
+
+
+def test_views_that_see():
+    views = ring_of_views(8)
+    assert views_that_see(torch.zeros(1, 3), views) == views
+    assert views_that_see(torch.tensor([[0.0, 0.0, 1e4]]), views) == []
+    assert views_that_see(torch.zeros(0, 3), views) == []
+    # Beside the first camera, and so behind it and in front of the one across.
+    beyond = views[0].center * 1.2
+    seen = {view.index for view in views_that_see(beyond[None], views)}
+    assert 0 not in seen
+    assert 4 in seen
+
+
+def test_a_twentieth_of_a_block_in_the_image_suffices():
+    views = ring_of_views(1)
+    behind = views[0].center * 2
+    some = torch.cat([torch.zeros(1, 3), behind.expand(18, 3)])
+    few = torch.cat([torch.zeros(1, 3), behind.expand(20, 3)])
+    assert len(views_that_see(some, views)) == 1
+    assert views_that_see(few, views) == []
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 8])
+def test_the_first_look_is_from_behind_the_cameras(count):
+    views = ring_of_views(8)[:count]
+    shown = box((-1, -1, -1), (1, 1, 1))
+    eye, target = overview(shown, views)
+    assert target.tolist() == [0.0, 0.0, 0.0]
+    # Far enough out to have all of the box in view, and from above.
+    assert np.linalg.norm(eye) > SCENE_SCALE * float(shown.upper.norm())
+    assert eye[2] > 0
+    if count == 1:
+        assert np.dot(eye[:2], views[0].center[:2].numpy()) > 0
