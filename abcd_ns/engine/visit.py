@@ -115,7 +115,7 @@ class VisitLayers:
         *,
         window_weight: float,
         scene_key: str,
-        at_hand_bytes: int,
+        at_hand_bytes: int = AT_HAND_BYTES,
     ) -> None:
         self._painter, self._cache = painter, cache
         self._geometry, self._views, self._settings = geometry, views, settings

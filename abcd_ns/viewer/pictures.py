@@ -9,7 +9,9 @@ from enum import Enum
 import torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
+from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.compositing import empty_layer, over
+from abcd_ns.engine.culling import Frusta
 from abcd_ns.engine.influence import coarser
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.painter import Painter, PaintSettings, Parts
@@ -72,6 +74,9 @@ class Cropped:
     def count(self, block: int) -> int:
         return self._scene.count(block)
 
+    def bounds(self, block: int) -> Box | None:
+        return self._scene.bounds(block)
+
 
 @dataclass(frozen=True)
 class BlockPictures:
@@ -105,14 +110,14 @@ class BlockPictures:
     def everything(self) -> Raster:
         """The whole scene, nearest unit first, until nothing behind can be seen."""
         painter, view = self.painter, self.view
-        whole = self._nothing()
+        whole, seen_by = self._nothing(), Frusta([(view, view.full)])
         for unit in painter.order(painter.units(), view):
             if float(whole.transmittance.max()) < OPAQUE:
                 break
-            window = None
+            loaded, window = painter.load(unit, seen_by=seen_by), None
             if painter.ownership == "fragments" and unit != 0:
                 window = ray_interval(painter.tree.box(unit), view, view.full)
-            next_one = self._raster(painter.load(unit).gaussians, None, window)
+            next_one = self._raster(loaded.gaussians, None, window)
             layer = over(whole.layer, next_one.layer)
             depth = whole.depth + whole.transmittance * next_one.depth
             whole = Raster(layer.color, layer.transmittance, depth, {})
@@ -141,11 +146,13 @@ class BlockPictures:
 
     def _around(self, block: int, window: ZWindow | None) -> Parts:
         painter, view = self.painter, self.view
-        parts = {}
+        seen_by = Frusta([(view, view.full)])
+        parts: dict[int, Parts | None] = {}
         for unit in painter.units(exclude=block):
-            loaded = painter.load(unit, block)
+            loaded = painter.load(unit, block, seen_by)
             cut = {"active": block, "window": window}
             parts[unit] = painter.paint(unit, loaded, view, view.full, self.settings, **cut)
+            painter.fold_up(parts, unit, view)
         return painter.fold(parts, view, view.full)
 
 

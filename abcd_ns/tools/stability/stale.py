@@ -5,7 +5,9 @@ from typing import Any
 import torch
 
 from abcd_ns.engine.block_state import BlockState
+from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.culling import bounds_of
 from abcd_ns.engine.painter import Painter, PaintSettings
 from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.scene import BlockScene
@@ -31,6 +33,9 @@ class Snapshot(BlockScene):
 
     def count(self, block: int) -> int:
         return len(self._blocks[block])
+
+    def bounds(self, block: int) -> Box | None:
+        return bounds_of(self._blocks[block])
 
 
 class StaleCoordinator(Coordinator):
