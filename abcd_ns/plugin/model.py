@@ -54,7 +54,7 @@ class AbcdModel(SplatfactoModel):
         self.camera_optimizer = self.config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu"
         )
-        self.tree = build_kd(torch.zeros(0, 3), 1)
+        self._tree = build_kd(torch.zeros(0, 3), 1)
         self.near = NEAR_PLANE
         self.step = 0
         self.crop_box: OrientedBox | None = None
@@ -69,7 +69,6 @@ class AbcdModel(SplatfactoModel):
     def follow(self, coordinator: Coordinator) -> None:
         """From now on the scene is the coordinator's, and the registered parameters its live block."""
         self._coordinator = coordinator
-        self.tree = coordinator.scene.tree
 
     def draws_with(self) -> Rasterizer:
         """The rasterizer, made on first use."""
@@ -78,6 +77,11 @@ class AbcdModel(SplatfactoModel):
         return self._rasterizer
 
     # -- the scene -----------------------------------------------------------------------------------
+
+    @property
+    def tree(self) -> BlockTree:
+        """How space is cut; while training, as it is now."""
+        return self._tree if self._coordinator is None else self._coordinator.scene.tree
 
     def scene(self) -> BlockScene:
         """The whole scene by blocks, the live one included."""
@@ -132,7 +136,7 @@ class AbcdModel(SplatfactoModel):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Take over the cut of space and the near plane from a checkpoint."""
-        self.tree = BlockTree.from_json(state["tree"])
+        self._tree = BlockTree.from_json(state["tree"])
         self.near = state.get("near", NEAR_PLANE)
 
     # -- pictures ------------------------------------------------------------------------------------

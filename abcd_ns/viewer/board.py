@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from abcd_ns.engine.events import Event, StepTaken, VisitBegan, VisitEnded
+from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
 from abcd_ns.engine.run_state import UNLIMITED, RunState
 
 FEW_VIEWS = 3
@@ -91,6 +91,8 @@ class Board:
                 self._recent.append(event.psnr)
                 if not self.curve or seconds - self.curve[-1][0] >= SECONDS_BETWEEN_POINTS:
                     self._add_point(seconds)
+            case BlockSplit():
+                self.visits[event.new] = self.visits.get(event.block, 0)
             case VisitEnded():
                 self.visit = None
                 if event.block is not None:

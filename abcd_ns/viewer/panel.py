@@ -17,7 +17,7 @@ from abcd_ns.engine.events import Event, LayersDrawn, SweepEnded, VisitBegan, Vi
 from abcd_ns.engine.influence import worth_training
 from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.scene import BlockScene
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import View
 from abcd_ns.viewer.board import BlockRow, Board, Status, seconds_left, sweep_share
 from abcd_ns.viewer.boxes import boxes_of, bulk
 from abcd_ns.viewer.controls import Controls
@@ -40,8 +40,6 @@ class Drawn(Protocol):
 
     tree: BlockTree
     choice: Choice
-    initial: Gaussians
-    """What training began with."""
 
     def scene(self) -> BlockScene:
         """The scene by blocks."""
@@ -66,7 +64,8 @@ class AbcdPanel(ViewerControl):
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
         self._layers = ""
-        self._laid_out = False
+        self._laid_out = 0
+        """Blocks for which boxes and lists are made; 0 before that."""
         self._overview: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
@@ -109,19 +108,17 @@ class AbcdPanel(ViewerControl):
     def _lay_out(self) -> None:
         """Boxes and the list of blocks, once the cut of space is known."""
         tree, scene = self._model.tree, self._model.scene()
-        if self._coordinator is not None:
-            means = self._model.initial.means
-        else:
-            means = torch.cat([scene.gaussians(block).means for block in range(tree.num_blocks)])
-        bounds = bulk(means)
+        bounds = bulk(torch.cat([scene.gaussians(block).means for block in range(tree.num_blocks)]).cpu())
         self._scenery.set_boxes(boxes_of(tree, bounds))
         self._overview = overview(bounds, self._views())
         self._controls.set_blocks(tree.num_blocks)
-        self._laid_out = True
+        self._laid_out = tree.num_blocks
 
     def _update(self) -> None:
         if not self._laid_out:
             return
+        if self._laid_out != self._model.tree.num_blocks:  # a block was cut in two
+            self._lay_out()
         self._updated = time.monotonic()
         rows = self._rows()
         self._controls.write(blocks=block_table(rows), memory=memory_table(self._memory()))

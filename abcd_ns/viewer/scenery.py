@@ -51,7 +51,7 @@ class Scenery:
 
     def set_boxes(self, boxes: Mapping[int, Box]) -> None:
         """The boxes to show, by block; drawn when their states are known."""
-        self._boxes = dict(boxes)
+        self._boxes, self._status = dict(boxes), {}
         corners = torch.stack([c for box in boxes.values() for c in (box.lower, box.upper)])
         self._thickness = THICKNESS * float((corners.amax(dim=0) - corners.amin(dim=0)).norm())
 

@@ -14,7 +14,7 @@ from torch.nn import Parameter
 
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.coordinator import DEFAULT_BATCH, Coordinator
+from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Event
 from abcd_ns.engine.initialize import gaussians_from_points, thin_out
@@ -25,6 +25,7 @@ from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.schedule import views_per_step
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -222,7 +223,7 @@ def live_optimizers(sh_degree: int) -> tuple[dict[str, Parameter], Optimizers]:
 
 def steps_for(views: int, config: TrainingConfig, blocks: int) -> int:
     """Steps that draw about so many views: one each in the warm-up and with one block, else a batch."""
-    batch = config.batch or (1 if blocks == 1 else DEFAULT_BATCH)
+    batch = views_per_step(config.batch, blocks)
     warmup = config.warmup if blocks > 1 else 0.0
     return max(round(views / (warmup + (1 - warmup) * batch)), 1)
 
