@@ -8,9 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Parts
-from abcd_ns.engine.rasterizer import ZWindow
+from abcd_ns.engine.rasterizer import Raster, Shot, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.types import Crop, View
 
@@ -25,6 +27,32 @@ class Sample:
     near: Splats | None
     window: ZWindow | None
     background: Float[Tensor, "3"]
+
+    @property
+    def shot(self) -> Shot:
+        """What the rasterizer is to draw."""
+        return Shot(self.view, self.crop, self.near, None if self.near is None else self.window)
+
+    def picture(self, raster: Raster) -> Float[Tensor, "h w 3"]:
+        """What the rasterizer drew, between the layers and on the background, 0..1."""
+        if self.layers is None:
+            rgb = raster.color + raster.transmittance[..., None] * self.background
+        else:
+            rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
+        return rgb.clamp(0, 1)
+
+    def loss(
+        self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig
+    ) -> Float[Tensor, ""]:
+        """Photometric, as this crop's part of the loss of the whole image."""
+        return photometric_loss(
+            picture,
+            photo,
+            full_pixels=self.view.full.pixels,
+            full_windows=ssim_windows(self.view.height, self.view.width),
+            ssim_lambda=config.ssim_lambda,
+            pixel_loss=config.pixel_loss,
+        )
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from torch import Tensor
 from abcd_ns.engine.batch import Batch, Rendered, Sample, background
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
 from abcd_ns.engine.density import DensityClock, DensityControl, Infos, for_blocks
 from abcd_ns.engine.events import (
@@ -29,15 +28,14 @@ from abcd_ns.engine.events import (
     VisitEnded,
 )
 from abcd_ns.engine.health import Health
-from abcd_ns.engine.influence import DIGITS, Influence, influence, weights
-from abcd_ns.engine.loss import photometric_loss, ssim_windows
+from abcd_ns.engine.influence import influence, share_shown
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
 from abcd_ns.engine.planner import Planner
-from abcd_ns.engine.rasterizer import Rasterizer, Shot
+from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.room import check_room
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.scaffold import LIVE, part
+from abcd_ns.engine.scaffold import LIVE
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
     endless_order,
@@ -46,10 +44,10 @@ from abcd_ns.engine.schedule import (
     view_order,
     views_per_step,
 )
-from abcd_ns.engine.settle import at_rest, had_reserve, has_reserve, owners_at_rest, settle
+from abcd_ns.engine.settle import at_rest, count_at_rest, had_reserve, has_reserve, settle
 from abcd_ns.engine.splitting import split_full
 from abcd_ns.engine.storage import LayerCache, crash_points
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import AT_HAND_BYTES, VisitLayers
 
 
@@ -90,28 +88,14 @@ class Coordinator:
         self._scene_key, self._at_hand_bytes = scene_key, at_hand_bytes
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
-        self._planner = Planner(
-            config,
-            budget,
-            scene,
-            self.views,
-            rasterizer,
-            device=self.device,
-        )
+        self._planner = Planner(config, budget, scene, self.views, rasterizer, device=self.device)
         self._pace = Pace(optimizers)
-        self.health = Health(
-            scene,
-            params,
-            optimizers,
-            self.announce,
-            may_act=config.heal and config.layers,
-            may_drop=config.density.strategy == "default",
-        )
+        heals = {"may_act": config.heal and config.layers, "may_drop": config.density.strategy == "default"}
+        self.health = Health(scene, params, optimizers, self.announce, **heals)
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
         self._layers: VisitLayers | None = None
         self._order: tuple[int, ...] = ()
-        self._owner = torch.zeros(0, dtype=torch.int64)
 
     @property
     def batch(self) -> int:
@@ -165,15 +149,12 @@ class Coordinator:
             background=background(self.config, self.state.step, place).to(self.device),
         )
 
-    def _shot(self, sample: Sample) -> Shot:
-        return Shot(sample.view, sample.crop, sample.near, None if sample.near is None else sample.window)
-
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
         changes = self._active.is_whole or self.config.sh_restart
         rasters = self._rasterizer.draw(
             live_gaussians(self.params),
-            [self._shot(sample) for sample in batch.samples],
+            [sample.shot for sample in batch.samples],
             sh_degree=self.sh_degree if changes else self._active.sh_degree,
             antialiased=self.config.antialiased,
             absgrad=self.density.absgrad,
@@ -183,11 +164,7 @@ class Coordinator:
         pictures = []
         for sample, raster in zip(batch.samples, rasters, strict=True):
             self.health.see(sample.layers and sample.layers.front, raster.transmittance)
-            if sample.layers is None:
-                rgb = raster.color + raster.transmittance[..., None] * sample.background
-            else:
-                rgb = sandwich(sample.layers.front, raster.layer, sample.layers.back, sample.background)
-            pictures.append(rgb.clamp(0, 1))
+            pictures.append(sample.picture(raster))
         return Rendered(tuple(pictures), tuple(raster.transmittance for raster in rasters), infos)
 
     def loss(
@@ -198,17 +175,8 @@ class Coordinator:
     ) -> Float[Tensor, ""]:
         """The loss of a step: photometric over the crops, the mean of the samples', plus what the density
         strategy asks for."""
-        losses = [
-            photometric_loss(
-                picture,
-                photo,
-                full_pixels=sample.view.full.pixels,
-                full_windows=ssim_windows(sample.view.height, sample.view.width),
-                ssim_lambda=self.config.ssim_lambda,
-                pixel_loss=self.config.pixel_loss,
-            )
-            for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True)
-        ]
+        triples = zip(batch.samples, pictures, photos, strict=True)
+        losses = [sample.loss(picture, photo, self.config) for sample, picture, photo in triples]
         self.health.note(tuple(sample.view.index for sample in batch.samples), losses)
         photometric = sum(losses, start=torch.zeros((), device=self.device)) / len(batch.samples)
         if self.config.density.strategy != "mcmc":
@@ -225,11 +193,8 @@ class Coordinator:
             self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)
             self._refine(rendered.infos if sound else (), taken)
         self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
-        if (
-            active.done >= active.steps
-            or self.finished
-            or (active.is_whole and self.progress >= self.config.warmup)
-        ):
+        is_warm = active.is_whole and self.progress >= self.config.warmup
+        if active.done >= active.steps or self.finished or is_warm:
             self._end_visit()
 
     def _refine(self, infos: Infos, taken: int) -> None:
@@ -295,9 +260,8 @@ class Coordinator:
         if (active := self.state.active) is not None:
             self.health.look_over()
             state = self._detached()
-            held = part(state, self._owner) if active.is_whole else {LIVE: state}
-            updates = {block: state.to_tensors() for block, state in held.items()}
-            active.saved = not active.is_whole
+            updates = {LIVE: state.to_tensors()}
+            active.saved = True
         self.state.seconds = self.stopwatch.seconds
         self.scene.store.commit(updates, state=self.state.to_json())
         if pin is not None:
@@ -327,8 +291,7 @@ class Coordinator:
 
     def _attach(self, active: ActiveVisit) -> None:
         which = (self.scene, active.geometry.block, active.saved)
-        self._owner = owners_at_rest(*which).to(self.device)
-        check_room(len(self._owner), self.config.sh_degree, self.device)
+        check_room(count_at_rest(*which), self.config.sh_degree, self.device)
         rest = at_rest(*which).to(self.device)
         if active.done == 0 and not self.config.keep_moments:
             rest = rest.forgetful()
@@ -338,7 +301,8 @@ class Coordinator:
         self.scene.lay_over(
             None if active.is_whole else active.geometry.block, lambda: live_gaussians(self.params)
         )
-        self._order = self._order_of(active)
+        taken = 0 if active.is_whole else active.steps * self.batch
+        self._order = view_order(active.views, taken, active.number, self.config.seed)
         seen, block = len(active.geometry.views), None if active.is_whole else active.geometry.block
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
@@ -350,20 +314,11 @@ class Coordinator:
     def _measure_influence(self, active: ActiveVisit) -> None:
         """Find out how much the doubtful views show of the block by now."""
         for view in active.looked_at:
-            sample = self._sample(view, 0)
-            found = weights(
-                live_gaussians(self.params),
-                self._rasterizer,
-                self._shot(sample),
-                sample.layers and sample.layers.front.transmittance,
-                antialiased=self.config.antialiased,
+            sample, live = self._sample(view, 0), live_gaussians(self.params)
+            before = sample.layers and sample.layers.front.transmittance
+            self.state.influence[active.geometry.block][view] = share_shown(
+                live, self._rasterizer, sample.shot, before, antialiased=self.config.antialiased
             )
-            share = float(found.sum()) / sample.view.full.pixels
-            self.state.influence[active.geometry.block][view] = round(share, DIGITS)
-
-    def _order_of(self, active: ActiveVisit) -> tuple[int, ...]:
-        taken = 0 if active.is_whole else active.steps * self.batch
-        return view_order(active.views, taken, active.number, self.config.seed)
 
     def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
         if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
@@ -376,14 +331,13 @@ class Coordinator:
             pass_gaussians=self.config.pass_gaussians or default_pass(self.scene),
             device=self.device,
         )
-        settings = PaintSettings(active.sh_degree, self.config.antialiased)
         layers = VisitLayers(
             painter,
             self.cache,
             active.geometry,
             self.scene.at_rest(active.geometry.block),
             self.views,
-            settings,
+            PaintSettings(active.sh_degree, self.config.antialiased),
             window_weight=self.config.window_weight,
             scene_key=self._scene_key,
             at_hand_bytes=self._at_hand_bytes,
@@ -398,7 +352,9 @@ class Coordinator:
         self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
         state = self.health.end_visit(active, self._detached)
         if active.is_whole:
-            self.state.influence = self._influence_of_all(state.gaussians)
+            owner, views = self.scene.tree.assign(state.gaussians.means), self.views.values()
+            options = {"antialiased": self.config.antialiased}
+            self.state.influence = influence(state.gaussians, owner, views, self._rasterizer, **options)
         updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
         tree, updates = self._split_full(updates)
         split = tree is not self.scene.tree
@@ -438,11 +394,6 @@ class Coordinator:
             self.state.inherit(new, parent)
             self.announce(BlockSplit(parent, new, len(updates[parent]), len(updates[new])))
         return tree, updates
-
-    def _influence_of_all(self, scaffold: Gaussians) -> Influence:
-        owner = self.scene.tree.assign(scaffold.means)
-        options = {"antialiased": self.config.antialiased}
-        return influence(scaffold, owner, self.views.values(), self._rasterizer, **options)
 
     def _detached(self) -> BlockState:
         return detach(self.params, self.optimizers, self._growth, self._clocks)

@@ -51,6 +51,19 @@ def weights(
     return found.flatten(1)[:, 0] / _SH_0
 
 
+def share_shown(
+    gaussians: Gaussians,
+    rasterizer: Rasterizer,
+    shot: Shot,
+    front: Float[Tensor, "h w"] | None,
+    *,
+    antialiased: bool = False,
+) -> float:
+    """The influence of some Gaussians on the view of a shot that shows all of them; see `weights`."""
+    found = weights(gaussians, rasterizer, shot, front, antialiased=antialiased)
+    return round(float(found.sum()) / shot.view.full.pixels, DIGITS)
+
+
 def influence(
     gaussians: Gaussians,
     owner: Int[Tensor, "n"],

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from abcd_ns.engine.block_state import BlockState
@@ -19,17 +18,15 @@ def at_rest(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
     return join([_at_rest(scene, number) for number in _numbers(scene, block, saved)])
 
 
-def owners_at_rest(scene: StoredScene, block: int, saved: bool = False) -> Tensor:
-    """The number under which the store keeps each row of `at_rest` [n]."""
-    numbers = _numbers(scene, block, saved)
-    rows = torch.tensor([scene.store.counts(number) for number in numbers])
-    return torch.tensor(numbers).repeat_interleave(rows)
+def count_at_rest(scene: StoredScene, block: int, saved: bool = False) -> int:
+    """Rows of `at_rest`, without reading them."""
+    return sum(scene.store.counts(number) for number in _numbers(scene, block, saved))
 
 
 def _numbers(scene: StoredScene, block: int, saved: bool) -> list[int]:
-    if block == WHOLE:
-        return list(range(scene.tree.num_blocks))
-    return [LIVE if saved else block]
+    if saved:
+        return [LIVE]
+    return list(range(scene.tree.num_blocks)) if block == WHOLE else [block]
 
 
 def settle(scene: StoredScene, block: int, state: BlockState, migrate: bool = True) -> dict[int, BlockState]:

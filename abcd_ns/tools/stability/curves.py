@@ -79,21 +79,33 @@ def _score(lab: Lab, stage: Stage, method: Method, **options) -> float:
 def studies() -> tuple[Study, ...]:
     """All of them, on the table with its balls."""
     stage = make_stage(views=ring(MANY))
-    run = partial(partial, _score)  # run(stage=..., ...) is a call that still waits for its lab
-    one_block = run(stage=stage, method="abcd-monolithic")
+    return (*_studies_of_blocks(stage), *_studies_of_captures(stage))
+
+
+_later = partial(partial, _score)
+"""_later(stage=..., ...) is a call that still waits for its lab."""
+
+
+def _studies_of_blocks(stage: Stage) -> tuple[Study, ...]:
+    """What block training adds to joint training: cuts, visits, layers."""
+    one_block = _later(stage=stage, method="abcd-monolithic")
     return (
         Study(
             "blocks",
             "number of blocks",
             "blocks",
-            tuple((m, k, run(stage=stage, method=m, blocks=k)) for m in WITH_BLOCKS for k in BLOCKS if k > 1),
+            tuple(
+                (m, k, _later(stage=stage, method=m, blocks=k)) for m in WITH_BLOCKS for k in BLOCKS if k > 1
+            ),
             level=one_block,
         ),
         Study(
             "visit-steps",
             "length of a visit",
             "steps a visit (4 views each)",
-            tuple(("abcd", n, run(stage=stage, method="abcd", blocks=4, visit_steps=n)) for n in VISIT_STEPS),
+            tuple(
+                ("abcd", n, _later(stage=stage, method="abcd", blocks=4, visit_steps=n)) for n in VISIT_STEPS
+            ),
             note="4 blocks; the same number of views in all",
             level=one_block,
         ),
@@ -115,21 +127,27 @@ def studies() -> tuple[Study, ...]:
             "layer-bits",
             "precision of layers",
             "bits",
-            tuple(("abcd", bits, run(stage=stage, method="abcd", bits=bits)) for bits in BITS),
+            tuple(("abcd", bits, _later(stage=stage, method="abcd", bits=bits)) for bits in BITS),
             level=one_block,
         ),
+    )
+
+
+def _studies_of_captures(stage: Stage) -> tuple[Study, ...]:
+    """What captures do to any method."""
+    return (
         Study(
             "views",
             "sparse views",
             "training views",
-            tuple((m, n, run(stage=stage.only(n), method=m)) for m in METHODS for n in VIEWS),
+            tuple((m, n, _later(stage=stage.only(n), method=m)) for m in METHODS for n in VIEWS),
         ),
         Study(
             "pose-noise",
             "noisy poses",
             "degrees (and twice as many hundredths of the distance)",
             tuple(
-                (m, d, run(stage=with_noisy_poses(stage, d, 0.02 * d), method=m))
+                (m, d, _later(stage=with_noisy_poses(stage, d, 0.02 * d), method=m))
                 for m in METHODS
                 for d in DEGREES
             ),
@@ -139,7 +157,7 @@ def studies() -> tuple[Study, ...]:
             "changing exposure",
             "gain of every other photo",
             tuple(
-                (m, g, run(stage=with_gains(stage, (GAINS[0], g)), method=m))
+                (m, g, _later(stage=with_gains(stage, (GAINS[0], g)), method=m))
                 for m in METHODS
                 for g in GAIN_STEPS
             ),
