@@ -275,7 +275,7 @@ def test_views_in_both_lists_are_mentioned(scene, capsys):
     (scene / "train_list.txt").write_text("\n".join(NAMES[:7]))
     (scene / "val_list.txt").write_text("\n".join(NAMES[6:]))
     parser(scene).check()
-    assert "1 views are trained on and held out" in capsys.readouterr().out
+    assert "1 view(s) are trained on and held out" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("where", ["files", "transforms"])
@@ -290,9 +290,9 @@ def test_lists_that_name_unknown_photos_are_refused(scene, where):
     lines = refusal(scene).splitlines()
     assert len(lines) == 2
     assert "train" in lines[0]
-    assert "elsewhere.png" in lines[0]
+    assert "names a photo without a pose (elsewhere.png)" in lines[0]
     shown = ", ".join(("" if where == "files" else "images/") + name for name in unknown[:3])
-    assert f"names 4 photos that have no pose ({shown}, ...)" in lines[1]
+    assert f"names 4 photos without a pose ({shown}, ...)" in lines[1]
 
 
 @pytest.mark.parametrize(

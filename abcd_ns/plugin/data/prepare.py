@@ -98,7 +98,7 @@ def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
     points, in_model, more = _points(scene, similarity)
     both = scene.split_lists.in_both if scene.split_lists else 0
     if both:
-        more.append(f"{both} views are trained on and held out: scores on them say nothing about new views.")
+        more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
     notes = (*scene.notes, *notes, *more)
     return Prepared(scene, sources, lenses, similarity, points, in_model, notes)
 

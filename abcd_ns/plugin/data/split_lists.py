@@ -55,9 +55,8 @@ def split_lists(
         unknown = [name for name in dict.fromkeys(names) if name not in known]
         if unknown:
             few = ", ".join(unknown[:_NAMED]) + (", ..." if len(unknown) > _NAMED else "")
-            problems.add(
-                f"{labels[split]} names {len(unknown)} photos that have no pose ({few}); correct the list."
-            )
+            photos = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
+            problems.add(f"{labels[split]} names {photos} without a pose ({few}); correct the list.")
     problems.raise_if_any()
     listed = {split: frozenset(known[name] for name in names) for split, names in found.items()}
     held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())

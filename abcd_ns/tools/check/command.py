@@ -44,7 +44,8 @@ def check(*, data: Path, downscale: int = 1, json: Path | None = None) -> int:
     """Examine a data set without training, and explain what is wrong or doubtful with it.
 
     Reads it as `ns-train abcd` does and refuses what that refuses, in the same words; then decodes every
-    photo. Writes nothing unless --json is given. Exit code: 2 if training would refuse the data, else 0.
+    photo. Writes nothing unless --json is given. Exit code: 2 if training would refuse the data or stop at
+    them, else 0.
 
     Args:
         data: Folder with a COLMAP model or a transforms.json, and photos; as for `ns-train abcd --data`.
@@ -88,7 +89,7 @@ def findings_of(found: Survey) -> list[Finding]:
 def _verdict(report: Report) -> str:
     data = one_line(report.data)
     if report.refused:
-        return f"\nTraining would refuse {data}: mend the errors first."
+        return f"\nTraining cannot work with {data}: mend the errors first."
     if any(finding.level == "warning" for finding in report.findings):
         return f"\n{data} can be trained on; see whether the warnings matter to you."
     reduced = f" {DOWNSCALE} {report.downscale}" if report.downscale > 1 else ""
