@@ -2,7 +2,7 @@
 
     python -m benchmarks.faults
 
-Every run is a process of its own and small: 48 steps by the engine, 36 by nerfstudio's trainer. "Survived"
+Every run is a process of its own and small: 30 steps by the engine, 36 by nerfstudio's trainer. "Survived"
 means: gone on with, it ended with the very bits of a run that nothing disturbed. Where a file was altered it
 means that this was noticed. "Lost" counts steps that the run had said were safe.
 """

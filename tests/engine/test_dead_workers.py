@@ -1,5 +1,6 @@
 """A process that works for another and dies is an error or a warning, never a wait without end."""
 
+import copy
 import os
 import signal
 import sys
@@ -9,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from abcd_ns.engine.kernels import build
-from abcd_ns.engine.kernels.kernel import FOLDER_VARIABLE
+from abcd_ns.engine.kernels.kernel import FOLDER_VARIABLE, Kernel
 
 
-class Deadly:
+class Deadly(Kernel):
     """A kernel whose compiler is killed, as one is that needs more memory than there is."""
 
     is_built = False
@@ -23,6 +24,9 @@ class Deadly:
         raise AssertionError("it lives")
 
 
+DEADLY = Deadly("deadly", copy.copy, ("n",))
+
+
 @pytest.fixture(autouse=True)
 def _own_folder(tmp_path, monkeypatch):
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
@@ -30,7 +34,7 @@ def _own_folder(tmp_path, monkeypatch):
 
 def test_a_killed_compiler_is_an_error():
     with pytest.raises(BrokenProcessPool):
-        build.compile_all([Deadly()])
+        build.compile_all([DEADLY])
 
 
 def test_a_killed_builder_is_a_warning_and_kernels_stay_eager(monkeypatch):
@@ -39,4 +43,4 @@ def test_a_killed_builder_is_a_warning_and_kernels_stay_eager(monkeypatch):
     monkeypatch.setattr(build.subprocess, "run", lambda _, **options: run(suicide, **options))
     monkeypatch.setattr(build, "can_build", lambda: True)
     with pytest.warns(UserWarning, match="stays slow: exit code -9"):
-        build.build_kernels([Deadly()], 4, 16)
+        build.build_kernels([DEADLY], 4, 16)

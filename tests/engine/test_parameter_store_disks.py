@@ -72,7 +72,7 @@ def test_the_nth_write_that_fails_is_one_clear_line(store, monkeypatch, code):
 def test_a_pin_that_cannot_be_written_leaves_the_others(store, monkeypatch):
     store.pin("best")
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", FailAt(None, 1, code=errno.ENOSPC))
+        patch.setattr(Path, "write_bytes", FailAt(None, 1, persistent=True, code=errno.ENOSPC))
         with pytest.raises(StoreError, match=r"manifest-other\.json could not be written"):
             store.pin("other")
         with pytest.raises(StoreError, match=r"'best' could not be restored.*holds generation 1"):
@@ -213,12 +213,12 @@ def test_a_reader_sees_a_thousand_commits_old_or_new_and_never_mixed(store, monk
     stop, seen = context.Event(), context.Queue()
     reader = context.Process(target=read_until, args=(store.folder, stop, seen))
     reader.start()
-    assert seen.get() == "ready"
+    assert seen.get(timeout=60) == "ready"
     for value in range(1, 1001):
         fresh = {0: block(20, float(value)), 7: block(9, float(value))}
         store.commit(fresh, state={"value": float(value)})
     stop.set()
-    generations, mixed = seen.get()
+    generations, mixed = seen.get(timeout=60)
     reader.join()
     assert mixed == []
     assert len(generations) > 1

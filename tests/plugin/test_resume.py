@@ -65,7 +65,7 @@ def refusal(config, capsys) -> str:
 
 
 def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, data, undisturbed, tmp_path):
-    killed_at = STEPS_PER_SAVE - 2
+    killed_at = STEPS_PER_SAVE
     assert trainings.finish(data, tmp_path / "killed", kill_at_step=killed_at) == -signal.SIGKILL
     killed = run_folder(tmp_path / "killed")
     assert not list(killed.rglob("*.ckpt"))

@@ -27,10 +27,10 @@ from abcd_ns.engine.storage import LayerCache, ParameterStore, StoreError, crash
 from abcd_ns.engine.training_loop import train_step
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 
-STEPS = 48
-SAVE_EVERY = 7
+STEPS = 30
+SAVE_EVERY = 4
 """Steps between saves in the middle of visits, as nerfstudio's checkpoints are."""
-AT_HAND_BYTES = 40_000
+AT_HAND_BYTES = 20_000
 """Room for some views' layers, so that the cache has others."""
 DISK_FULL = 3
 """Exit code of a run that the disk refused."""
@@ -114,8 +114,8 @@ def points_reached(folder: Path) -> dict[str, int]:
 
 
 def _train(folder: Path) -> None:
-    views = ring_of_views(4, width=32, height=24)
-    photos = Photos(random_gaussians(100, seed=7, size=0.12), views)
+    views = ring_of_views(3, width=24, height=18)
+    photos = Photos(random_gaussians(60, seed=7, size=0.12), views)
     with LayerCache(folder / "layers", 1 << 22) as cache:
         coordinator = _open(folder, views, cache)
         coordinator.announce.subscribe(lambda event: _note(folder, coordinator, event))
@@ -130,7 +130,7 @@ def _train(folder: Path) -> None:
 
 def _open(folder: Path, views: list, cache: LayerCache) -> Coordinator:
     """Go on from a clone of what is there, as the trainer does with --load-dir, or begin."""
-    start = random_gaussians(90, seed=1, size=0.12)
+    start = random_gaussians(60, seed=1, size=0.12)
     resume = begun(folder)
     if resume:
         shutil.rmtree(folder / "clone", ignore_errors=True)
@@ -150,7 +150,8 @@ def _open(folder: Path, views: list, cache: LayerCache) -> Coordinator:
         steps=STEPS,
         resume=resume,
         bits=16,
-        scaffold=30,
+        scaffold=20,
+        batch=2,
         cache=cache,
         at_hand_bytes=AT_HAND_BYTES,
         density=density,
@@ -182,13 +183,13 @@ class Runs:
     body: Callable[..., None] = staticmethod(run)
     """What a process does."""
     modules: tuple[str, ...] = ("tests.reference.crash_runs",)
-    """What the server imports."""
+    """What the server imports, besides what torch would import late, and slowly, in every process."""
 
     def __init__(self) -> None:
         # Before the server starts: libraries read it when they are imported.
         os.environ["OMP_NUM_THREADS"] = "1"
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload([*self.modules])
+        self._context.set_forkserver_preload(["torch._dynamo", *self.modules])
 
     def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
         """A process; see `body` for its arguments."""

@@ -125,7 +125,7 @@ def make_coordinator(
         Budget(steps=steps),
         StoredScene(tree, store, ram_bytes),
         views,
-        cache or LayerCache(None, bits=bits),
+        LayerCache(None, bits=bits) if cache is None else cache,
         TorchRasterizer(compile="never"),
         params,
         make_adam(params, RATES),

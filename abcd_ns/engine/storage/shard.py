@@ -1,5 +1,6 @@
 """One block's tensors in one safetensors file, which is written once and never changed."""
 
+import errno
 import hashlib
 import os
 import shutil
@@ -54,7 +55,7 @@ def read_shard(path: Path, names: Iterable[str] | None) -> tuple[dict[str, Tenso
         KeyError: no tensor of this name.
         OSError, safetensors.SafetensorError: the file cannot be read.
     """
-    with safe_open(path, framework="pt", device="cpu") as file:
+    with _opened(path) as file:
         present = set(file.keys())
         wanted = sorted(present) if names is None else list(names)
         for name in wanted:
@@ -62,6 +63,15 @@ def read_shard(path: Path, names: Iterable[str] | None) -> tuple[dict[str, Tenso
                 raise KeyError(f"{path} has no tensor {name!r}; it has {sorted(present)}.")
         # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
         return {name: file.get_tensor(name).clone() for name in wanted}, file.metadata()[_META]
+
+
+def _opened(path: Path) -> safe_open:
+    try:
+        return safe_open(path, framework="pt", device="cpu")
+    except RuntimeError as error:  # torch maps the file, and has no OSError of its own
+        if not path.exists():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from error
+        raise OSError(str(error)) from error
 
 
 def link_or_copy(source: Path, target: Path) -> None:
