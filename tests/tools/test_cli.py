@@ -11,7 +11,6 @@ from abcd_ns import __version__
 from abcd_ns.errors import UserError
 from abcd_ns.tools import cli
 
-
 THERE_ARE = f"there are: {', '.join(command.name for command in cli.COMMANDS)}."
 
 
