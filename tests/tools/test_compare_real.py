@@ -54,6 +54,16 @@ def test_runs_report_what_was_asked_for(compared):
 
 
 @pytest.mark.cli
+def test_a_runs_log_has_the_curve_for_its_report(compared):
+    results, plan, _ = compared
+    for job, run in zip(plan.jobs, results.runs, strict=True):
+        lines = map(json.loads, (job.folder(plan.out) / "abcd" / "log.jsonl").read_text().splitlines())
+        scores = [line["psnr"] for line in lines if line["kind"] == "held out"]
+        assert scores == [point.psnr for point in run.curve[:-1]]
+        assert len(scores) == 2
+
+
+@pytest.mark.cli
 def test_curves_rise_in_time_to_the_final_score(compared):
     results, plan, _ = compared
     for run in results.runs:
