@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 5.0
+HANDOVER_SECONDS = 0.002
 MOST_POINTS = 2000
 """Gaussians of a block that tell which cameras see it."""
 
@@ -99,9 +100,22 @@ class AbcdPanel(ViewerControl):
         """Take an event in; the browser is told at visits' ends and otherwise once in a while."""
         self._board.note(event, self._seconds)
         self._layers = f"layers {event.done} of {event.total}" if isinstance(event, LayersDrawn) else ""
-        waited = time.monotonic() - self._updated
-        if isinstance(event, (VisitBegan, VisitEnded, SweepEnded)) or waited > SECONDS_BETWEEN_UPDATES:
+        due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
+        if due or isinstance(event, (VisitBegan, VisitEnded, SweepEnded)):
             self._update()
+        if due and isinstance(event, LayersDrawn):
+            self._let_viewer_draw()
+
+    def _let_viewer_draw(self) -> None:
+        """Hand the training lock over for one picture: a visit's layers take long, and browsers wait."""
+        lock = self.viewer.train_lock
+        if lock is None or not lock.locked() or not self.viewer.render_statemachines:
+            return
+        lock.release()
+        try:
+            time.sleep(HANDOVER_SECONDS)  # or this thread would have it back before another one wakes up
+        finally:
+            lock.acquire()
 
     # -- what is shown -------------------------------------------------------------------------------
 
