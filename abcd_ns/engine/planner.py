@@ -15,9 +15,14 @@ from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import VisitPlan, passes_of_sweep, plan_sweep, views_per_visit, visit_views
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, survey
+from abcd_ns.errors import UserError
 
 LOOK_AGAIN = 4
 """Blocks that were hidden behind others are looked at again every so many sweeps."""
+
+
+class NothingSeenError(UserError, RuntimeError):
+    """There is nothing to train: no view sees any Gaussian, or none is left."""
 
 
 class Planner:
@@ -55,7 +60,7 @@ class Planner:
         most of the time those that no picture showed when they were last visited.
 
         Raises:
-            RuntimeError: no view sees any block.
+            NothingSeenError: no view sees any block.
         """
         while True:
             plan = self._next_plan(state)
@@ -116,7 +121,7 @@ class Planner:
             steps = (passes / self._batch, remaining, config.seed, config.visit_steps)
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
-                raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
+                raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
         return state.queue.pop(0)
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
