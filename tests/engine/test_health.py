@@ -54,7 +54,7 @@ def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, sta
             monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
         folder = tmp_path / str(watched)
         folder.mkdir()
-        options = {"blocks": 3, "steps": 40, "density": GROWING, "scaffold": 40}
+        options = {"blocks": 2, "steps": 18, "density": GROWING, "scaffold": 60}
         coordinator = make_coordinator(folder, start, views, heal=watched, **options)
         told = listen(coordinator, Mended | VisitUndone)
         train(coordinator, photos)
@@ -63,8 +63,7 @@ def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, sta
     assert equal(*results)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
-@pytest.mark.parametrize("blocks", [1, 3])
+@pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (math.nan, 1), (math.inf, 1), (1e30, 1)])
 def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(
     tmp_path, views, photos, start, value, blocks
 ):

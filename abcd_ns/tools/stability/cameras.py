@@ -100,7 +100,7 @@ def lenses() -> tuple[bool, bool]:
 def repeated(lab: Lab) -> Finding:
     """A20: the same run twice, and with another number of threads."""
     stage, threads, same = make_stage(views=ring(8), points=300), torch.get_num_threads(), {}
-    options = {"budget": lab.views_drawn(120), "blocks": 4, "density": DensityConfig(refine_start=0.0)}
+    options = {"budget": lab.views_drawn(90), "blocks": 4, "density": DensityConfig(refine_start=0.0)}
     for method in ("abcd", "abcd-monolithic"):
         results = []
         try:
