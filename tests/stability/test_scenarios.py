@@ -11,7 +11,7 @@ from abcd_ns.tools.stability.catalogue import SCENARIOS
 from abcd_ns.tools.stability.lab import Lab
 
 SLOW = {"A3", "A6", "A8", "A9", "A11", "A12", "A13", "A14", "A15", "A16", "A19"}
-"""These train for long. What they rest on is in engine/test_health, too: giants, resets, what nothing shows."""
+"""These train for long. What they rest on is in engine/test_health too."""
 QUICK = {"A1", "A5", "A17", "A20"}
 """A third of the training says as much."""
 BEHIND = {

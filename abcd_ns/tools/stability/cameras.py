@@ -161,6 +161,7 @@ SCENARIOS = (
         "one run twice on one thread, then on two and three",
         "all bit-equal, on a CPU",
         repeated,
+        cost=4,
     ),
     Scenario(
         "A21",

@@ -119,6 +119,7 @@ SCENARIOS = (
         f"{FEW} of 16 cameras; points at random places",
         "PSNR falls by no more than one block's does, and 0.3 dB",
         sparse,
+        cost=6,
     ),
     Scenario(
         "A12",
@@ -126,6 +127,7 @@ SCENARIOS = (
         f"poses off by {TURN_DEGREES} degrees and {SHIFT:.0%}; every other photo 1.5 times as bright",
         "PSNR falls by no more than one block's does, and 0.3 dB; no layer is found under a pose that moved",
         inexact,
+        cost=5,
     ),
     Scenario(
         "A16",
@@ -133,5 +135,6 @@ SCENARIOS = (
         f"a textured shell {FAR:g} times as far away as the cameras stand",
         "PSNR falls by no more than one block's does, and 0.3 dB",
         far_shell,
+        cost=2,
     ),
 )

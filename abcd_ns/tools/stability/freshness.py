@@ -117,6 +117,7 @@ SCENARIOS = (
         "one frozen block changed under a visit; layers drawn once a sweep, plainly and damped",
         f"the first stops the run; damped, the full objective rises in at most {VISITS_RISING:.0%} of visits",
         old_layers,
+        cost=4,
     ),
     Scenario(
         "A19",
@@ -124,5 +125,6 @@ SCENARIOS = (
         f"{', '.join(map(str, BLOCKS))} blocks and a grid that cuts the balls, on a budget of 600 views",
         f"worst within {CLIFF_DB} dB of the best; the charts show visits of 1 to 64 steps too",
         blocks_and_cuts,
+        cost=6,
     ),
 )

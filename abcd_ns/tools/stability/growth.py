@@ -110,6 +110,7 @@ SCENARIOS = (
         f"a reset after every {RESET_EVERY} of a block's views, in visits and at their ends",
         f"no visit leaves the error over all photos more than {ALLOWED_RISE:.0%} higher",
         resets,
+        cost=2,
     ),
     Scenario(
         "A7",

@@ -134,7 +134,7 @@ def far_away(lab: Lab) -> Finding:
     numbers |= {f"offset {offset:g}": score for offset, score in zip(OFFSETS, moved, strict=True)}
     spread = max(moved) - min(moved)
     even = largest <= math.ceil(len(where) / BLOCKS)
-    passed = even and abs(numbers["lost to outlier"]) <= 0.1 and spread <= 0.05
+    passed = even and numbers["lost to outlier"] <= 0.1 and spread <= 0.05
     said["abcd"] = f"outlier: {db(numbers['lost to outlier'])} lost; offsets to 5e6 m: {db(spread)} apart"
     return Finding(passed, said, {**numbers, "spread": spread})
 
@@ -171,6 +171,7 @@ SCENARIOS = (
         "Gaussians with sigma = 1, 3 and 10 extents of their cell among the first ones",
         f"shrunk by a block's refinements, none over 1.25 of what is allowed; ordering gap >= {GAP_DB:g} dB",
         giants,
+        cost=2,
     ),
     Scenario(
         "A8",
@@ -184,7 +185,7 @@ SCENARIOS = (
         "A17",
         "one outlier spoils the octree (GaussianSplats3D #299); UTM offsets eat float32",
         "a point at 1e7 m; coordinates that begin at 0, 5e5 and 5e6 m",
-        "blocks stay even, 0.1 dB with the outlier, 0.05 dB between offsets",
+        "blocks as even as without it, at most 0.1 dB lost; 0.05 dB between offsets",
         far_away,
     ),
 )
