@@ -23,9 +23,14 @@ from abcd_ns.engine.schedule import (
 )
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, survey
+from abcd_ns.errors import UserError
 
 LOOK_AGAIN = 4
 """Blocks that were hidden behind others are looked at again every so many sweeps."""
+
+
+class NothingSeenError(UserError, RuntimeError):
+    """There is nothing to train: no view sees any Gaussian, or none is left."""
 
 
 class Planner:
@@ -62,7 +67,7 @@ class Planner:
         most of the time those that no picture showed when they were last visited.
 
         Raises:
-            RuntimeError: no view sees any block.
+            NothingSeenError: no view sees any block.
         """
         while True:
             plan = self._next_plan(state)
@@ -124,7 +129,7 @@ class Planner:
             steps = (passes / batch, remaining, config.seed, config.visit_steps)
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
-                raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
+                raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
         return state.queue.pop(0)
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:

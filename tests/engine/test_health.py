@@ -54,7 +54,7 @@ def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, sta
             monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
         folder = tmp_path / str(watched)
         folder.mkdir()
-        options = {"blocks": 3, "steps": 40, "density": GROWING, "scaffold": 40}
+        options = {"blocks": 2, "steps": 18, "density": GROWING, "scaffold": 60}
         coordinator = make_coordinator(folder, start, views, heal=watched, **options)
         told = listen(coordinator, Mended | VisitUndone)
         train(coordinator, photos)
@@ -63,8 +63,7 @@ def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, sta
     assert equal(*results)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
-@pytest.mark.parametrize("blocks", [1, 3])
+@pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (math.nan, 1), (math.inf, 1), (1e30, 1)])
 def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(
     tmp_path, views, photos, start, value, blocks
 ):
@@ -164,8 +163,7 @@ def test_a_visit_that_made_its_pictures_worse_is_undone(tmp_path, views, photos,
     assert after[block].clocks.visits == before[block].clocks.visits + 1
     assert after[block].clocks.steps > before[block].clocks.steps
     record = coordinator.state.health[block]
-    assert record.undone == 1
-    assert record.damping == 1.0  # the next visit was damped and went well
+    assert (record.undone, record.damping) == (1, 0.5)
 
 
 def test_the_visit_after_an_undone_one_is_damped(tmp_path, views, photos, start):
@@ -177,6 +175,9 @@ def test_the_visit_after_an_undone_one_is_damped(tmp_path, views, photos, start)
     coordinator.state.health[block] = BlockHealth(visits=1, undone=1, damping=0.5)
     coordinator.next_batch()
     assert coordinator.optimizers["scales"].param_groups[0]["lr"] == 0.5 * rates["scales"]
+    while coordinator.state.active is not None:
+        train_step(coordinator, photos)
+    assert coordinator.state.health[block].damping == 1.0
 
 
 def test_off_nothing_is_undone(tmp_path, views, photos, start):
@@ -307,7 +308,7 @@ def test_how_blocks_stand_is_said_in_words():
 def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(
     tmp_path, views, photos, start, monkeypatch
 ):
-    with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .* max-gaussians"):
+    with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
         check_room(10**12, 3, torch.device("cpu"))
     check_room(1000, 3, torch.device("cpu"))
     monkeypatch.setattr("abcd_ns.engine.room.free_bytes", lambda _: bytes_for(30, 1))

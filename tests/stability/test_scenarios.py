@@ -10,17 +10,29 @@ import pytest
 from abcd_ns.tools.stability.catalogue import SCENARIOS
 from abcd_ns.tools.stability.lab import Lab
 
-SLOW = {"A11", "A12", "A14", "A15", "A16", "A19"}
-"""These compare three trained scenes, which takes minutes where nothing is compiled."""
+SLOW = {"A3", "A6", "A8", "A9", "A11", "A12", "A13", "A14", "A15", "A16", "A19"}
+"""These train for long. What they rest on is in engine/test_health too."""
+QUICK = {"A1", "A5", "A17", "A20"}
+"""A third of the training says as much."""
+BEHIND = {
+    "A19": "on so small a budget each doubling of the blocks costs several dB; see docs/results/stability"
+}
+"""Where ABCD does not do what it should."""
+
+
+def marks(id: str) -> list:
+    """How a scenario's test is marked."""
+    found = [pytest.mark.slow] if id in SLOW else []
+    return found + ([pytest.mark.xfail(reason=BEHIND[id], strict=True)] if id in BEHIND else [])
 
 
 @pytest.mark.parametrize(
     "scenario",
-    [pytest.param(s, marks=[pytest.mark.slow] * (s.id in SLOW)) for s in SCENARIOS.values()],
+    [pytest.param(s, marks=marks(s.id)) for s in SCENARIOS.values()],
     ids=lambda scenario: scenario.id,
 )
 def test_scenario(scenario, tmp_path):
-    found = scenario.run(Lab(tmp_path, compile="never"))
+    found = scenario.run(Lab(tmp_path, quick=scenario.id in QUICK))
     assert found.passed, (scenario.rule, found.said, found.numbers)
     assert "abcd" in found.said
 

@@ -4,18 +4,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
-from abcd_ns.tools.stability.captures import GAINS, MANY, with_gains, with_noisy_poses
+from abcd_ns.tools.stability.captures import PAIR, table, with_gains, with_noisy_poses
 from abcd_ns.tools.stability.freshness import BLOCKS, train_stale
-from abcd_ns.tools.stability.lab import METHODS, Lab, Method, Stage, make_stage
-from abcd_ns.tools.stability.world import ring
+from abcd_ns.tools.stability.lab import Lab, Method, Stage
 
-BUDGET = 1500
-VIEWS = (3, 6, 12, 24)
-VISIT_STEPS = (1, 4, 16, 64, 256)
-AGES = (1, 2, 4, 8, 16)
+VIEWS = (3, 8, 16)
+VISIT_STEPS = (1, 4, 16, 64)
+AGES = (1, 2, 4, 8)
 """Visits after which layers are refreshed."""
-DEGREES = (0.0, 0.25, 0.5, 1.0)
-GAIN_STEPS = (1.0, 1.25, 1.5, 2.0)
+DEGREES = (0.0, 0.5, 1.0)
+GAIN_STEPS = (1.0, 1.5, 2.0)
 BITS = (16, 32)
 WITH_BLOCKS: tuple[Method, ...] = ("abcd", "abcd-ablated")
 
@@ -72,40 +70,36 @@ class Study:
         yield Curve(self.name, self.title, self.x_label, lines, self.note, level)
 
 
-def _score(lab: Lab, stage: Stage, method: Method, **options) -> float:
-    return lab.train(stage, method, **{"budget": lab.views_drawn(BUDGET), **options}).psnr
+def _score(lab: Lab, stage: Stage, method: Method, name: str | None = None, **options) -> float:
+    return lab.compared(stage, method, name, **options)
 
 
 def studies() -> tuple[Study, ...]:
     """All of them, on the table with its balls."""
-    stage = make_stage(views=ring(MANY))
-    return (*_studies_of_blocks(stage), *_studies_of_captures(stage))
+    stage = table()
+    run = partial(partial, _score)  # run(stage=..., ...) is a call that still waits for its lab
+    clean = {method: run(stage=stage, method=method, name="table") for method in PAIR}
+    one_block = clean["abcd-monolithic"]
 
+    def faults(changed: Callable[[float], Stage], values: tuple[float, ...], plain: float):
+        """The points of both methods at all values, of which `plain` is the table as it is."""
+        return tuple(
+            (m, x, clean[m] if x == plain else run(stage=changed(x), method=m)) for m in PAIR for x in values
+        )
 
-_later = partial(partial, _score)
-"""_later(stage=..., ...) is a call that still waits for its lab."""
-
-
-def _studies_of_blocks(stage: Stage) -> tuple[Study, ...]:
-    """What block training adds to joint training: cuts, visits, layers."""
-    one_block = _later(stage=stage, method="abcd-monolithic")
     return (
         Study(
             "blocks",
             "number of blocks",
             "blocks",
-            tuple(
-                (m, k, _later(stage=stage, method=m, blocks=k)) for m in WITH_BLOCKS for k in BLOCKS if k > 1
-            ),
+            tuple((m, k, run(stage=stage, method=m, blocks=k)) for m in WITH_BLOCKS for k in BLOCKS if k > 1),
             level=one_block,
         ),
         Study(
             "visit-steps",
             "length of a visit",
             "steps a visit (4 views each)",
-            tuple(
-                ("abcd", n, _later(stage=stage, method="abcd", blocks=4, visit_steps=n)) for n in VISIT_STEPS
-            ),
+            tuple(("abcd", n, run(stage=stage, method="abcd", visit_steps=n)) for n in VISIT_STEPS),
             note="4 blocks; the same number of views in all",
             level=one_block,
         ),
@@ -115,10 +109,7 @@ def _studies_of_blocks(stage: Stage) -> tuple[Study, ...]:
             "visits between refreshes",
             tuple(
                 (name, age, partial(_stale, stage=stage, every=age, **options))
-                for name, options in (
-                    ("abcd", {}),
-                    ("abcd, damped by 1/2", {"damping": 0.5}),
-                )
+                for name, options in (("abcd", {}), ("abcd, damped by 1/2", {"damping": 0.5}))
                 for age in AGES
             ),
             note="4 blocks, no density control; the engine itself allows 1 only",
@@ -127,40 +118,23 @@ def _studies_of_blocks(stage: Stage) -> tuple[Study, ...]:
             "layer-bits",
             "precision of layers",
             "bits",
-            tuple(("abcd", bits, _later(stage=stage, method="abcd", bits=bits)) for bits in BITS),
+            tuple(("abcd", bits, run(stage=stage, method="abcd", bits=bits)) for bits in BITS),
             level=one_block,
         ),
-    )
-
-
-def _studies_of_captures(stage: Stage) -> tuple[Study, ...]:
-    """What captures do to any method."""
-    return (
         Study(
-            "views",
-            "sparse views",
-            "training views",
-            tuple((m, n, _later(stage=stage.only(n), method=m)) for m in METHODS for n in VIEWS),
+            "views", "sparse views", "training views", faults(lambda n: stage.only(int(n)), VIEWS, VIEWS[-1])
         ),
         Study(
             "pose-noise",
             "noisy poses",
             "degrees (and twice as many hundredths of the distance)",
-            tuple(
-                (m, d, _later(stage=with_noisy_poses(stage, d, 0.02 * d), method=m))
-                for m in METHODS
-                for d in DEGREES
-            ),
+            faults(lambda d: with_noisy_poses(stage, d, 0.02 * d), DEGREES, 0.0),
         ),
         Study(
             "exposure",
             "changing exposure",
             "gain of every other photo",
-            tuple(
-                (m, g, _later(stage=with_gains(stage, (GAINS[0], g)), method=m))
-                for m in METHODS
-                for g in GAIN_STEPS
-            ),
+            faults(lambda g: with_gains(stage, (1.0, g)), GAIN_STEPS, 1.0),
         ),
     )
 

@@ -32,7 +32,7 @@ def nobody_left(lab: Lab) -> Finding:
     tree = build_kd(stage.start().means, 3)
     tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]]))), 2, 8.0)
     coordinator = lab.coordinator(
-        stage.start(), stage.views, budget=600, tree=tree, warmup=0.0, visit_steps=VISIT, batch=4
+        stage.start(), stage.views, budget=240, tree=tree, warmup=0.0, visit_steps=VISIT, batch=4
     )
     empty = int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]])))
     lab.finish(coordinator, stage, steps=VISIT)
@@ -91,7 +91,7 @@ def observed(lab: Lab) -> Finding:
     start = stage.start()
     at = {count: int(tree.assign(torch.tensor([[0.0, 0.0, depth]]))) for depth, count in CLUSTERS}
     unseen = start[tree.assign(start.means) == at[0]]
-    options = {"budget": lab.views_drawn(900), "tree": tree, "warmup": 0.0}
+    options = {"budget": lab.views_drawn(280), "tree": tree, "warmup": 0.0}
     coordinator = lab.coordinator(start, stage.views, **options)
     lab.finish(coordinator, stage)
     state = coordinator.state
@@ -103,7 +103,7 @@ def observed(lab: Lab) -> Finding:
         f"visits with {count}": BlockState.from_tensors(*coordinator.scene.store.load(b)).clocks.visits
         for count, b in at.items()
     }
-    mono = lab.coordinator(start, stage.views, "abcd-monolithic", budget=lab.views_drawn(900), density=STILL)
+    mono = lab.coordinator(start, stage.views, "abcd-monolithic", budget=lab.views_drawn(100), density=STILL)
     lab.finish(mono, stage)
     below = merged(mono).means[:, 2] < -15.0
     said["abcd-monolithic"] = f"says nothing of the {int(below.sum())} Gaussians that few cameras see"

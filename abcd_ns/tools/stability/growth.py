@@ -28,7 +28,7 @@ def noise(lab: Lab) -> Finding:
     photos = {index: torch.rand(photo.shape, **draw) for index, photo in stage.photos.items()}
     density = DensityConfig(max_gaussians=CAP, refine_start=0.0, refine_stop=1.0, densify_grad_thresh=1e-5)
     for method in ("abcd", "abcd-monolithic"):
-        options = {"budget": lab.views_drawn(900), "blocks": 4, "density": density}
+        options = {"budget": lab.views_drawn(300), "blocks": 4, "density": density}
         trained = lab.train(replace(stage, photos=photos), method, **options)
         most = max(trained.counts)
         numbers[f"most {method}"] = most
@@ -48,7 +48,7 @@ def resets(lab: Lab) -> Finding:
     stage, said, numbers = make_stage(views=ring(12), points=400), {}, {}
     density = DensityConfig(reset_every=RESET_EVERY, refine_start=0.0, refine_stop=1.0)
     for name, heal in (("abcd", True), ("abcd, not healing", False)):
-        options = {"budget": lab.views_drawn(900), "blocks": 3, "warmup": 0.0, "density": density}
+        options = {"budget": lab.views_drawn(600), "blocks": 3, "warmup": 0.0, "density": density}
         coordinator = lab.coordinator(stage.start(), stage.views, heal=heal, **options)
         errors, undone = [lab.error(coordinator, stage)], []
 
@@ -110,6 +110,7 @@ SCENARIOS = (
         f"a reset after every {RESET_EVERY} of a block's views, in visits and at their ends",
         f"no visit leaves the error over all photos more than {ALLOWED_RISE:.0%} higher",
         resets,
+        cost=2,
     ),
     Scenario(
         "A7",

@@ -8,18 +8,18 @@ import torch
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.tools.stability.captures import GAINS, SHIFT, TURN_DEGREES, with_gains, with_noisy_poses
-from abcd_ns.tools.stability.lab import METHODS, Lab, Stage
+from abcd_ns.tools.stability.captures import GAINS, PAIR, SHIFT, TURN_DEGREES, with_gains, with_noisy_poses
+from abcd_ns.tools.stability.lab import Lab, Stage
 from abcd_ns.tools.stability.outcome import Finding, Scenario, against_one_block, db
 from abcd_ns.tools.stability.sizes import surveyed
 
-BUDGET = 1000
+BUDGET = 600
 """Views drawn in a run."""
 SPARSE = 8
 THOUSANDS = 3000
 """Photos of a capture that shows everything over and over."""
 OFFSET = 5e6
-MOST_POINTS = 6000
+MOST_POINTS = 4000
 """More points than this are thinned out, for time."""
 
 
@@ -76,7 +76,7 @@ def real_scenarios(stage: Stage, name: str) -> tuple[Scenario, ...]:
     def compared(changed: Stage):
         def run(lab: Lab) -> Finding:
             budget = lab.views_drawn(BUDGET)
-            return against_one_block({m: lab.train(changed, m, budget=budget).psnr for m in METHODS})
+            return against_one_block({m: lab.train(changed, m, budget=budget, blocks=8).psnr for m in PAIR})
 
         return run
 

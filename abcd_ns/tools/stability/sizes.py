@@ -72,14 +72,14 @@ def giants(lab: Lab) -> Finding:
     before = largest_share(start, tree, stage.views)
     eager = DensityConfig(refine_start=0.0, refine_stop=1.0)
     for name, heal in (("abcd", True), ("abcd, not healing", False)):
-        options = {"budget": lab.views_drawn(900), "tree": tree, "warmup": 0.0, "density": eager}
+        options = {"budget": lab.views_drawn(320), "tree": tree, "warmup": 0.0, "density": eager}
         trained = lab.train(stage, start=start, heal=heal, **options)
         after = largest_share(trained.gaussians, tree, stage.views)
         gap = ordering_gap(lab, trained, stage.held_out[:4])
         held = [event.visit for event in trained.of(Mended) if event.what == "giants"]
         numbers |= {f"largest {name}": after, f"gap {name}": gap, f"visits {name}": len(held)}
         said[name] = f"largest {before:.1f} -> {after:.2f} of what is allowed, gap {gap:.0f} dB"
-    mono = lab.train(stage, "abcd-monolithic", start=start, budget=lab.views_drawn(900), density=eager)
+    mono = lab.train(stage, "abcd-monolithic", start=start, budget=lab.views_drawn(320), density=eager)
     left = largest_share(mono.gaussians, tree, stage.views)
     said["abcd-monolithic"] = f"largest {before:.1f} -> {left:.2f}"
     passed = numbers["largest abcd"] < 1.25 and numbers["gap abcd"] >= GAP_DB and numbers["visits abcd"] > 0
@@ -102,7 +102,7 @@ def transparent(lab: Lab) -> Finding:
         tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, 50.0 + k]]))), 2, 50.5 + k)
     for method in ("abcd", "abcd-monolithic"):
         options = {
-            "budget": lab.views_drawn(900),
+            "budget": lab.views_drawn(320),
             "tree": tree,
             "density": DensityConfig(cull_alpha_thresh=0),
         }
@@ -121,7 +121,7 @@ def transparent(lab: Lab) -> Finding:
 def far_away(lab: Lab) -> Finding:
     """A17: a point at 1e7; and captures in coordinates of national grids."""
     stage, numbers, said = make_stage(views=ring(12), points=400), {}, {}
-    budget = lab.views_drawn(360)
+    budget = lab.views_drawn(160)
     options = {"budget": budget, "blocks": BLOCKS, "density": STILL}
     plain = lab.train(stage, **options)
     where = torch.cat([stage.points, stage.points.new_tensor([[OUTLIER, 0, 0]])])
@@ -134,7 +134,7 @@ def far_away(lab: Lab) -> Finding:
     numbers |= {f"offset {offset:g}": score for offset, score in zip(OFFSETS, moved, strict=True)}
     spread = max(moved) - min(moved)
     even = largest <= math.ceil(len(where) / BLOCKS)
-    passed = even and abs(numbers["lost to outlier"]) <= 0.1 and spread <= 0.05
+    passed = even and numbers["lost to outlier"] <= 0.1 and spread <= 0.05
     said["abcd"] = f"outlier: {db(numbers['lost to outlier'])} lost; offsets to 5e6 m: {db(spread)} apart"
     return Finding(passed, said, {**numbers, "spread": spread})
 
@@ -171,6 +171,7 @@ SCENARIOS = (
         "Gaussians with sigma = 1, 3 and 10 extents of their cell among the first ones",
         f"shrunk by a block's refinements, none over 1.25 of what is allowed; ordering gap >= {GAP_DB:g} dB",
         giants,
+        cost=2,
     ),
     Scenario(
         "A8",
@@ -184,7 +185,7 @@ SCENARIOS = (
         "A17",
         "one outlier spoils the octree (GaussianSplats3D #299); UTM offsets eat float32",
         "a point at 1e7 m; coordinates that begin at 0, 5e5 and 5e6 m",
-        "blocks stay even, 0.1 dB with the outlier, 0.05 dB between offsets",
+        "blocks as even as without it, at most 0.1 dB lost; 0.05 dB between offsets",
         far_away,
     ),
 )
