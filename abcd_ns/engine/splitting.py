@@ -3,6 +3,8 @@
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.partition import best_split
+from abcd_ns.engine.run_state import RunState
+from abcd_ns.engine.scene import StoredScene
 
 FULL = 0.75
 """Share of its limit over which a block is cut: the next visit needs room to grow."""
@@ -38,3 +40,18 @@ def split_full(
         settled |= {block: state[~leaves], new: state[leaves]}
         waiting += [block, new]
     return tree, settled, parents
+
+
+def cut_at_rest(scene: StoredScene, state: RunState, limit: int) -> None:
+    """Cut the blocks of a run that goes on with a smaller limit than it had; nothing where all are in order.
+
+    A block whose visit was under way is left for its end.
+    """
+    for block in range(scene.tree.num_blocks):
+        if scene.store.counts(block) <= FULL * limit or state.active is not None:
+            continue
+        large = {block: BlockState.from_tensors(*scene.store.load(block))}
+        tree, parts, parents = split_full(scene.tree, large, limit)
+        for new, parent in parents.items():
+            state.inherit(new, parent)
+        scene.rest(tree, {number: part.to_tensors() for number, part in parts.items()}, state.to_json())

@@ -19,9 +19,10 @@ from abcd_ns.engine.independent import IndependentCoordinator, independent_at_re
 from abcd_ns.engine.initialize import thin_out
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.partition import build_grid, build_kd
-from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.run_state import Budget, RunState
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.splitting import cut_at_rest
 from abcd_ns.engine.storage import ParameterStore, view_fingerprint
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.engine.visit import AT_HAND_BYTES
@@ -29,7 +30,7 @@ from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
 from abcd_ns.plugin.ram_budget import budget_bytes, share_out
-from abcd_ns.plugin.room import EXPECTED_GROWTH, device_budget, find_room
+from abcd_ns.plugin.room import EXPECTED_GROWTH, Room, device_budget, find_room
 from abcd_ns.plugin.run_folder import CACHE as CACHE
 from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, open_cache, take_over
 from abcd_ns.plugin.run_folder import STORE as STORE
@@ -131,13 +132,14 @@ class AbcdPipeline(VanillaPipeline):
         views = self._views()
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer, views)
-        header = store.header
-        tree = BlockTree.from_json(header["tree"])
-        training = replace(config.training, block_limit=header.get("block_limit", 0))
+        scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
+        training = replace(config.training, block_limit=self._block_limit(store, resumed))
+        if resumed and training.block_limit:
+            cut_at_rest(scene, RunState.from_json(store.state), training.block_limit)
         coordinator = coordinator_for(training)(
             training,
             Budget(trainer.total_steps, config.max_seconds),
-            StoredScene(tree, store, self._ram.blocks),
+            scene,
             views,
             open_cache(folder / CACHE, self._ram.cache, config.layer_bits),
             self.model.draws_with(),
@@ -151,18 +153,27 @@ class AbcdPipeline(VanillaPipeline):
             coordinator.restore()
         return coordinator
 
-    def _room(self, points: int) -> tuple[int, int]:
-        """(number of blocks to begin with, Gaussians in a block at most or 0 for no limit)."""
-        config = self.config
-        if config.blocks > 0:
-            return config.blocks, config.training.block_limit
-        cameras = self.datamanager.train_dataset.cameras
-        room = find_room(
+    def _block_limit(self, store: ParameterStore, resumed: bool) -> int:
+        """Gaussians in a block at most: as the run began, unless it goes on with a budget of its own."""
+        if resumed and self.config.blocks == 0 and self.config.device_budget_gb > 0:
+            return self._room(1).limit
+        return store.header.get("block_limit", 0)
+
+    def _room(self, points: int) -> Room:
+        """How many blocks for a scene that begins with so many points."""
+        config, cameras = self.config, self.datamanager.train_dataset.cameras
+        return find_room(
             device_budget(config.device_budget_gb, self.device),
             pixels=int((cameras.width * cameras.height).max()),
             gaussians=config.training.density.limit or EXPECTED_GROWTH * points,
             training=config.training,
         )
+
+    def _first_cut(self, points: int) -> tuple[int, int]:
+        """(number of blocks to begin with, Gaussians in a block at most or 0 for no limit)."""
+        if self.config.blocks > 0:
+            return self.config.blocks, self.config.training.block_limit
+        room = self._room(points)
         CONSOLE.print(room.in_words(), highlight=False, soft_wrap=True)
         return room.blocks, room.limit
 
@@ -190,7 +201,7 @@ class AbcdPipeline(VanillaPipeline):
                 highlight=False,
             )
         del everything
-        blocks, limit = self._room(len(gaussians))
+        blocks, limit = self._first_cut(len(gaussians))
         tree = cut_space(gaussians, blocks, self.config.partition)
         store = new_store(folder, {"tree": tree.to_json(), "block_limit": limit, **made_for.header()})
         if training.overlap > 0:

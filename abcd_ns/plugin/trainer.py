@@ -74,11 +74,20 @@ class AbcdTrainer(Trainer):
             self._say(f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost.")
             self._say_how_to_go_on()
             raise SystemExit(stopped.exit_code) from None
-        except UserError as error:
+        except (UserError, torch.cuda.OutOfMemoryError) as error:
             self._end_report()
-            print_error(str(error))
+            print_error(str(error) if isinstance(error, UserError) else self._memory_is_full())
             self._say_how_to_go_on()
             raise SystemExit(2) from None
+
+    def _memory_is_full(self) -> str:
+        limit = self.pipeline.coordinator.config.block_limit
+        room = f"blocks of {limit:,} Gaussians" if limit else f"{self.config.pipeline.blocks} blocks"
+        return (
+            f"The device's memory does not hold {room}. Nothing that a visit has finished is lost: go on "
+            "with --pipeline.blocks 0 and a smaller --pipeline.device-budget-gb, or begin anew with smaller "
+            "photos."
+        )
 
     def _train_complete_viewer(self) -> None:
         # All is saved; nerfstudio goes on serving its viewer until Ctrl-C, which is how such a run ends.

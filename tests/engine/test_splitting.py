@@ -10,7 +10,7 @@ from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.run_state import RunState
 from abcd_ns.engine.scaffold import RESERVE
 from abcd_ns.engine.schedule import VisitPlan
-from abcd_ns.engine.splitting import FULL, split_full
+from abcd_ns.engine.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.training_loop import train, train_step
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
 
@@ -110,3 +110,25 @@ def test_a_run_that_was_cut_resumes_bit_for_bit(tmp_path, views, photos, start):
     assert expected.scene.tree == second.scene.tree
     for (_, a), (_, b) in zip(whole_scene(expected).items(), whole_scene(second).items(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_a_run_goes_on_with_a_smaller_limit(tmp_path, views, photos, start):
+    options = {"blocks": 2, "steps": 30, "density": DensityConfig(strategy="off"), "warmup": 0.0}
+    first = make_coordinator(tmp_path, start, views, **options)
+    while first.state.visit == 0 or first.state.active is not None:
+        train_step(first, photos)
+    before = rows(BlockState.fresh(whole_scene(first)))
+    scene, store = first.scene, first.scene.store
+    cut_at_rest(scene, RunState.from_json(store.state), 40)
+    assert scene.tree.num_blocks > 2
+    assert max(map(scene.count, range(scene.tree.num_blocks))) <= FULL * 40
+    assert rows(BlockState.fresh(whole_scene(first))) == before
+    generation = store.generation
+    cut_at_rest(scene, RunState.from_json(store.state), 40)
+    assert store.generation == generation
+    store.close()
+    again = make_coordinator(tmp_path, start, views, resume=True, block_limit=40, **options)
+    visited = []
+    again.announce.subscribe(lambda e: visited.append(e.block) if isinstance(e, VisitBegan) else None)
+    train(again, photos)
+    assert max(visited) >= 2

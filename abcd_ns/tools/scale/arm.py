@@ -129,9 +129,10 @@ def make_store(land: Land, monolithic: bool, folder: Path) -> ParameterStore:
 
 def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, device, folder) -> Coordinator:
     tree = build_kd(torch.zeros(0, 3), 1) if job.monolithic else land.tree()
+    still = DensityConfig(strategy="off")  # or blocks would not be equal
     params = ParameterDict({n: Parameter(v.to(device)) for n, v in Gaussians.empty(3).items()})
     return Coordinator(
-        TrainingConfig(seed=job.seed, warmup=0.0, sh_ramp=0.0, density=DensityConfig(strategy="off")),
+        TrainingConfig(seed=job.seed, warmup=0.0, sh_ramp=0.0, background="black", density=still),
         Budget(steps=10**9),
         StoredScene(tree, store, ram_bytes=job.ram_budget_bytes),
         land.cameras(),

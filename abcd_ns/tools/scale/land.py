@@ -83,7 +83,7 @@ class Land:
         )
 
     def cameras(self) -> list[View]:
-        """All cameras, tile by tile, looking down and a little ahead."""
+        """All cameras, tile by tile, looking down and a little across the tile's middle."""
         focal = 0.9 * self.width
         K = torch.tensor([[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1.0]])
         found = []
@@ -117,10 +117,10 @@ def color_of(x: Float[Tensor, "*s"], y: Float[Tensor, "*s"]) -> Float[Tensor, "*
 
 
 def _looking_down(eye: tuple[float, float, float], angle: float) -> Float[Tensor, "4 4"]:
-    """World to camera: image x to the camera's right, z down and a little towards `angle`."""
-    ahead = torch.tensor([0.25 * math.cos(angle), 0.25 * math.sin(angle), -1.0])
-    z = ahead / ahead.norm()
-    right = torch.linalg.cross(z, torch.tensor([math.cos(angle), math.sin(angle), 0.0]))
+    """World to camera: z down and a little away from `angle`."""
+    across = torch.tensor([-0.25 * math.cos(angle), -0.25 * math.sin(angle), -1.0])
+    z = across / across.norm()
+    right = torch.linalg.cross(z, torch.tensor([-math.cos(angle), -math.sin(angle), 0.0]))
     x = right / right.norm()
     rotation = torch.stack([x, torch.linalg.cross(z, x), z])
     matrix = torch.eye(4)
