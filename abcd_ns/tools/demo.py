@@ -66,7 +66,8 @@ class Steps:
         Raises:
             StepFailed: it exited with another code than 0.
         """
-        self._console.print(f"$ {name} {' '.join(command[1:])}", style="dim", markup=False, soft_wrap=True)
+        typed = ["abcd", *command[3:]] if command[1:2] == ["-m"] else [name, *command[1:]]
+        self._console.print(f"$ {' '.join(typed)}", style="dim", markup=False, soft_wrap=True)
         log = self._logs / f"{name}.log"
         with open(log if quiet else os.devnull, "wb") as stream:
             output = {"stdout": stream, "stderr": subprocess.STDOUT} if quiet else {}

@@ -101,6 +101,7 @@ def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capf
         assert train[train.index(flag) + 1] == value
     assert commands.calls()[2][1] == "gaussian-splat"
     printed = capfd.readouterr().out
+    assert f"$ abcd synth {out / 'scene'} --courts 1" in printed
     files = (str(out / "splat.ply"), str(out / "report.html"))
     for part in ("21.50 dB", "0.750", "1,234", "GiB", *files, "ns-viewer --load-config"):
         assert part in printed
