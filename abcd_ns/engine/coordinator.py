@@ -259,8 +259,7 @@ class Coordinator:
         updates = {}
         if (active := self.state.active) is not None:
             self.health.look_over()
-            state = self._detached()
-            updates = {LIVE: state.to_tensors()}
+            updates = {LIVE: self._detached().to_tensors()}
             active.saved = True
         self.state.seconds = self.stopwatch.seconds
         self.scene.store.commit(updates, state=self.state.to_json())
@@ -298,12 +297,10 @@ class Coordinator:
         attach(rest, self.params, self.optimizers)
         self.health.begin_visit(active, self.state.health)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
-        self.scene.lay_over(
-            None if active.is_whole else active.geometry.block, lambda: live_gaussians(self.params)
-        )
-        taken = 0 if active.is_whole else active.steps * self.batch
-        self._order = view_order(active.views, taken, active.number, self.config.seed)
-        seen, block = len(active.geometry.views), None if active.is_whole else active.geometry.block
+        block = None if active.is_whole else active.geometry.block
+        self.scene.lay_over(block, lambda: live_gaussians(self.params))
+        self._order = self._order_of(active)
+        seen = len(active.geometry.views)
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
         self._layers = self._draw_layers(active)
@@ -319,6 +316,10 @@ class Coordinator:
             self.state.influence[active.geometry.block][view] = share_shown(
                 live, self._rasterizer, sample.shot, before, antialiased=self.config.antialiased
             )
+
+    def _order_of(self, active: ActiveVisit) -> tuple[int, ...]:
+        taken = 0 if active.is_whole else active.steps * self.batch
+        return view_order(active.views, taken, active.number, self.config.seed)
 
     def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
         if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
