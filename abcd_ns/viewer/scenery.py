@@ -29,6 +29,8 @@ MOST_LABELS = 64
 """Blocks that get their number in the scene; with more they would hide it."""
 MOST_FRUSTA = 200
 """Cameras shown at a time; evenly chosen of more."""
+LIFT = 0.15
+"""How far above a camera a browser looks from at first, as a share of the distance."""
 SEEN_SHARE = 0.05
 """Share of a block's Gaussians that must lie in a view's image for it to count as one that sees the block."""
 
@@ -101,7 +103,8 @@ class Scenery:
 def first_look(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Where a browser looks from at first, and at what, in the viewer's units.
 
-    From the camera that is farthest from the middle: from outside, what lies behind the scene would hide it.
+    Above the camera that is farthest from the middle, whose frustum would be in the way from its own place.
+    From outside, what lies behind the scene would hide it.
 
     Args:
         box: holds the bulk of the scene.
@@ -110,7 +113,8 @@ def first_look(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"],
     target = (box.lower + box.upper) / 2
     centers = [view.center.double().cpu() for view in views] or [box.upper]
     eye = max(centers, key=lambda center: float((center - target).norm()))
-    return (eye * SCENE_SCALE).numpy(), (target * SCENE_SCALE).numpy()
+    lift = torch.tensor([0.0, 0.0, LIFT * float((eye - target).norm())]).double()
+    return ((eye + lift) * SCENE_SCALE).numpy(), (target * SCENE_SCALE).numpy()
 
 
 def views_that_see(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:

@@ -24,7 +24,7 @@ def headline(where: str, progress: float, left: float | None) -> str:
 
 def sweep_line(sweep: int, over: int, visits: int, left: float | None) -> str:
     """Where the sweep stands."""
-    return f"Sweep {sweep}: {over} of {visits} blocks" + ("" if left is None else f", {clock(left)} left")
+    return f"Sweep {sweep}: {over} of {visits}" + ("" if left is None else f", {clock(left)} left")
 
 
 def block_table(rows: Sequence[BlockRow]) -> str:

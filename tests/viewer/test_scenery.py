@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, center, clipped, frame_mesh
-from abcd_ns.viewer.scenery import first_look, views_that_see
+from abcd_ns.viewer.scenery import LIFT, first_look, views_that_see
 from tests.reference.scenes import ring_of_views
 
 
@@ -101,5 +101,7 @@ def test_the_first_look_is_from_the_farthest_camera():
     assert target.tolist() == [SCENE_SCALE, 0.0, 0.0]
     distances = [float((view.center - torch.tensor([1.0, 0.0, 0.0])).norm()) for view in views]
     farthest = views[distances.index(max(distances))]
-    assert eye.tolist() == pytest.approx((farthest.center * SCENE_SCALE).tolist())
-    assert first_look(shown, [])[0].tolist() == [3 * SCENE_SCALE, SCENE_SCALE, SCENE_SCALE]
+    assert eye[:2].tolist() == pytest.approx((farthest.center[:2] * SCENE_SCALE).tolist())
+    above = LIFT * max(distances) * SCENE_SCALE
+    assert eye[2] == pytest.approx(float(farthest.center[2]) * SCENE_SCALE + above, rel=1e-5)
+    assert first_look(shown, [])[0].tolist()[:2] == [3 * SCENE_SCALE, SCENE_SCALE]
