@@ -10,7 +10,7 @@ from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
 from abcd_ns.engine.visit import VisitGeometry
-from abcd_ns.viewer.board import MOST_POINTS, Board, Status, seconds_left, sweep_share
+from abcd_ns.viewer.board import MOST_POINTS, BlockRow, Board, Status, seconds_left, sweep_share
 from abcd_ns.viewer.words import MOST_ROWS, block_table, clock, headline, memory_table, sweep_line
 
 
@@ -70,6 +70,17 @@ def test_the_table_gives_each_blocks_last_psnr():
     table = block_table(rows)
     assert "| 1 | done | 1,234 | 15.00 | 9 |" in table
     assert "| 2 | under-observed | 5 | - | 1 |" in table
+
+
+def test_a_table_of_a_finished_run_has_no_empty_columns():
+    rows = [BlockRow(0, Status.DONE, 7, None, None), BlockRow(1, Status.UNTRAINED, 0, None, None)]
+    lines = [
+        "| # | state | Gaussians |",
+        "| ---: | --- | ---: |",
+        "| 1 | done | 7 |",
+        "| 2 | untrained | 0 |",
+    ]
+    assert block_table(rows).splitlines() == lines
 
 
 def test_of_many_blocks_the_table_shows_the_urgent_ones():
