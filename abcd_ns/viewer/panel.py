@@ -23,7 +23,7 @@ from abcd_ns.viewer.boxes import boxes_of, bulk
 from abcd_ns.viewer.controls import Controls
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Choice
-from abcd_ns.viewer.scenery import Scenery, overview, views_that_see
+from abcd_ns.viewer.scenery import Scenery, first_look, views_that_see
 from abcd_ns.viewer.words import block_table, headline, memory_table, sweep_line
 
 if TYPE_CHECKING:
@@ -65,9 +65,14 @@ class AbcdPanel(ViewerControl):
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
         self._layers = ""
+<<<<<<< HEAD
         self._laid_out = 0
         """Blocks for which boxes and lists are made; 0 before that."""
         self._overview: tuple[np.ndarray, np.ndarray] | None = None
+=======
+        self._laid_out = False
+        self._first_look: tuple[np.ndarray, np.ndarray] | None = None
+>>>>>>> h-viewer
         self._updated = self._curve_drawn = 0.0
 
     def _setup(self, viewer: "Viewer") -> None:
@@ -124,7 +129,7 @@ class AbcdPanel(ViewerControl):
         tree, scene = self._model.tree, self._model.scene()
         bounds = bulk(torch.cat([scene.gaussians(block).means for block in range(tree.num_blocks)]).cpu())
         self._scenery.set_boxes(boxes_of(tree, bounds))
-        self._overview = overview(bounds, self._views())
+        self._first_look = first_look(bounds, self._views())
         self._controls.set_blocks(tree.num_blocks)
         self._laid_out = tree.num_blocks
 
@@ -191,9 +196,9 @@ class AbcdPanel(ViewerControl):
         return 0.0 if self._coordinator is None else self._coordinator.stopwatch.seconds
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Let a browser begin with a view of the whole scene."""
-        if self._overview is not None:
-            client.camera.position, client.camera.look_at = self._overview
+        """Let a browser begin where the scene is to be seen."""
+        if self._first_look is not None:
+            client.camera.position, client.camera.look_at = self._first_look
 
     # -- what the user chooses -----------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ COLORS = {
     Status.DONE: (40, 190, 140),
     Status.UNDER_OBSERVED: (235, 70, 70),
 }
-THICKNESS = 0.0018
+THICKNESS = 0.0015
 """Of a box's edges, as a share of the diagonal of all boxes."""
 STRONGER = 3.0
 """How much thicker the edges of the active block are."""
@@ -29,10 +29,8 @@ MOST_LABELS = 64
 """Blocks that get their number in the scene; with more they would hide it."""
 MOST_FRUSTA = 200
 """Cameras shown at a time; evenly chosen of more."""
-OVERVIEW = 0.8
-"""How far from its middle a scene is first looked at, in diagonals of its bulk."""
-ELEVATION = 0.6
-"""Tangent of the angle from which it is looked down on."""
+LIFT = 0.15
+"""How far above a camera a browser looks from at first, as a share of the distance."""
 SEEN_SHARE = 0.05
 """Share of a block's Gaussians that must lie in a view's image for it to count as one that sees the block."""
 
@@ -102,22 +100,21 @@ class Scenery:
         )
 
 
-def overview(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Where to look at the whole scene from, and at what, in the viewer's units: from behind the cameras.
+def first_look(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Where a browser looks from at first, and at what, in the viewer's units.
+
+    Above the camera that is farthest from the middle, whose frustum would be in the way from its own place.
+    From outside, what lies behind the scene would hide it.
 
     Args:
         box: holds the bulk of the scene.
-        views: the training views; without any, the scene is looked at from one side.
+        views: the training views; without any, the scene is looked at from one corner of the box.
     """
-    target, size = (box.lower + box.upper) / 2, float((box.upper - box.lower).norm())
-    centers = torch.stack([view.center.double().cpu() for view in views] or [target + 1])
-    level = torch.tensor([1.0, 1.0, 0.0]).double()
-    away = (centers.mean(dim=0) - target) * level
-    if float(away.norm()) < 0.05 * size:  # cameras all around
-        away = (centers[0] - target) * level
-    direction = torch.nn.functional.normalize(away, dim=0) + ELEVATION * (1 - level)
-    eye = target + OVERVIEW * size * torch.nn.functional.normalize(direction, dim=0)
-    return (eye * SCENE_SCALE).numpy(), (target * SCENE_SCALE).numpy()
+    target = (box.lower + box.upper) / 2
+    centers = [view.center.double().cpu() for view in views] or [box.upper]
+    eye = max(centers, key=lambda center: float((center - target).norm()))
+    lift = torch.tensor([0.0, 0.0, LIFT * float((eye - target).norm())]).double()
+    return ((eye + lift) * SCENE_SCALE).numpy(), (target * SCENE_SCALE).numpy()
 
 
 def views_that_see(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:

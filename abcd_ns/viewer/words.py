@@ -24,18 +24,20 @@ def headline(where: str, progress: float, left: float | None) -> str:
 
 def sweep_line(sweep: int, over: int, visits: int, left: float | None) -> str:
     """Where the sweep stands."""
-    return f"Sweep {sweep}: {over} of {visits} blocks" + ("" if left is None else f", {clock(left)} left")
+    return f"Sweep {sweep}: {over} of {visits}" + ("" if left is None else f", {clock(left)} left")
 
 
 def block_table(rows: Sequence[BlockRow]) -> str:
-    """The blocks by number, counted from 1 as in the terminal."""
+    """The blocks by number, counted from 1 as in the terminal, without columns that nothing is known of."""
     shown = list(rows)
     if len(rows) > MOST_ROWS:
         urgent = (Status.ACTIVE, Status.UNDER_OBSERVED)
         first = sorted(rows, key=lambda row: (row.status not in urgent, row.block))[:MOST_ROWS]
         shown = sorted(first, key=lambda row: row.block)
-    lines = ["| # | state | Gaussians | PSNR | views |", "| ---: | --- | ---: | ---: | ---: |"]
-    lines += [_row(row) for row in shown]
+    trained = any(row.psnr is not None or row.views is not None for row in rows)
+    lines = ["| # | state | Gaussians |" + " PSNR | views |" * trained]
+    lines += ["| ---: | --- | ---: |" + " ---: | ---: |" * trained]
+    lines += [_row(row, trained) for row in shown]
     if len(rows) > len(shown):
         counts = Counter(row.status.value for row in rows)
         said = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
@@ -43,12 +45,13 @@ def block_table(rows: Sequence[BlockRow]) -> str:
     return "\n".join(lines)
 
 
-def _row(row: BlockRow) -> str:
+def _row(row: BlockRow, trained: bool) -> str:
     state = f"**{row.status.value}**" if row.status is Status.ACTIVE else row.status.value
-    gaussians = "-" if row.gaussians is None else f"{row.gaussians:,}"
+    line = f"| {row.block + 1} | {state} | " + ("-" if row.gaussians is None else f"{row.gaussians:,}") + " |"
+    if not trained:
+        return line
     psnr = "-" if row.psnr is None else f"{row.psnr:.2f}"
-    views = "-" if row.views is None else str(row.views)
-    return f"| {row.block + 1} | {state} | {gaussians} | {psnr} | {views} |"
+    return f"{line} {psnr} | {'-' if row.views is None else row.views} |"
 
 
 def memory_table(rows: Sequence[tuple[str, int, int]]) -> str:

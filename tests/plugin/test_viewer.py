@@ -225,7 +225,7 @@ def test_ns_viewer_stays_on_this_machine_and_shows_blocks(finished):
     assert tuple(choices["options"]) == ("1",)
     browser.wait_for(lambda m: "options" in m.get("updates", {}) and len(m["updates"]["options"]) == BLOCKS)
     browser.wait_for(lambda m: m["type"] == "MeshMessage" and m["name"] == f"/abcd/block_{BLOCKS}")
-    browser.wait_for(lambda m: "| # | state |" in m.get("updates", {}).get("markdown", ""))
+    browser.wait_for(lambda m: "| 3 | done |" in m.get("updates", {}).get("markdown", ""))
     browser.send(CAMERA)
     browser.wait_for(lambda m: m["type"] == "SetCameraLookAtMessage")
     browser.send(camera_of(viewer.pipeline))

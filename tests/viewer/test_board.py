@@ -10,7 +10,7 @@ from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
 from abcd_ns.engine.visit import VisitGeometry
-from abcd_ns.viewer.board import MOST_POINTS, Board, Status, seconds_left, sweep_share
+from abcd_ns.viewer.board import MOST_POINTS, BlockRow, Board, Status, seconds_left, sweep_share
 from abcd_ns.viewer.words import MOST_ROWS, block_table, clock, headline, memory_table, sweep_line
 
 
@@ -70,6 +70,17 @@ def test_the_table_gives_each_blocks_last_psnr():
     table = block_table(rows)
     assert "| 1 | done | 1,234 | 15.00 | 9 |" in table
     assert "| 2 | under-observed | 5 | - | 1 |" in table
+
+
+def test_a_table_of_a_finished_run_has_no_empty_columns():
+    rows = [BlockRow(0, Status.DONE, 7, None, None), BlockRow(1, Status.UNTRAINED, 0, None, None)]
+    lines = [
+        "| # | state | Gaussians |",
+        "| ---: | --- | ---: |",
+        "| 1 | done | 7 |",
+        "| 2 | untrained | 0 |",
+    ]
+    assert block_table(rows).splitlines() == lines
 
 
 def test_of_many_blocks_the_table_shows_the_urgent_ones():
@@ -158,8 +169,8 @@ def test_words():
         "**Block 3, step 4 of 9**  \n25% of the run, 0:01:30 left"
     )
     assert headline("Between visits", 1.0, 0.0) == "**Trained.**"
-    assert sweep_line(2, 3, 8, None) == "Sweep 2: 3 of 8 blocks"
-    assert sweep_line(2, 3, 8, 61.0) == "Sweep 2: 3 of 8 blocks, 0:01:01 left"
+    assert sweep_line(2, 3, 8, None) == "Sweep 2: 3 of 8"
+    assert sweep_line(2, 3, 8, 61.0) == "Sweep 2: 3 of 8, 0:01:01 left"
     assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers on disk", 2**20, 2**32)]).splitlines()[2:] == [
         "| RAM | 1.5 GB | 16.0 GB |",
         "| layers on disk | 1 MB | 4.0 GB |",

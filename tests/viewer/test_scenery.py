@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, center, clipped, frame_mesh
-from abcd_ns.viewer.scenery import overview, views_that_see
+from abcd_ns.viewer.scenery import LIFT, first_look, views_that_see
 from tests.reference.scenes import ring_of_views
 
 
@@ -95,14 +95,13 @@ def test_a_twentieth_of_a_block_in_the_image_suffices():
     assert views_that_see(few, views) == []
 
 
-@pytest.mark.parametrize("count", [0, 1, 3, 8])
-def test_the_first_look_is_from_behind_the_cameras(count):
-    views = ring_of_views(8)[:count]
-    shown = box((-1, -1, -1), (1, 1, 1))
-    eye, target = overview(shown, views)
-    assert target.tolist() == [0.0, 0.0, 0.0]
-    # Far enough out to have all of the box in view, and from above.
-    assert np.linalg.norm(eye) > SCENE_SCALE * float(shown.upper.norm())
-    assert eye[2] > 0
-    if count == 1:
-        assert np.dot(eye[:2], views[0].center[:2].numpy()) > 0
+def test_the_first_look_is_from_the_farthest_camera():
+    views, shown = ring_of_views(8), box((-1, -1, -1), (3, 1, 1))
+    eye, target = first_look(shown, views)
+    assert target.tolist() == [SCENE_SCALE, 0.0, 0.0]
+    distances = [float((view.center - torch.tensor([1.0, 0.0, 0.0])).norm()) for view in views]
+    farthest = views[distances.index(max(distances))]
+    assert eye[:2].tolist() == pytest.approx((farthest.center[:2] * SCENE_SCALE).tolist())
+    above = LIFT * max(distances) * SCENE_SCALE
+    assert eye[2] == pytest.approx(float(farthest.center[2]) * SCENE_SCALE + above, rel=1e-5)
+    assert first_look(shown, [])[0].tolist()[:2] == [3 * SCENE_SCALE, SCENE_SCALE]
