@@ -65,14 +65,9 @@ class AbcdPanel(ViewerControl):
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
         self._layers = ""
-<<<<<<< HEAD
         self._laid_out = 0
         """Blocks for which boxes and lists are made; 0 before that."""
-        self._overview: tuple[np.ndarray, np.ndarray] | None = None
-=======
-        self._laid_out = False
         self._first_look: tuple[np.ndarray, np.ndarray] | None = None
->>>>>>> h-viewer
         self._updated = self._curve_drawn = 0.0
 
     def _setup(self, viewer: "Viewer") -> None:
