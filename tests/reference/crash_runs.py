@@ -185,11 +185,12 @@ class Runs:
     modules: tuple[str, ...] = ("tests.reference.crash_runs",)
     """What the server imports, besides what torch would import late, and slowly, in every process."""
 
-    def __init__(self) -> None:
+    def __init__(self, *modules: str) -> None:
+        """`modules`: what the server is to import, too; the caller's own, if it is a program."""
         # Before the server starts: libraries read it when they are imported.
         os.environ["OMP_NUM_THREADS"] = "1"
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["torch._dynamo", *self.modules])
+        self._context.set_forkserver_preload(["torch._dynamo", *self.modules, *modules])
 
     def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
         """A process; see `body` for its arguments."""
