@@ -12,7 +12,6 @@ import os
 import resource
 import shutil
 import signal
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -211,7 +210,7 @@ class Runs:
     def killed_after(self, seconds: float, *args: Any, **options: Any) -> bool:
         """Kill a run so long after its start; False if it was done by then."""
         process = self.start(*args, **options)
-        time.sleep(seconds)
+        process.join(seconds)
         process.kill()
         process.join()
         return process.exitcode == -signal.SIGKILL
