@@ -34,6 +34,10 @@ from tests.reference.crash_runs import DISK_FULL, Kill, Runs, digest, lost_steps
 
 KILLED = -signal.SIGKILL
 TRAINING_STEPS = 36
+IMPORTED = ("tests.plugin.crash_training", "tests.reference.cache_file", "tyro", "rich.progress")
+"""What processes import of this module's own imports, once for all of them."""
+SECONDS_BETWEEN_LINES = 10.0
+"""Where the output is no terminal."""
 
 
 @dataclass
@@ -44,6 +48,8 @@ class Args:
     """Kills of the engine at random times."""
     flips: int = 300
     """Bits flipped in each kind of file."""
+    engine: bool = True
+    """Whether runs of the engine, and files, are tried."""
     trainings: bool = True
     """Whether nerfstudio's trainer and the command `ns-train` are run, too."""
     seed: int = 0
@@ -85,12 +91,13 @@ class Bench:
     def __init__(self, args: Args, folder: Path) -> None:
         self.args, self.folder = args, folder
         self.random = random.Random(args.seed)
-        self.runs = Runs()
+        self.runs = Runs(*IMPORTED)
         self._count = 0
         self._train = folder / "undisturbed"
-        began = time.monotonic()
         if self.runs.finish(self._train) != 0:
             raise RuntimeError("the run that nothing disturbs failed")
+        began = time.monotonic()  # of a second one: the first waits for the server
+        self.runs.finish(self.new_folder())
         self.seconds = time.monotonic() - began
         self.expected = digest(self._train)
 
@@ -225,7 +232,7 @@ class TrainingBench:
     def __init__(self, args: Args, folder: Path) -> None:
         self.folder, self.random = folder, random.Random(args.seed)
         self.data = write_scene(folder / "wall")
-        self.trainings = Trainings()
+        self.trainings = Trainings(*IMPORTED)
         self._count = 0
         if self.trainings.finish(self.data, folder / "undisturbed") != 0:
             raise RuntimeError("the training that nothing disturbs failed")
@@ -315,12 +322,18 @@ def same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> b
 def carry_out(trials: list[Trial], console: Console) -> list[Row]:
     """Inject one after the other."""
     rows: dict[str, Row] = {}
+    began = said = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("", total=len(trials))
-        for trial in trials:
+        for number, trial in enumerate(trials):
             progress.update(task, description=trial.fault)
-            outcome = trial.inject()
+            outcome, now = trial.inject(), time.monotonic()
+            if not console.is_terminal and now - said > SECONDS_BETWEEN_LINES:
+                said, left = now, (now - began) / (number + 1) * (len(trials) - number - 1)
+                print(f"{number + 1}/{len(trials)}  {trial.fault}  about {left:.0f} s left", flush=True)
+            if not outcome.survived:
+                console.print(f"not survived: {trial.fault}, {trial.inject}", markup=False)
             row = rows.setdefault(trial.fault, Row(trial.fault))
             row.tried += 1
             row.survived += outcome.survived
@@ -347,7 +360,7 @@ def main(args: Args) -> int:
     console = Console()
     with tempfile.TemporaryDirectory(prefix="abcd-faults-") as name:
         with console.status("runs that nothing disturbs"):
-            trials = Bench(args, Path(name)).trials()
+            trials = Bench(args, Path(name)).trials() if args.engine else []
             if args.trainings:
                 trials += TrainingBench(args, Path(name) / "trainings").trials()
         rows = carry_out(trials, console)

@@ -135,7 +135,7 @@ def test_a_signal_commits_and_says_how_to_go_on(
     def interrupt(happened) -> None:
         nonlocal left
         left -= isinstance(happened, event)
-        if left == 0:
+        if left == 0 and isinstance(happened, event):
             signal.raise_signal(number)
 
     with pytest.raises(SystemExit) as ended:

@@ -12,7 +12,6 @@ import os
 import resource
 import shutil
 import signal
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -185,11 +184,12 @@ class Runs:
     modules: tuple[str, ...] = ("tests.reference.crash_runs",)
     """What the server imports, besides what torch would import late, and slowly, in every process."""
 
-    def __init__(self) -> None:
+    def __init__(self, *modules: str) -> None:
+        """`modules`: what the server is to import, too; the caller's own, if it is a program."""
         # Before the server starts: libraries read it when they are imported.
         os.environ["OMP_NUM_THREADS"] = "1"
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["torch._dynamo", *self.modules])
+        self._context.set_forkserver_preload(["torch._dynamo", *self.modules, *modules])
 
     def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
         """A process; see `body` for its arguments."""
@@ -210,7 +210,7 @@ class Runs:
     def killed_after(self, seconds: float, *args: Any, **options: Any) -> bool:
         """Kill a run so long after its start; False if it was done by then."""
         process = self.start(*args, **options)
-        time.sleep(seconds)
+        process.join(seconds)
         process.kill()
         process.join()
         return process.exitcode == -signal.SIGKILL
