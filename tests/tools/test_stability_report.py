@@ -1,17 +1,21 @@
 """`abcd stability`: what it refuses, what it writes, and that it hides no failure."""
 
+import io
 from dataclasses import replace
 
 import pytest
+from rich.console import Console
+from rich.progress import Progress
 
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.machine import describe_machine, describe_versions
 from abcd_ns.tools import cli
 from abcd_ns.tools.stability.catalogue import SCENARIOS
 from abcd_ns.tools.stability.charts import draw_curves
-from abcd_ns.tools.stability.command import choose, claim
+from abcd_ns.tools.stability.command import Meter, carry_out, choose, claim
 from abcd_ns.tools.stability.curves import Curve, Line, studies
-from abcd_ns.tools.stability.outcome import Outcome, against_one_block
+from abcd_ns.tools.stability.lab import Lab
+from abcd_ns.tools.stability.outcome import Finding, Outcome, Scenario, against_one_block
 from abcd_ns.tools.stability.report import SCHEMA, Report, headline, markdown, read_report, write_report
 
 GOOD = Outcome(
@@ -79,6 +83,20 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
         claim(tmp_path)
     with pytest.raises(UserError, match="is a file"):
         claim(tmp_path / "thesis.tex")
+
+
+def test_what_is_done_is_kept_when_the_rest_breaks_off(tmp_path):
+    def stop(_):
+        raise KeyboardInterrupt
+
+    good = Scenario("A1", "fails", "done", "rule", lambda _: Finding(True, {"abcd": "fine"}))
+    rest, kept = replace(good, id="A2", run=stop), []
+    console = Console(file=io.StringIO())
+    meter = Meter(Progress(console=console), 2)
+    with pytest.raises(KeyboardInterrupt):
+        carry_out(Lab(tmp_path), [good, rest], [], meter, lambda outcomes, _: kept.append(list(outcomes)))
+    assert [[outcome.id for outcome in outcomes] for outcomes in kept] == [["A1"]]
+    assert "A1  pass  fails" in console.file.getvalue()
 
 
 def test_every_curve_has_its_points():

@@ -68,7 +68,7 @@ def seams(lab: Lab) -> Finding:
         numbers |= {f"ratio {method}": ratio, f"psnr {method}": trained.psnr}
         said[method] = f"{ratio:.2f} of the interior's error at borders, {trained.psnr:.2f} dB"
     against = numbers["ratio abcd"] / numbers["ratio abcd-monolithic"]
-    said["abcd"] += f"; the same pixels of one block: {against:.2f} times less, against the interior"
+    said["abcd"] += f", {against:.2f} times one block's ratio"
     numbers["against one block"] = against
     return Finding(numbers["ratio abcd"] <= SEAM, said, numbers, worse=against > 1)
 

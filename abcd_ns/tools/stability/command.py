@@ -4,7 +4,7 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated
@@ -66,19 +66,18 @@ def stability(
         known |= {scenario.id: scenario for scenario in real_scenarios(stage, data.resolve().name)}
     chosen = choose(only, known)
     wanted = () if only or quick else studies()
+    began = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    made = (shlex.join(["abcd", *sys.argv[1:]]), describe_machine(), describe_versions())
+    paths: list[Path] = []
+
+    def keep(outcomes: Sequence[Outcome], curves: Sequence[Curve]) -> None:
+        paths[:] = write_report(Report(SCHEMA, began, *made, tuple(outcomes), tuple(curves)), out)
+
     with tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder, _bar(console) as progress:
         meter = Meter(progress, sum(scenario.cost for scenario in chosen) + sum(map(len, wanted)))
-        outcomes, curves = carry_out(Lab(Path(folder), quick=quick, tick=meter.step), chosen, wanted, meter)
-    report = Report(
-        SCHEMA,
-        datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        shlex.join(["abcd", *sys.argv[1:]]),
-        describe_machine(),
-        describe_versions(),
-        outcomes,
-        curves,
-    )
-    for path in write_report(report, out):
+        lab = Lab(Path(folder), quick=quick, tick=meter.step)
+        outcomes = carry_out(lab, chosen, wanted, meter, keep)
+    for path in paths:
         console.print(str(path), highlight=False, markup=False, soft_wrap=True)
     console.print(headline(outcomes), highlight=False, soft_wrap=True)
     return 0 if all(outcome.passed for outcome in outcomes) else 1
@@ -132,22 +131,33 @@ class Meter:
 
 
 def carry_out(
-    lab: Lab, scenarios: Sequence[Scenario], wanted: Sequence[Study], meter: Meter
-) -> tuple[tuple[Outcome, ...], tuple[Curve, ...]]:
-    """Every scenario and every curve, one after the other."""
-    outcomes, curves = [], []
+    lab: Lab,
+    scenarios: Sequence[Scenario],
+    wanted: Sequence[Study],
+    meter: Meter,
+    keep: Callable[[Sequence[Outcome], Sequence[Curve]], None],
+) -> list[Outcome]:
+    """Every scenario and every curve, one after the other.
+
+    Args:
+        keep: given all that is there after each of them, so that a call that is broken off leaves something.
+    """
+    outcomes: list[Outcome] = []
+    curves: list[Curve] = []
     for scenario in scenarios:
         meter.begin(f"{scenario.id} {scenario.fails}")
         outcomes.append(examine(lab, scenario))
         meter.advance(scenario.cost)
         print_outcome(outcomes[-1], meter.console)
+        keep(outcomes, curves)
     for study in wanted:
         meter.begin(f"chart: {study.title}")
         for curve in study.make(lab):
             meter.advance()
             curves += [] if curve is None else [curve]
         meter.console.print(f"      chart: {study.title}", highlight=False)
-    return tuple(outcomes), tuple(curves)
+        keep(outcomes, curves)
+    return outcomes
 
 
 def examine(lab: Lab, scenario: Scenario) -> Outcome:

@@ -17,6 +17,9 @@ GAIN_STEPS = (1.0, 1.5, 2.0)
 BITS = (16, 32)
 WITH_BLOCKS: tuple[Method, ...] = ("abcd", "abcd-ablated")
 
+Train = Callable[[Lab], float]
+"""Trains, and gives the held-out PSNR, dB."""
+
 
 @dataclass(frozen=True)
 class Line:
@@ -48,10 +51,10 @@ class Study:
     name: str
     title: str
     x_label: str
-    points: tuple[tuple[str, float, Callable[[Lab], float]], ...]
+    points: tuple[tuple[str, float, Train], ...]
     """(line, x, what trains and scores)."""
     note: str = ""
-    level: Callable[[Lab], float] | None = None
+    level: Train | None = None
 
     def __len__(self) -> int:
         return len(self.points) + (self.level is not None)
@@ -77,65 +80,55 @@ def _score(lab: Lab, stage: Stage, method: Method, name: str | None = None, **op
 def studies() -> tuple[Study, ...]:
     """All of them, on the table with its balls."""
     stage = table()
-    run = partial(partial, _score)  # run(stage=..., ...) is a call that still waits for its lab
-    clean = {method: run(stage=stage, method=method, name="table") for method in PAIR}
-    one_block = clean["abcd-monolithic"]
+    clean = {method: _call(stage, method, name="table") for method in PAIR}
+    return (*_of_training(stage, clean["abcd-monolithic"]), *_of_captures(stage, clean))
 
-    def faults(changed: Callable[[float], Stage], values: tuple[float, ...], plain: float):
-        """The points of both methods at all values, of which `plain` is the table as it is."""
-        return tuple(
-            (m, x, clean[m] if x == plain else run(stage=changed(x), method=m)) for m in PAIR for x in values
-        )
 
+def _call(stage: Stage, method: Method, **options) -> Train:
+    """Training and scoring that still waits for its lab."""
+    return partial(_score, stage=stage, method=method, **options)
+
+
+def _of_training(stage: Stage, one_block: Train) -> tuple[Study, ...]:
+    blocks = [(m, k, _call(stage, m, blocks=k)) for m in WITH_BLOCKS for k in BLOCKS if k > 1]
+    visits = [("abcd", n, _call(stage, "abcd", visit_steps=n)) for n in VISIT_STEPS]
+    damped = (("abcd", 1.0), ("abcd, damped by 1/2", 0.5))
+    ages = [
+        (name, age, partial(_stale, stage=stage, every=age, damping=share))
+        for name, share in damped
+        for age in AGES
+    ]
+    bits = [("abcd", b, _call(stage, "abcd", bits=b)) for b in BITS]
+    all_views = "4 blocks; the same number of views in all"
+    allowed = "4 blocks, no density control; the engine itself allows 1 only"
     return (
-        Study(
-            "blocks",
-            "number of blocks",
-            "blocks",
-            tuple((m, k, run(stage=stage, method=m, blocks=k)) for m in WITH_BLOCKS for k in BLOCKS if k > 1),
-            level=one_block,
-        ),
+        Study("blocks", "number of blocks", "blocks", tuple(blocks), level=one_block),
         Study(
             "visit-steps",
             "length of a visit",
             "steps a visit (4 views each)",
-            tuple(("abcd", n, run(stage=stage, method="abcd", visit_steps=n)) for n in VISIT_STEPS),
-            note="4 blocks; the same number of views in all",
-            level=one_block,
+            tuple(visits),
+            all_views,
+            one_block,
         ),
-        Study(
-            "staleness",
-            "age of layers",
-            "visits between refreshes",
-            tuple(
-                (name, age, partial(_stale, stage=stage, every=age, **options))
-                for name, options in (("abcd", {}), ("abcd, damped by 1/2", {"damping": 0.5}))
-                for age in AGES
-            ),
-            note="4 blocks, no density control; the engine itself allows 1 only",
-        ),
-        Study(
-            "layer-bits",
-            "precision of layers",
-            "bits",
-            tuple(("abcd", bits, run(stage=stage, method="abcd", bits=bits)) for bits in BITS),
-            level=one_block,
-        ),
-        Study(
-            "views", "sparse views", "training views", faults(lambda n: stage.only(int(n)), VIEWS, VIEWS[-1])
-        ),
-        Study(
-            "pose-noise",
-            "noisy poses",
-            "degrees (and twice as many hundredths of the distance)",
-            faults(lambda d: with_noisy_poses(stage, d, 0.02 * d), DEGREES, 0.0),
-        ),
-        Study(
-            "exposure",
-            "changing exposure",
-            "gain of every other photo",
-            faults(lambda g: with_gains(stage, (1.0, g)), GAIN_STEPS, 1.0),
-        ),
+        Study("staleness", "age of layers", "visits between refreshes", tuple(ages), allowed),
+        Study("layer-bits", "precision of layers", "bits", tuple(bits), level=one_block),
+    )
+
+
+def _of_captures(stage: Stage, clean: dict[Method, Train]) -> tuple[Study, ...]:
+    def faults(changed: Callable[[float], Stage], values: tuple[float, ...], plain: float):
+        """The points of both methods at all values, of which `plain` is the table as it is."""
+        return tuple((m, x, clean[m] if x == plain else _call(changed(x), m)) for m in PAIR for x in values)
+
+    views = faults(lambda n: stage.only(int(n)), VIEWS, VIEWS[-1])
+    poses = faults(lambda d: with_noisy_poses(stage, d, 0.02 * d), DEGREES, 0.0)
+    gains = faults(lambda g: with_gains(stage, (1.0, g)), GAIN_STEPS, 1.0)
+    degrees = "degrees (and twice as many hundredths of the distance)"
+    return (
+        Study("views", "sparse views", "training views", views),
+        Study("pose-noise", "noisy poses", degrees, poses),
+        Study("exposure", "changing exposure", "gain of every other photo", gains),
     )
 
 

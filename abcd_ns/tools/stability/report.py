@@ -79,7 +79,8 @@ def markdown(report: Report) -> str:
 def print_outcome(outcome: Outcome, console: Console) -> None:
     """A scenario's lines in the terminal."""
     word = "pass" if outcome.passed else "FAIL"
-    console.print(f"{outcome.id:>4}  {word}  {outcome.fails}  ({outcome.seconds:.0f} s)", highlight=False)
+    head = f"{outcome.id:>4}  {word}  {outcome.fails}  ({outcome.seconds:.0f} s)"
+    console.print(head, highlight=False, soft_wrap=True)
     for method, words in outcome.said.items():
         console.print(f"            {method}: {words}", highlight=False, markup=False, soft_wrap=True)
 
