@@ -63,7 +63,8 @@ class Row:
     fault: str
     tried: int = 0
     survived: int = 0
-    lost: int = 0
+    lost: int | None = None
+    """Steps; None where that was not looked at."""
     seconds: list[float] = field(default_factory=list)
     """Until the process was gone, where that was measured."""
 
@@ -73,7 +74,7 @@ class Outcome:
     """What came of one fault."""
 
     survived: bool
-    lost: int = 0
+    lost: int | None = None
     seconds: float | None = None
 
 
@@ -337,7 +338,8 @@ def carry_out(trials: list[Trial], console: Console) -> list[Row]:
             row = rows.setdefault(trial.fault, Row(trial.fault))
             row.tried += 1
             row.survived += outcome.survived
-            row.lost += outcome.lost
+            if outcome.lost is not None:
+                row.lost = (row.lost or 0) + outcome.lost
             row.seconds += [] if outcome.seconds is None else [outcome.seconds]
             progress.advance(task)
     return list(rows.values())
@@ -348,9 +350,10 @@ def table(rows: list[Row]) -> str:
     lines = ["| fault | tried | survived | steps lost |", "| --- | ---: | ---: | ---: |"]
     for row in rows:
         slowest = f" (gone within {max(row.seconds):.1f} s)" if row.seconds else ""
-        lines.append(f"| {row.fault}{slowest} | {row.tried} | {row.survived} | {row.lost} |")
+        lost = "-" if row.lost is None else row.lost
+        lines.append(f"| {row.fault}{slowest} | {row.tried} | {row.survived} | {lost} |")
     tried, survived = sum(row.tried for row in rows), sum(row.survived for row in rows)
-    lines.append(f"| all | {tried} | {survived} | {sum(row.lost for row in rows)} |")
+    lines.append(f"| all | {tried} | {survived} | {sum(row.lost or 0 for row in rows)} |")
     return "\n".join(lines)
 
 
