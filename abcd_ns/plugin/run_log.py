@@ -176,7 +176,9 @@ def past_of(coordinator: Coordinator, log: Path) -> list[str]:
             # A visit that began after the checkpoint begins once more, at the same step.
             again = line["kind"] == "visit" and line["visit"] >= state.visit
             if line["step"] <= state.step and line["kind"] != "end" and not again:
-                kept.append(text)
+                # The clock goes on from the commit, and what was said of it came after.
+                line["seconds"] = min(line["seconds"], round(coordinator.stopwatch.seconds, 3))
+                kept.append(json.dumps(line))
     return kept
 
 
