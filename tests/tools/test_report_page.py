@@ -192,7 +192,7 @@ def test_changed_settings_and_the_command_that_sets_them():
     changed = {"pipeline.blocks": 4, "pipeline.max_seconds": 60.0, "timestamp": "now", "output_dir": "x"}
     settings = made_up_settings(options={**options, **changed}, data="my data; rm -rf")
     found = {option.name: (option.value, option.default) for option in changed_options(settings)}
-    assert found == {"pipeline.blocks": ("4", "8"), "pipeline.max_seconds": ("60.0", "None")}
+    assert found == {"pipeline.blocks": ("4", "0"), "pipeline.max_seconds": ("60.0", "None")}
     assert shlex.split(training_command(settings).replace("\\\n", "")) == [
         "ns-train", "abcd", "--data", "my data; rm -rf",
         "--pipeline.blocks", "4", "--pipeline.max-seconds", "60.0",

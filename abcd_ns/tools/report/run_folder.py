@@ -1,9 +1,9 @@
 """A run's folder, read without trusting it: JSON, tensors, and no Python objects."""
 
 import copy
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -25,7 +25,7 @@ from abcd_ns.tools.runs.options import set_options
 from abcd_ns.tools.runs.records import read_record
 
 CHECKPOINTS = "nerfstudio_models"
-_DAMAGE = (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, pickle.UnpicklingError)
+_DAMAGE = (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, UnpicklingError)
 """What comes of reading a file that is no checkpoint of ours."""
 
 
