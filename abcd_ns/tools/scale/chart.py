@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from abcd_ns.tools.runs.style import COLORS, MARKERS, STYLE, lay_grid, save
 from abcd_ns.tools.runs.tables import MIB
@@ -69,9 +69,9 @@ def _draw_memory(axes: Axes, results: ScaleResults, has_gpu: bool) -> None:
         color="#666666",
         fontsize=8,
     )
-    axes.set_ylim(bottom=0 if has_gpu else 0.75 * base)
+    axes.set_ylim(bottom=0)
     axes.set_ylabel("peak memory (MiB)")
-    _size_axis(axes)
+    _size_axis(axes, results)
 
 
 def _draw_time(axes: Axes, results: ScaleResults) -> None:
@@ -95,11 +95,12 @@ def _draw_time(axes: Axes, results: ScaleResults) -> None:
     axes.set_ylim(bottom=0)
     axes.margins(y=0.15)
     axes.set_ylabel("seconds")
-    _size_axis(axes)
+    _size_axis(axes, results)
 
 
-def _size_axis(axes: Axes) -> None:
+def _size_axis(axes: Axes, results: ScaleResults) -> None:
     axes.set_xscale("log", base=2)
+    axes.xaxis.set_major_locator(FixedLocator(sorted({arm.gaussians for arm in results.arms})[::2]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("Gaussians in the scene")
