@@ -29,11 +29,11 @@ from abcd_ns.engine.events import (
 )
 from abcd_ns.engine.health import Health
 from abcd_ns.engine.influence import influence, share_shown
+from abcd_ns.engine.memory import check_room
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
 from abcd_ns.engine.planner import Planner
 from abcd_ns.engine.rasterizer import Rasterizer
-from abcd_ns.engine.room import check_room
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.scaffold import LIVE
 from abcd_ns.engine.scene import StoredScene

@@ -1,13 +1,17 @@
-"""How many Gaussians fit on the device: what a visit holds there, part by part.
+"""How many Gaussians fit on the device: a model to plan with, and a look before memory is taken.
 
-A model to plan with, made of what must be held and rounded up; `abcd scale` measures.
+The model adds up what a visit must hold, part by part, and rounds up; `abcd scale` measures.
 """
 
 import math
 from dataclasses import dataclass
 
+import psutil
+import torch
+
 from abcd_ns.engine.painter import LEAST_PASS
 from abcd_ns.engine.visit import AT_HAND_BYTES, PARTS_BYTES
+from abcd_ns.errors import UserError
 
 FLOAT = 4
 """Bytes."""
@@ -15,6 +19,8 @@ PROJECTED_FLOATS = 50
 """Of a Gaussian in one view: its splat (11 numbers), copies sorted by tile, the gradients of all these."""
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
+LIVE_COPIES = 5
+"""Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
 
 
 @dataclass(frozen=True)
@@ -60,3 +66,35 @@ class DeviceNeeds:
 def fewest_blocks(gaussians: int, limit: int, full: float) -> int:
     """Equal blocks for so many Gaussians, none of them above the share `full` of `limit`."""
     return max(1, math.ceil(gaussians / max(full * limit, 1.0)))
+
+
+class OutOfRoomError(UserError):
+    """A block is too large for the memory that is free."""
+
+
+def bytes_for(gaussians: int, sh_degree: int) -> int:
+    """What a live block of so many Gaussians takes, pictures not counted."""
+    return gaussians * (11 + 3 * (sh_degree + 1) ** 2) * FLOAT * LIVE_COPIES
+
+
+def free_bytes(device: torch.device) -> int:
+    """What `device` has left, memory that torch holds in reserve included."""
+    if device.type != "cuda":
+        return psutil.virtual_memory().available
+    reserve = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + reserve
+
+
+def check_room(gaussians: int, sh_degree: int, device: torch.device) -> None:
+    """Refuse a block that cannot fit.
+
+    Raises:
+        OutOfRoomError: the memory that is free does not suffice; says what would.
+    """
+    needed, free = bytes_for(gaussians, sh_degree), free_bytes(device)
+    if needed > free:
+        raise OutOfRoomError(
+            f"A block of {gaussians:,} Gaussians takes {needed / 2**30:.1f} GiB, but {device} has "
+            f"{free / 2**30:.1f} GiB left; set --pipeline.training.density.max-gaussians, or more "
+            "--pipeline.blocks."
+        )

@@ -13,8 +13,8 @@ from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
 from abcd_ns.engine.health import Health
 from abcd_ns.engine.health_record import BlockHealth, standing, summary
 from abcd_ns.engine.health_rules import extent, is_worse, loss_rise, stand_ins, unsound
+from abcd_ns.engine.memory import OutOfRoomError, bytes_for, check_room
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
-from abcd_ns.engine.room import OutOfRoomError, bytes_for, check_room
 from abcd_ns.engine.run_state import RunState
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -311,7 +311,7 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(
     with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
         check_room(10**12, 3, torch.device("cpu"))
     check_room(1000, 3, torch.device("cpu"))
-    monkeypatch.setattr("abcd_ns.engine.room.free_bytes", lambda _: bytes_for(30, 1))
+    monkeypatch.setattr("abcd_ns.engine.memory.free_bytes", lambda _: bytes_for(30, 1))
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=10)
     with pytest.raises(OutOfRoomError, match="A block of 60 Gaussians"):
         train_step(coordinator, photos)

@@ -7,7 +7,7 @@ import torch
 
 from abcd_ns.engine.density import DensityClock, DensityConfig, DensityControl, for_blocks
 from abcd_ns.engine.events import VisitEnded, VisitUndone
-from abcd_ns.engine.room import OutOfRoomError, check_room
+from abcd_ns.engine.memory import OutOfRoomError, check_room
 from abcd_ns.engine.schedule import passes_of_sweep, views_per_visit
 from abcd_ns.tools.stability.lab import Lab, make_stage
 from abcd_ns.tools.stability.outcome import Finding, Scenario
