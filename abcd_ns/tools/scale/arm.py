@@ -70,7 +70,7 @@ class Arm:
     plan_seconds: float
     """Until the first visit began: which views see which block."""
     visit_seconds: float | None
-    """Mean of the visits."""
+    """Mean of the visits but the first, whose time holds `plan_seconds`."""
     layer_seconds: float | None
     """Of it, for layers."""
     steps: int
@@ -93,7 +93,7 @@ def run(job: ArmJob, folder: Path) -> Arm:
     wanted = MONOLITHIC_STEPS if job.monolithic else None
     while len(watch.visits) < job.visits if wanted is None else coordinator.state.step < wanted:
         train_step(coordinator, lambda view, crop: land.photo(cameras[view], crop))
-    visits = watch.visits
+    visits = watch.visits[1:] or watch.visits  # the first one's time holds the planning of the sweep
     return Arm(
         tiles=job.tiles,
         gaussians=job.tiles * job.gaussians_per_tile,
