@@ -4,18 +4,9 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.param_swap import LEARNING_RATES
 from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig, FusedAdamConfig
 from abcd_ns.viewer.rules import THIS_MACHINE
-
-LEARNING_RATES = {
-    "means": 1.6e-4,
-    "features_dc": 0.0025,
-    "features_rest": 0.0025 / 20,
-    "opacities": 0.05,
-    "scales": 0.005,
-    "quats": 0.001,
-}
-"""Splatfacto's. The means' decays with the progress of the run, see TrainingConfig."""
 
 PAPER = TrainingConfig(
     ownership="means",

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import torch
 import tyro
-from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
@@ -26,7 +25,7 @@ from abcd_ns.engine.events import VisitEnded
 from abcd_ns.engine.initialize import gaussians_from_points
 from abcd_ns.engine.loss import mean_psnr
 from abcd_ns.engine.near_plane import near_plane
-from abcd_ns.engine.param_swap import make_adam
+from abcd_ns.engine.param_swap import nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import make_rasterizer
 from abcd_ns.engine.run_state import Budget
@@ -35,7 +34,6 @@ from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.methods import LEARNING_RATES
 from abcd_ns.plugin.config import AbcdDataManagerConfig
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
 from abcd_ns.plugin.views import views_of
@@ -111,7 +109,6 @@ def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     keep = None if blocks == 1 else len(capture.gaussians) // blocks
     store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=args.seed))
-    params = ParameterDict({name: Parameter(value) for name, value in Gaussians.empty(3).items()})
     coordinator = Coordinator(
         TrainingConfig(seed=args.seed),
         Budget(seconds=args.seconds),
@@ -119,8 +116,7 @@ def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
         capture.views,
         LayerCache(folder / "layers"),
         make_rasterizer("torch", "cpu"),
-        params,
-        make_adam(params, LEARNING_RATES),
+        *nothing_live(3),
     )
     clock, layers = StageClock(), 0.0
 

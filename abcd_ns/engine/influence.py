@@ -14,13 +14,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer import Rasterizer, Shot
+from abcd_ns.engine.rasterizer.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians, View
 
 COARSE = 2
 """Influences of whole views are found in images that are so many times smaller."""
 DIGITS = 6
 """Decimals that are kept: a millionth of the image is less than a pixel."""
-_SH_0 = 0.28209479177387814
 
 Influence = dict[int, dict[int, float]]
 """By block and by view, the influence of the block's Gaussians; of pairs that have any."""
@@ -48,7 +48,7 @@ def weights(
     if not total.requires_grad:
         return gaussians.means.new_zeros(len(gaussians))
     (found,) = torch.autograd.grad(total, dark)
-    return found.flatten(1)[:, 0] / _SH_0
+    return found.flatten(1)[:, 0] / SH_C0
 
 
 def share_shown(

@@ -10,10 +10,9 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from abcd_ns.engine.rasterizer.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3
 """Other points whose mean distance is a point's size."""

@@ -15,6 +15,15 @@ Params = MutableMapping[str, Parameter] | ParameterDict
 """The live parameters by name."""
 Optimizers = Mapping[str, torch.optim.Optimizer]
 """One Adam per parameter, under the parameter's name; each with one parameter group."""
+LEARNING_RATES = {
+    "means": 1.6e-4,
+    "features_dc": 0.0025,
+    "features_rest": 0.0025 / 20,
+    "opacities": 0.05,
+    "scales": 0.005,
+    "quats": 0.001,
+}
+"""Splatfacto's. The means' decays with the progress of the run, see TrainingConfig."""
 
 
 def attach(state: BlockState, params: Params, optimizers: Optimizers) -> None:
@@ -66,12 +75,21 @@ def live_gaussians(params: Params) -> Gaussians:
     return Gaussians(**{name: params[name] for name in PARAM_NAMES})
 
 
-def make_adam(params: Params, learning_rates: Mapping[str, float], eps: float = 1e-15) -> Optimizers:
+def make_adam(params: Params) -> Optimizers:
     """One Adam for each parameter, as 3DGS uses it."""
     return {
-        name: torch.optim.Adam([params[name]], lr=learning_rates[name], eps=eps, fused=True)
+        name: torch.optim.Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
         for name in PARAM_NAMES
     }
+
+
+def nothing_live(
+    sh_degree: int, device: torch.device | str = "cpu"
+) -> tuple[dict[str, Parameter], Optimizers]:
+    """Empty parameters and their Adam, for a coordinator that nerfstudio does not call."""
+    empty = Gaussians.empty(sh_degree, device)
+    params = {name: Parameter(value) for name, value in empty.items()}
+    return params, make_adam(params)
 
 
 class Pace:

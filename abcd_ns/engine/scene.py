@@ -42,7 +42,7 @@ class MemoryScene:
         self.tree = tree
         owner = tree.assign(gaussians.means)
         self._blocks = [gaussians[owner == block] for block in range(tree.num_blocks)]
-        self._bounds = [bounds_of(block) for block in self._blocks]
+        self._bounds: dict[int, Box | None] = {}
 
     def gaussians(self, block: int) -> Gaussians:
         return self._blocks[block]
@@ -54,6 +54,8 @@ class MemoryScene:
         return len(self._blocks[block])
 
     def bounds(self, block: int) -> Box | None:
+        if block not in self._bounds:
+            self._bounds[block] = bounds_of(self._blocks[block])
         return self._bounds[block]
 
 

@@ -8,7 +8,7 @@ import torch
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.param_swap import attach, detach, live_gaussians, make_adam
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from tests.reference.scenes import RATES, random_gaussians
+from tests.reference.scenes import random_gaussians
 
 
 def some_state(count: int, seed: int = 0) -> BlockState:
@@ -32,7 +32,7 @@ def assert_same(a: BlockState, b: BlockState) -> None:
 
 def live(state: BlockState):
     params = {n: torch.nn.Parameter(v) for n, v in Gaussians.empty(1).items()}
-    optimizers = make_adam(params, RATES)
+    optimizers = make_adam(params)
     attach(state, params, optimizers)
     return params, optimizers
 

@@ -12,12 +12,12 @@ from abcd_ns.engine.density import DensityClock, DensityConfig, DensityControl, 
 from abcd_ns.engine.param_swap import attach, live_gaussians, make_adam
 from abcd_ns.engine.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from tests.reference.scenes import RATES, random_gaussians
+from tests.reference.scenes import random_gaussians
 
 
 def live(gaussians: Gaussians):
     params = {n: torch.nn.Parameter(v) for n, v in Gaussians.empty(gaussians.sh_degree).items()}
-    optimizers = make_adam(params, RATES)
+    optimizers = make_adam(params)
     attach(BlockState.fresh(gaussians), params, optimizers)
     return params, optimizers
 

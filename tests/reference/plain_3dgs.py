@@ -7,6 +7,7 @@ import torch
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.loss import photometric_loss
+from abcd_ns.engine.param_swap import LEARNING_RATES
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.schedule import (
     exponential_decay,
@@ -17,7 +18,7 @@ from abcd_ns.engine.schedule import (
     visit_views,
 )
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
-from tests.reference.scenes import RATES, Photos
+from tests.reference.scenes import Photos
 
 
 def train_plain(
@@ -26,13 +27,14 @@ def train_plain(
     """Train for `steps` on the views in the order that a run of one block takes, and return the result."""
     params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
     adam = {
-        name: torch.optim.Adam([params[name]], lr=RATES[name], eps=1e-15, fused=True) for name in PARAM_NAMES
+        name: torch.optim.Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
+        for name in PARAM_NAMES
     }
     draw, density, growth = TorchRasterizer(compile="never"), DensityControl(config.density), {}
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
         adam["means"].param_groups[0]["lr"] = exponential_decay(
-            taken / steps, RATES["means"], RATES["means"] * config.means_lr_decay
+            taken / steps, LEARNING_RATES["means"], LEARNING_RATES["means"] * config.means_lr_decay
         )
         raster = draw(
             Gaussians(**{name: params[name] for name in PARAM_NAMES}),

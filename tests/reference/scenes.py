@@ -9,7 +9,7 @@ from torch import Tensor
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.param_swap import make_adam
+from abcd_ns.engine.param_swap import nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
@@ -18,15 +18,6 @@ from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import AT_HAND_BYTES
-
-RATES = {
-    "means": 1.6e-4,
-    "features_dc": 2.5e-3,
-    "features_rest": 1.25e-4,
-    "opacities": 0.05,
-    "scales": 5e-3,
-    "quats": 1e-3,
-}
 
 
 def random_gaussians(
@@ -117,8 +108,6 @@ def make_coordinator(
         tree = tree or build_kd(gaussians.means, blocks)
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
         store.commit(content(tree, gaussians, *([] if scaffold is None else [scaffold])))
-    empty = Gaussians.empty(gaussians.sh_degree)
-    params = {name: torch.nn.Parameter(value) for name, value in empty.items()}
     config = TrainingConfig(sh_degree=gaussians.sh_degree, **training)
     coordinator = kind(
         config,
@@ -127,8 +116,7 @@ def make_coordinator(
         views,
         LayerCache(None, bits=bits) if cache is None else cache,
         TorchRasterizer(compile="never"),
-        params,
-        make_adam(params, RATES),
+        *nothing_live(gaussians.sh_degree),
         at_hand_bytes=at_hand_bytes,
     )
     if resume:

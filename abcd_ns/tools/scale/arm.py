@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
-from abcd_ns.engine.param_swap import make_adam
+from abcd_ns.engine.param_swap import nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import make_rasterizer
 from abcd_ns.engine.run_state import Budget
@@ -26,15 +25,6 @@ from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
 from abcd_ns.tools.scale.land import Land
 
 RESULT_FILE = "arm.json"
-RATES = {
-    "means": 1.6e-4,
-    "features_dc": 0.0025,
-    "features_rest": 0.0025 / 20,
-    "opacities": 0.05,
-    "scales": 0.005,
-    "quats": 0.001,
-}
-"""As the methods have them."""
 MONOLITHIC_STEPS = 12
 """Enough for Adam's moments and the drawing of the largest view to be there."""
 
@@ -130,7 +120,6 @@ def make_store(land: Land, monolithic: bool, folder: Path) -> ParameterStore:
 def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, device, folder) -> Coordinator:
     tree = build_kd(torch.zeros(0, 3), 1) if job.monolithic else land.tree()
     still = DensityConfig(strategy="off")  # or blocks would not be equal
-    params = ParameterDict({n: Parameter(v.to(device)) for n, v in Gaussians.empty(3).items()})
     return Coordinator(
         TrainingConfig(seed=job.seed, warmup=0.0, sh_ramp=0.0, background="black", density=still),
         Budget(steps=10**9),
@@ -138,8 +127,7 @@ def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, dev
         land.cameras(),
         LayerCache(folder / "layers"),
         rasterizer,
-        params,
-        make_adam(params, RATES),
+        *nothing_live(3, device),
         device=device,
     )
 

@@ -14,9 +14,9 @@ from torch import Tensor
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.intervals import ray_directions
 from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.rasterizer.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Crop, Gaussians, View
 
-SH_C0 = 0.28209479177387814
 HEIGHT = 1.1
 """Of the cameras over the land, in sides of a tile."""
 SHIFT = 0.25

@@ -19,7 +19,7 @@ from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Event
 from abcd_ns.engine.initialize import gaussians_from_points, thin_out
 from abcd_ns.engine.loss import psnr
-from abcd_ns.engine.param_swap import Optimizers, make_adam
+from abcd_ns.engine.param_swap import Optimizers, nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
@@ -33,15 +33,6 @@ from abcd_ns.tools.stability.world import TABLE, World, ring
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
-RATES = {
-    "means": 1.6e-4,
-    "features_dc": 2.5e-3,
-    "features_rest": 1.25e-4,
-    "opacities": 0.05,
-    "scales": 5e-3,
-    "quats": 1e-3,
-}
-"""As in abcd_ns.methods, which would load nerfstudio."""
 SH_DEGREE = 1
 """Nothing in these worlds shines."""
 STILL = DensityConfig(strategy="off")
@@ -176,7 +167,7 @@ class Lab:
         warms = config.warmup > 0 and tree.num_blocks > 1
         keep = math.ceil(len(start) / tree.num_blocks) if warms else None
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
-        params, adam = optimizers or live_optimizers(start.sh_degree)
+        params, adam = optimizers or nothing_live(start.sh_degree)
         scene, cache = StoredScene(tree, store), LayerCache(None, bits=bits)
         steps = Budget(steps=steps_for(budget, config, tree.num_blocks))
         return kind(config, steps, scene, views, cache, self.rasterizer, params, adam)
@@ -237,12 +228,6 @@ class Lab:
         drawn = self.pictures(merged(coordinator), stage.views)
         errors = [(a - stage.photos[v.index]).abs().mean() for a, v in zip(drawn, stage.views, strict=True)]
         return float(torch.stack(errors).mean())
-
-
-def live_optimizers(sh_degree: int) -> tuple[dict[str, Parameter], Optimizers]:
-    """Empty parameters and an Adam for each."""
-    params = {name: Parameter(value) for name, value in Gaussians.empty(sh_degree).items()}
-    return params, make_adam(params, RATES)
 
 
 def steps_for(views: int, config: TrainingConfig, blocks: int) -> int:

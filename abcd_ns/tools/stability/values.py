@@ -13,10 +13,11 @@ from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.events import Mended
 from abcd_ns.engine.health_record import standing
 from abcd_ns.engine.health_rules import unsound
-from abcd_ns.engine.initialize import SH_C0, gaussians_from_points, random_points
-from abcd_ns.engine.param_swap import Optimizers
+from abcd_ns.engine.initialize import gaussians_from_points, random_points
+from abcd_ns.engine.param_swap import Optimizers, nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.planner import NothingSeenError
+from abcd_ns.engine.rasterizer.spherical_harmonics import SH_C0
 from abcd_ns.engine.storage import through_codec
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.tools.stability.lab import (
@@ -24,7 +25,6 @@ from abcd_ns.tools.stability.lab import (
     STILL,
     Lab,
     Trained,
-    live_optimizers,
     make_stage,
     merged,
 )
@@ -76,7 +76,7 @@ def nan_gradients(lab: Lab) -> Finding:
     for method in ("abcd", "abcd-monolithic"):
         options = {"budget": budget, "blocks": 4, "density": STILL}
         clean = lab.train(stage, method, **options)
-        live = live_optimizers(SH_DEGREE)
+        live = nothing_live(SH_DEGREE)
         poison(live[1], live[0])
         spoilt = lab.train(stage, method, optimizers=live, **options)
         mended = sum(event.count for event in spoilt.of(Mended) if event.what == "gradients")
