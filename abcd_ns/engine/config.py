@@ -80,6 +80,12 @@ class TrainingConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 
+    def room(self, scene: int, block: int) -> int | None:
+        """Gaussians that may be added to a block of so many in a scene of so many; None for any number."""
+        rooms = [] if self.density.limit is None else [self.density.limit - scene]
+        rooms += [self.block_limit - block] if self.block_limit else []
+        return min(rooms, default=None)
+
 
 def resolve_ownership(
     wanted: Literal["auto", "fragments", "means"], rasterizer: Rasterizer

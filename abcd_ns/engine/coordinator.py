@@ -36,7 +36,7 @@ from abcd_ns.engine.planner import Planner
 from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.scaffold import LIVE
-from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.scene import BlockScene, StoredScene
 from abcd_ns.engine.schedule import (
     endless_order,
     exponential_decay,
@@ -213,14 +213,6 @@ class Coordinator:
         before = self.config.warmup if had_reserve(self.scene) else 0.0
         return max(self.progress - before, 0.0) / (1 - before)
 
-    @property
-    def _room(self) -> int | None:
-        """Gaussians that may be added to the live block: as many as the scene and the block have room for."""
-        scene, block = self.config.density.limit, self.config.block_limit
-        rooms = [] if scene is None else [scene - self.count()]
-        rooms += [block - len(self.params["means"])] if block else []
-        return min(rooms, default=None)
-
     def _density_clock(self, taken: int) -> DensityClock:
         active = self._active
         views = self.state.views.get(active.geometry.block, len(active.geometry.views))
@@ -231,7 +223,7 @@ class Coordinator:
             steps=self._clocks.steps,
             taken=taken,
             views=views,
-            room=self._room,
+            room=self.config.room(self.count(), len(self.params["means"])),
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
             resets=self._clocks.resets if self.health.acts else None,
             may_reset=4 * active.done <= active.steps,
@@ -321,11 +313,15 @@ class Coordinator:
         taken = 0 if active.is_whole else active.steps * self.batch
         return view_order(active.views, taken, active.number, self.config.seed)
 
+    def _surroundings(self) -> BlockScene:
+        """Where a visit's frozen blocks are drawn from."""
+        return self.scene
+
     def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
         if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
             return None
         painter = Painter(
-            self.scene,
+            self._surroundings(),
             list(self.views.values()),
             self._rasterizer,
             ownership=self._ownership,

@@ -8,11 +8,8 @@ from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.culling import bounds_of
-from abcd_ns.engine.painter import Painter, PaintSettings
-from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.scene import BlockScene
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.engine.visit import VisitLayers
 
 
 class Snapshot(BlockScene):
@@ -54,31 +51,10 @@ class StaleCoordinator(Coordinator):
         self._seen: Snapshot | None = None
         self._taken_at = 0
 
-    def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
-        if active.is_whole or self.scene.tree.num_blocks == 1:
-            return None
-        if self._seen is None or active.number - self._taken_at >= self._every:
-            self._seen, self._taken_at = Snapshot(self.scene, active.number), active.number
-        painter = Painter(
-            self._seen,
-            list(self.views.values()),
-            self._rasterizer,
-            ownership=self._ownership,
-            pass_gaussians=10**9,
-        )
-        layers = VisitLayers(
-            painter,
-            self.cache,
-            active.geometry,
-            self.scene.at_rest(active.geometry.block),
-            self.views,
-            PaintSettings(active.sh_degree),
-            window_weight=self.config.window_weight,
-            scene_key=f"stale {active.number}",
-        )
-        for _ in layers.draw(dict.fromkeys(self._order)):
-            pass
-        return layers
+    def _surroundings(self) -> BlockScene:
+        if self._seen is None or self.state.visit - self._taken_at >= self._every:
+            self._seen, self._taken_at = Snapshot(self.scene, self.state.visit), self.state.visit
+        return self._seen
 
     def _detached(self) -> BlockState:
         state = super()._detached()

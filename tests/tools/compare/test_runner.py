@@ -18,8 +18,8 @@ from abcd_ns.tools.runs import runner
 from abcd_ns.tools.runs.records import encode
 from abcd_ns.tools.runs.run import Failure, Run
 from abcd_ns.tools.runs.runner import claim, last_line, run_jobs
-from tests.tools.compare_records import MACHINE
-from tests.tools.fake_worker import FakeWorker
+from tests.tools.compare.fake_worker import FakeWorker
+from tests.tools.compare.records import MACHINE
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from abcd_ns.tools.report.held_out import HeldOut, Shown
 from abcd_ns.tools.report.run_folder import Checkpoint, RunFolder, default_config
 from abcd_ns.tools.report.story import read_story
 from abcd_ns.tools.runs.run import ViewScore
-from tests.tools.compare_records import MACHINE, VERSIONS
+from tests.tools.compare.records import MACHINE, VERSIONS
 
 TRAINING = {
     "schema": 1,

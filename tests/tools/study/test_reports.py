@@ -18,9 +18,9 @@ from abcd_ns.tools.study.plan import Conditions, StudyPlan, plan_blocks, plan_op
 from abcd_ns.tools.study.results import read_study, write_study
 from abcd_ns.tools.study.tables import notes, rows, write_table
 from tests.reference.colmap_scene import write_scene
-from tests.tools.compare_records import MACHINE
-from tests.tools.fake_worker import FakeWorker
-from tests.tools.study_records import (
+from tests.tools.compare.fake_worker import FakeWorker
+from tests.tools.compare.records import MACHINE
+from tests.tools.study.records import (
     blocks_study,
     gaussians_study,
     made_up_arm,

@@ -6,7 +6,7 @@ import pytest
 
 from abcd_ns.tools.report.story import Story, read_story
 from abcd_ns.tools.runs.records import RecordError
-from tests.tools.report_runs import TRAINING, line, log_lines, write_log
+from tests.tools.report.runs import TRAINING, line, log_lines, write_log
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from abcd_ns.tools.compare.results import SCHEMA, read_results, write_results
 from abcd_ns.tools.runs.evaluate import mean, ordering_gap
 from abcd_ns.tools.runs.records import RecordError, decode, encode
 from abcd_ns.tools.runs.run import CurvePoint, Run
-from tests.tools.compare_records import made_up_results, made_up_run
+from tests.tools.compare.records import made_up_results, made_up_run
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
 

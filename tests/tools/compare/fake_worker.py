@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from abcd_ns.tools.runs.records import encode
-from tests.tools.compare_records import made_up_run
+from tests.tools.compare.records import made_up_run
 
 WORKER = """
 import json, os, pathlib, sys

@@ -12,7 +12,6 @@ from PIL import Image
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.input_errors import InputError
 from abcd_ns.tools.check.command import check, examine
-from abcd_ns.tools.check.survey import Survey, survey
 from abcd_ns.tools.check.visibility import visibility
 from abcd_ns.tools.findings import Finding, by_level
 from tests.plugin.dataparser_scenes import (
@@ -24,24 +23,7 @@ from tests.plugin.dataparser_scenes import (
     write_model,
     write_photos,
 )
-from tests.tools.check_scenes import POINTS, names, write_sound
-
-
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory) -> Path:
-    """Not to be written to."""
-    return write_sound(tmp_path_factory.mktemp("check") / "scene")
-
-
-@pytest.fixture
-def scene(sound, tmp_path) -> Path:
-    """A copy that a test may spoil."""
-    return Path(shutil.copytree(sound, tmp_path / "scene"))
-
-
-@pytest.fixture(scope="module")
-def found(sound) -> Survey:
-    return survey(sound, 1)
+from tests.tools.check.scenes import POINTS, names
 
 
 def test_a_sound_scene_is_summed_up(sound, tmp_path, capsys):

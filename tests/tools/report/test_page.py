@@ -20,7 +20,7 @@ from abcd_ns.tools.report.page import render_page, sparkline
 from abcd_ns.tools.report.plan import make_plan, push_apart
 from abcd_ns.tools.report.svg import DARK
 from abcd_ns.tools.runs.evaluate import Drawn, HeldOutView
-from tests.tools.report_runs import made_up_held_out, made_up_run, made_up_score, made_up_settings
+from tests.tools.report.runs import made_up_held_out, made_up_run, made_up_score, made_up_settings
 
 HOSTILE = "</title></style><script>alert(1)</script>\"'><img src=http://evil/x onerror=alert(2)>{{ 7*7 }}"
 

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,25 +12,7 @@ from abcd_ns.tools.check.command import examine, findings_of
 from abcd_ns.tools.check.looks import Look
 from abcd_ns.tools.check.survey import Survey, survey
 from tests.plugin.dataparser_scenes import NAMES, SIZES, write_model, write_photos, write_transforms
-from tests.tools.check_scenes import POINTS, changed, names, the, wide, with_looks, write_sound
-
-
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory) -> Path:
-    """Not to be written to."""
-    return write_sound(tmp_path_factory.mktemp("check") / "scene")
-
-
-@pytest.fixture
-def scene(sound, tmp_path) -> Path:
-    """A copy that a test may spoil."""
-    return Path(shutil.copytree(sound, tmp_path / "scene"))
-
-
-@pytest.fixture(scope="module")
-def found(sound) -> Survey:
-    return survey(sound, 1)
-
+from tests.tools.check.scenes import POINTS, changed, names, the, wide, with_looks
 
 # Photos
 

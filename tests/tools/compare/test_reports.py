@@ -19,7 +19,7 @@ from abcd_ns.tools.runs.job import METHODS, evenly
 from abcd_ns.tools.runs.run import ViewScore
 from abcd_ns.tools.runs.style import COLORS, MARKERS, spread
 from abcd_ns.tools.runs.tables import MEASURES, cell
-from tests.tools.compare_records import made_up_results, made_up_run
+from tests.tools.compare.records import made_up_results, made_up_run
 
 
 def svg_texts(path) -> list[str]:

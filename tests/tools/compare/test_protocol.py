@@ -11,7 +11,7 @@ from abcd_ns.tools.compare.protocol import Options, make_plan, read_options
 from abcd_ns.tools.runs.configs import trainer_config
 from abcd_ns.tools.runs.job import METHODS, Settings
 
-CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.toml"))
+CONFIGS = sorted((Path(__file__).resolve().parents[3] / "configs").glob("*.toml"))
 
 
 def options(scene: Path, **given) -> Options:

@@ -6,7 +6,7 @@ import random
 from abcd_ns.tools.runs.run import Run
 from abcd_ns.tools.study.findings import findings_of
 from abcd_ns.tools.study.results import SCHEMA, Arm, StudyProtocol, StudyResults
-from tests.tools.compare_records import MACHINE, VERSIONS, made_up_run
+from tests.tools.compare.records import MACHINE, VERSIONS, made_up_run
 
 
 def made_up_arm(variant: str, value: int | None, psnrs: dict[int, float], method="abcd", **fields) -> Arm:
