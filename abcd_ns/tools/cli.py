@@ -24,6 +24,8 @@ class Command(NamedTuple):
     name: str
     target: str
     help: str
+    hands_on: bool = False
+    """The function takes the words as they are, and reads or hands them on by itself."""
 
     def load(self) -> Callable[..., int | None]:
         """Import the function. This is where the seconds go (torch, nerfstudio), so only on use."""
@@ -35,15 +37,18 @@ COMMANDS = (
     Command(
         "demo", "abcd_ns.tools.demo:demo", "make a small scene, train it block by block, show the result"
     ),
+    Command("poses", "abcd_ns.tools.poses.command:poses", "find camera poses for photos, by pycolmap"),
     Command("check", "abcd_ns.tools.check.command:check", "examine a data set before training on it"),
     Command("doctor", "abcd_ns.tools.doctor.command:doctor", "examine this machine and its packages"),
     Command("synth", "abcd_ns.tools.synth.command:synth", "render a synthetic scene to train on"),
+    Command("train", "abcd_ns.tools.train:train", "ns-train, with options from a TOML file", hands_on=True),
     Command("plan", "abcd_ns.tools.plan.command:plan", "say what a run will need, before it begins"),
     Command(
         "report",
         "abcd_ns.tools.report.command:report",
         "show all about a training run on one HTML page",
     ),
+    Command("export", "abcd_ns.tools.export.command:export", "write a scene as .ply, whole or in parts"),
     Command(
         "compare",
         "abcd_ns.tools.compare.command:compare",
@@ -60,6 +65,7 @@ COMMANDS = (
         "abcd_ns.tools.stability.command:stability",
         "make methods fail on small scenes and see what ABCD does",
     ),
+    Command("completion", "abcd_ns.tools.completion:completion", "complete words of this command in a shell"),
 )
 
 EXAMPLES = (
@@ -109,6 +115,8 @@ def find_command(name: str, commands: Sequence[Command]) -> Command:
 
 def run_command(command: Command, args: Sequence[str]) -> int:
     """Run `command` on its own arguments; returns its exit code. Wrong arguments raise SystemExit(2)."""
+    if command.hands_on:
+        return command.load()(list(args))
     # Here and not above: `abcd --help` has no use for it.
     import tyro
 

@@ -1,6 +1,7 @@
 """The `abcd` command: what it prints, what it returns, and what it does not import."""
 
 import importlib.util
+import shutil
 import subprocess
 import sys
 from types import ModuleType
@@ -138,3 +139,15 @@ def test_ctrl_c_is_quiet(greet, capsys):
 def test_a_bug_keeps_its_traceback(greet):
     with pytest.raises(ValueError, match="a bug"):
         greet("--name", "bug")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion_knows_commands_and_options(shell, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["completion", shell])
+    assert not ended.value.code
+    script = capsys.readouterr().out
+    assert "compare" in script
+    assert "--max-gaussians" in script
+    if shutil.which(shell):
+        subprocess.run([shell, "-n"], input=script, text=True, check=True)

@@ -63,7 +63,7 @@ def read_scene(data: Path) -> Scene:
     if data.name in MIP_NERF_360:
         hint = f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there."
     else:
-        hint = "give a folder with a COLMAP model, or make one with `ns-process-data images`."
+        hint = f"give a folder with a COLMAP model, or make one of {data}/images with `abcd poses {data}`."
     if not data.exists():
         raise InputError(f"--data {data} does not exist; {hint}")
     looked = ", ".join(f"{folder}/cameras.bin|txt" for folder in MODEL_FOLDERS)

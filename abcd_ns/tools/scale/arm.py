@@ -119,9 +119,17 @@ def make_store(land: Land, monolithic: bool, folder: Path) -> ParameterStore:
 
 def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, device, folder) -> Coordinator:
     tree = build_kd(torch.zeros(0, 3), 1) if job.monolithic else land.tree()
-    still = DensityConfig(strategy="off")  # or blocks would not be equal
+    config = TrainingConfig(
+        seed=job.seed,
+        warmup=0.0,
+        sh_ramp=0.0,
+        background="black",
+        density=DensityConfig(strategy="off"),  # or blocks would not be equal
+        # As large blocks have it. Small ones may draw more at once, for speed, which small lands do not have.
+        pass_gaussians=2 * job.gaussians_per_tile,
+    )
     return Coordinator(
-        TrainingConfig(seed=job.seed, warmup=0.0, sh_ramp=0.0, background="black", density=still),
+        config,
         Budget(steps=10**9),
         StoredScene(tree, store, ram_bytes=job.ram_budget_bytes),
         land.cameras(),

@@ -11,7 +11,11 @@ from abcd_ns.tools.compare.protocol import Options, make_plan, read_options
 from abcd_ns.tools.runs.configs import trainer_config
 from abcd_ns.tools.runs.job import METHODS, Settings
 
-CONFIGS = sorted((Path(__file__).resolve().parents[3] / "configs").glob("*.toml"))
+CONFIGS = [
+    path
+    for path in sorted((Path(__file__).resolve().parents[3] / "configs").glob("*.toml"))
+    if "method = " not in path.read_text()  # those are for `abcd train`
+]
 
 
 def options(scene: Path, **given) -> Options:

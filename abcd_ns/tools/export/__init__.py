@@ -1,0 +1,1 @@
+"""`abcd export`: a trained scene as .ply files, whole or in parts."""

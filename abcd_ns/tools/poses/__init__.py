@@ -1,0 +1,1 @@
+"""`abcd poses`: camera poses and points for a folder of photos, by pycolmap."""

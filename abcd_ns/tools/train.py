@@ -1,0 +1,78 @@
+"""`abcd train`: `ns-train` with its options from a TOML file."""
+
+import os
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from abcd_ns.errors import UserError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+USAGE = """usage: abcd train FILE.toml [OPTIONS]
+
+Run `ns-train` with the options of a TOML file, then those given here: what comes later counts.
+
+  abcd train configs/small-gpu.toml --data garden
+
+The file says `method = "abcd"`, or another method of ns-train, and options under their names, in tables:
+--pipeline.device-budget-gb 6 stands in [pipeline] as device-budget-gb = 6. configs/ has examples.
+`ns-train abcd --help` lists all options."""
+METHOD = "method"
+
+
+def train(words: list[str]) -> int:
+    """Take the place of this process with `ns-train`.
+
+    Args:
+        words: the file, and options to hand on.
+
+    Raises:
+        UserError: the file cannot be read, or there is no `ns-train`.
+    """
+    if not words or words[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0
+    command = [_find_ns_train(), *command_line(Path(words[0])), *words[1:]]
+    os.execv(command[0], command)
+
+
+def command_line(path: Path) -> list[str]:
+    """What a file's options are on the command line of `ns-train`.
+
+    Raises:
+        UserError: the file is absent, is no TOML, names no method, or holds what no option can be.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist; configs/ has examples.") from None
+    except (ValueError, OSError) as error:
+        raise UserError(f"{path} cannot be read as TOML: {error}.") from None
+    method = data.pop(METHOD, None)
+    if not isinstance(method, str):
+        raise UserError(f'{path} names no method; begin it with: method = "abcd"')
+    return [method, *_flags(data, "--", path)]
+
+
+def _flags(table: Mapping[str, Any], prefix: str, path: Path) -> Iterator[str]:
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flags(value, f"{prefix}{name}.", path)
+        elif isinstance(value, (str, int, float)):  # bool is an int
+            yield from (prefix + name, str(value))
+        else:
+            raise UserError(f"{path}: {name} is a list or a date; an option has a single value.")
+
+
+def _find_ns_train() -> str:
+    beside = Path(sys.executable).parent / "ns-train"
+    found = str(beside) if beside.exists() else shutil.which("ns-train")
+    if found is None:
+        raise UserError("There is no ns-train here; install nerfstudio into this environment.")
+    return found

@@ -1,0 +1,86 @@
+"""Every command that the documents show is one that the programs take."""
+
+import functools
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.exporter import Commands as Export
+from nerfstudio.scripts.render import Commands as Render
+from nerfstudio.scripts.viewer.run_viewer import RunViewer
+
+from abcd_ns.errors import UserError
+from abcd_ns.tools import cli, train
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS += [ROOT / "docs" / "results" / "README.md"]
+NERFSTUDIO: dict[str, Any] = {
+    "ns-train": AnnotatedBaseConfigUnion,
+    "ns-eval": ComputePSNR,
+    "ns-viewer": RunViewer,
+    "ns-export": Export,
+    "ns-render": Render,
+}
+
+
+def commands(text: str) -> Iterator[str]:
+    """Lines of fenced or indented code that call one of the programs."""
+    fenced = "\n".join(re.findall(r"^```(?:bash|sh)?\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+    indented = "\n".join(re.findall(r"^    +(.*)$", text, re.MULTILINE))
+    for line in f"{fenced}\n{indented}".replace("\\\n", " ").splitlines():
+        if re.match(r"(abcd|ns-\w+) ", line.strip()):
+            yield line.strip()
+
+
+SHOWN = [
+    pytest.param(line, id=f"{path.name}: {line}") for path in DOCUMENTS for line in commands(path.read_text())
+]
+
+
+def no_deed(function: Callable) -> Callable:
+    """What is called as `function` is, and does nothing."""
+
+    @functools.wraps(function)
+    def nothing(*_: Any, **__: Any) -> None:
+        pass
+
+    return nothing
+
+
+def parse(line: str) -> None:
+    """Let the program read its options; SystemExit if it does not take them."""
+    line = line.replace("--load-config ...", "--load-config config.yml").split(" > ")[0]
+    program, *words = [word for word in shlex.split(line, comments=True) if word != "..."]
+    if program in NERFSTUDIO:
+        tyro.cli(NERFSTUDIO[program], args=words)
+        return
+    if words[0].startswith("--"):
+        return
+    command = cli.find_command(words[0], cli.COMMANDS)
+    if command.hands_on:
+        tyro.cli(AnnotatedBaseConfigUnion, args=[*train.command_line(ROOT / words[1]), *words[2:]])
+        return
+    tyro.cli(no_deed(command.load()), args=words[1:])
+
+
+@pytest.mark.parametrize("line", SHOWN)
+def test_a_command_in_the_documents_is_understood(line):
+    parse(line)
+
+
+@pytest.mark.parametrize("line", ["abcd plan --date garden", "ns-train abcd --pipeline.bloks 3", "abcd fly"])
+def test_a_wrong_one_would_be_noticed(line):
+    with pytest.raises((SystemExit, UserError)):
+        parse(line)
+
+
+def test_there_are_commands_to_look_at():
+    assert {"ns-train", "abcd"} <= {shlex.split(p.values[0], comments=True)[0] for p in SHOWN}
+    assert len(SHOWN) > 40
