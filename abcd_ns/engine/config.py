@@ -59,6 +59,9 @@ class TrainingConfig:
     block_limit: int = 0
     """Gaussians that a block may hold while it is trained; one that comes near it is cut in two when its
     visit ends. 0 is none; `ns-train abcd` sets it by the device's memory."""
+    sole_limit: int = 0
+    """The same for a block that is the whole scene: it has no neighbours, and draws one view in a step, so
+    there is room for more. 0 takes `block_limit`."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
     sh_degree: int = 3
@@ -80,10 +83,12 @@ class TrainingConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 
-    def room(self, scene: int, block: int) -> int | None:
-        """Gaussians that may be added to a block of so many in a scene of so many; None for any number."""
+    def room(self, scene: int, block: int, blocks: int) -> int | None:
+        """Gaussians that may be added to a block of so many in a scene of so many and of so many blocks; None
+        for any number."""
+        limit = self.block_limit if blocks > 1 else self.sole_limit or self.block_limit
         rooms = [] if self.density.limit is None else [self.density.limit - scene]
-        rooms += [self.block_limit - block] if self.block_limit else []
+        rooms += [limit - block] if limit else []
         return min(rooms, default=None)
 
 

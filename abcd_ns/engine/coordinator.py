@@ -223,7 +223,7 @@ class Coordinator:
             steps=self._clocks.steps,
             taken=taken,
             views=views,
-            room=self.config.room(self.count(), len(self.params["means"])),
+            room=self.config.room(self.count(), len(self.params["means"]), self.scene.tree.num_blocks),
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
             resets=self._clocks.resets if self.health.acts else None,
             may_reset=4 * active.done <= active.steps,
@@ -384,9 +384,8 @@ class Coordinator:
 
     def _split_full(self, updates: dict[int, BlockState]) -> tuple[BlockTree, dict[int, BlockState]]:
         """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole."""
-        if not self.config.block_limit:
-            return self.scene.tree, updates
-        tree, updates, parents = split_full(self.scene.tree, updates, self.config.block_limit)
+        limits = self.config.block_limit, self.config.sole_limit
+        tree, updates, parents = split_full(self.scene.tree, updates, *limits)
         for new, parent in parents.items():
             self.state.inherit(new, parent)
             self.announce(BlockSplit(parent, new, len(updates[parent]), len(updates[new])))

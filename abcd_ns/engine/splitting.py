@@ -11,7 +11,7 @@ FULL = 0.75
 
 
 def split_full(
-    tree: BlockTree, settled: dict[int, BlockState], limit: int
+    tree: BlockTree, settled: dict[int, BlockState], limit: int, sole: int = 0
 ) -> tuple[BlockTree, dict[int, BlockState], dict[int, int]]:
     """Cut each block with more than FULL of `limit` Gaussians in equal halves, and those again if need be.
 
@@ -19,11 +19,16 @@ def split_full(
 
     Args:
         settled: blocks that are about to be stored; numbers that are no block's are left alone.
+        limit: 0 is none.
+        sole: the limit of a block that is the whole scene; 0 is `limit`.
 
     Returns:
         The tree with the cuts, everything to be stored, and of each new block the one that it was part of.
     """
     parents: dict[int, int] = {}
+    alone = tree.num_blocks == 1 and all(len(state) <= FULL * sole for state in settled.values())
+    if not limit or alone:
+        return tree, settled, parents
     waiting = sorted(block for block in settled if block < tree.num_blocks)
     settled = dict(settled)
     while waiting:
@@ -42,16 +47,19 @@ def split_full(
     return tree, settled, parents
 
 
-def cut_at_rest(scene: StoredScene, state: RunState, limit: int) -> None:
-    """Cut the blocks of a run that goes on with a smaller limit than it had; nothing where all are in order.
+def cut_at_rest(scene: StoredScene, state: RunState, limit: int, sole: int = 0) -> None:
+    """Cut the blocks of a run that goes on with smaller limits than it had; nothing where all are in order.
 
     A block whose visit was under way is left for its end.
+
+    Args:
+        limit, sole: as of `split_full`.
     """
-    for block in range(scene.tree.num_blocks):
+    for block in range(scene.tree.num_blocks) if limit else ():
         if scene.store.counts(block) <= FULL * limit or state.active is not None:
             continue
         large = {block: BlockState.from_tensors(*scene.store.load(block))}
-        tree, parts, parents = split_full(scene.tree, large, limit)
+        tree, parts, parents = split_full(scene.tree, large, limit, sole)
         for new, parent in parents.items():
             state.inherit(new, parent)
         scene.rest(tree, {number: part.to_tensors() for number, part in parts.items()}, state.to_json())

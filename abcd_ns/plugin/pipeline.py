@@ -30,7 +30,7 @@ from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
 from abcd_ns.plugin.ram_budget import budget_bytes, share_out
-from abcd_ns.plugin.room import EXPECTED_GROWTH, Room, device_budget, find_room
+from abcd_ns.plugin.room import Room, device_budget, find_room
 from abcd_ns.plugin.run_folder import CACHE as CACHE
 from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, open_cache, take_over
 from abcd_ns.plugin.run_folder import STORE as STORE
@@ -133,9 +133,10 @@ class AbcdPipeline(VanillaPipeline):
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
-        training = replace(config.training, block_limit=self._block_limit(store, resumed))
-        if resumed and training.block_limit:
-            cut_at_rest(scene, RunState.from_json(store.state), training.block_limit)
+        limit, sole = self._limits(store, resumed)
+        training = replace(config.training, block_limit=limit, sole_limit=sole)
+        if resumed:
+            cut_at_rest(scene, RunState.from_json(store.state), limit, sole)
         coordinator = coordinator_for(training)(
             training,
             Budget(trainer.total_steps, config.max_seconds),
@@ -153,11 +154,13 @@ class AbcdPipeline(VanillaPipeline):
             coordinator.restore()
         return coordinator
 
-    def _block_limit(self, store: ParameterStore, resumed: bool) -> int:
-        """Gaussians in a block at most: as the run began, unless it goes on with a budget of its own."""
+    def _limits(self, store: ParameterStore, resumed: bool) -> tuple[int, int]:
+        """Gaussians in a block, and in a sole one, at most: as the run began, unless it goes on with a budget
+        of its own."""
         if resumed and self.config.blocks == 0 and self.config.device_budget_gb > 0:
-            return self._room(1).limit
-        return store.header.get("block_limit", 0)
+            room = self._room(1)
+            return room.limit, room.sole
+        return store.header.get("block_limit", 0), store.header.get("sole_limit", 0)
 
     def _room(self, points: int) -> Room:
         """How many blocks for a scene that begins with so many points."""
@@ -165,17 +168,22 @@ class AbcdPipeline(VanillaPipeline):
         return find_room(
             device_budget(config.device_budget_gb, self.device),
             pixels=int((cameras.width * cameras.height).max()),
-            gaussians=config.training.density.limit or EXPECTED_GROWTH * points,
+            points=points,
+            most=config.training.density.limit,
             training=config.training,
         )
 
-    def _first_cut(self, points: int) -> tuple[int, int]:
-        """(number of blocks to begin with, Gaussians in a block at most or 0 for no limit)."""
+    def _first_cut(self, points: int) -> tuple[int, dict[str, int]]:
+        """The number of blocks to begin with, and the limits of their Gaussians, by option; 0 for none."""
+        training = self.config.training
         if self.config.blocks > 0:
-            return self.config.blocks, self.config.training.block_limit
+            return self.config.blocks, {
+                "block_limit": training.block_limit,
+                "sole_limit": training.sole_limit,
+            }
         room = self._room(points)
         CONSOLE.print(room.in_words(), highlight=False, soft_wrap=True)
-        return room.blocks, room.limit
+        return room.blocks, {"block_limit": room.limit, "sole_limit": room.sole}
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""
@@ -201,9 +209,9 @@ class AbcdPipeline(VanillaPipeline):
                 highlight=False,
             )
         del everything
-        blocks, limit = self._first_cut(len(gaussians))
+        blocks, limits = self._first_cut(len(gaussians))
         tree = cut_space(gaussians, blocks, self.config.partition)
-        store = new_store(folder, {"tree": tree.to_json(), "block_limit": limit, **made_for.header()})
+        store = new_store(folder, {"tree": tree.to_json(), **limits, **made_for.header()})
         if training.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))
             return store, False

@@ -13,8 +13,7 @@ from abcd_ns.errors import UserError
 
 GB = 2**30
 EXPECTED_GROWTH = 5
-"""Gaussians at the end for each initial point, where no limit is set. Only the number of blocks to begin with
-hangs on it: blocks that outgrow their room are cut."""
+"""Gaussians at the end for each initial point, where no limit is set; for forecasts only."""
 FREE_SHARE = 0.9
 """Of a GPU's free memory: the rest is for what the allocator cannot use."""
 RAM_SHARE = 0.25
@@ -28,21 +27,34 @@ class Room:
     """What a budget allows."""
 
     blocks: int
-    """To begin with."""
+    """To begin with: as few as hold the initial Gaussians. Those that outgrow their room are cut in two."""
     limit: int
-    """Gaussians in a block at most."""
+    """Gaussians in a block at most, where there are several."""
+    sole: int
+    """Gaussians at most in a block that is the whole scene."""
     budget: int
     """Bytes of the device that training may take."""
     gaussians: int
     """Expected in the whole scene at the end."""
 
+    @property
+    def blocks_at_the_end(self) -> int:
+        """If as many Gaussians come as are expected."""
+        return max(self.blocks, _fewest(self.gaussians, self.limit, self.sole))
+
     def in_words(self) -> str:
         """One line for the terminal."""
         blocks = "1 block" if self.blocks == 1 else f"{self.blocks} blocks"
+        limit = self.sole if self.blocks == 1 else self.limit
         return (
-            f"{self.budget / GB:.1f} GB of the device allow {self.limit:,} Gaussians in a block: {blocks} "
-            f"for the {self.gaussians:,} that are expected."
+            f"{self.budget / GB:.1f} GB of the device allow {limit:,} Gaussians in a block: {blocks} to "
+            "begin with; a block that comes near that is cut in two."
         )
+
+
+def _fewest(gaussians: int, limit: int, sole: int) -> int:
+    """Blocks for so many Gaussians."""
+    return 1 if gaussians <= FULL * sole else max(2, fewest_blocks(gaussians, limit, FULL))
 
 
 def device_budget(wanted_gb: float, device: torch.device | str) -> int:
@@ -69,24 +81,24 @@ def check_room(budget: int, pixels: int, training: TrainingConfig) -> None:
         )
 
 
-def find_room(budget: int, *, pixels: int, gaussians: int, training: TrainingConfig) -> Room:
+def find_room(
+    budget: int, *, pixels: int, points: int, most: int | None = None, training: TrainingConfig
+) -> Room:
     """The fewest blocks whose visits stay within `budget` bytes.
 
     Args:
         pixels: of the largest image.
-        gaussians: expected in the whole scene.
+        points: the scene begins with.
+        most: limit on Gaussians in the whole scene; None for none.
 
     Raises:
         UserError: the budget has no room for any block worth a visit.
     """
     check_room(budget, pixels, training)
     # A single block has no neighbours and draws one view a step, so it may be larger.
-    limit = _needs(pixels, training, blocks=1).block_limit(budget)
-    blocks = fewest_blocks(gaussians, limit, FULL)
-    if blocks > 1:
-        limit = _needs(pixels, training, blocks).block_limit(budget)
-        blocks = fewest_blocks(gaussians, limit, FULL)
-    return Room(blocks, limit, budget, gaussians)
+    sole, limit = (_needs(pixels, training, blocks).block_limit(budget) for blocks in (1, 2))
+    first = points if most is None else min(points, most)
+    return Room(_fewest(first, limit, sole), limit, sole, budget, most or EXPECTED_GROWTH * points)
 
 
 def _needs(pixels: int, training: TrainingConfig, blocks: int) -> DeviceNeeds:

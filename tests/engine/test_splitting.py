@@ -91,6 +91,25 @@ def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, sta
         assert bool((tree.assign(means) == block).all())
 
 
+def test_a_block_that_is_alone_may_be_larger_until_it_is_cut(tmp_path, views, photos, start):
+    options = {"blocks": 1, "steps": 50, "density": GROWING, "block_limit": 90, "warmup": 0.0}
+    coordinator = make_coordinator(tmp_path, start, views, **options, sole_limit=200)
+    largest = {True: 0, False: 0}
+    while not coordinator.finished:
+        alone = coordinator.scene.tree.num_blocks == 1
+        train_step(coordinator, photos)
+        largest[alone] = max(largest[alone], len(coordinator.params["means"]))
+    assert 0.75 * 200 < largest[True] <= 200
+    assert 0 < largest[False] <= 90
+
+
+def test_a_block_that_has_room_is_not_cut(tmp_path, views, photos, start):
+    options = {"blocks": 1, "steps": 30, "density": GROWING, "block_limit": 20, "warmup": 0.0}
+    coordinator = make_coordinator(tmp_path, start, views, **options, sole_limit=10**6)
+    train(coordinator, photos)
+    assert coordinator.scene.tree.num_blocks == 1
+
+
 def test_a_run_that_was_cut_resumes_bit_for_bit(tmp_path, views, photos, start):
     options = {"blocks": 2, "steps": 50, "density": GROWING, "block_limit": 110, "warmup": 0.0}
     whole, halves = tmp_path / "whole", tmp_path / "halves"

@@ -15,16 +15,26 @@ PIXELS = 1297 * 840
 @pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
 @pytest.mark.parametrize("gb", [3, 8, 24, 80])
 def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
-    room = find_room(gb * GB, pixels=PIXELS, gaussians=gaussians, training=TRAINING)
-    needs = DeviceNeeds(PIXELS, 1 if room.blocks == 1 else 4)
-    assert needs.bytes_for(room.limit) <= gb * GB < needs.bytes_for(room.limit + 1)
-    assert gaussians <= room.blocks * FULL * room.limit
-    assert room.blocks == 1 or gaussians > (room.blocks - 1) * FULL * room.limit
+    room = find_room(gb * GB, pixels=PIXELS, points=gaussians, training=TRAINING)
+    for limit, views in ((room.sole, 1), (room.limit, 4)):
+        needs = DeviceNeeds(PIXELS, views)
+        assert needs.bytes_for(limit) <= gb * GB < needs.bytes_for(limit + 1)
+    assert (room.blocks == 1) == (gaussians <= FULL * room.sole)
+    if room.blocks > 1:
+        assert gaussians <= room.blocks * FULL * room.limit
+        assert room.blocks == 2 or gaussians > (room.blocks - 1) * FULL * room.limit
 
 
 def test_a_scene_that_fits_is_one_block():
-    assert find_room(24 * GB, pixels=PIXELS, gaussians=2_000_000, training=TRAINING).blocks == 1
-    assert find_room(24 * GB, pixels=PIXELS, gaussians=200_000_000, training=TRAINING).blocks > 10
+    def room(points, most=None):
+        return find_room(24 * GB, pixels=PIXELS, points=points, most=most, training=TRAINING)
+
+    assert room(2_000_000).blocks == 1
+    assert room(200_000_000).blocks > 10
+    # What it may become is no reason to cut it now; what it may not become is none either.
+    assert room(2_000_000, most=100_000_000).blocks == 1
+    assert room(2_000_000, most=100_000_000).blocks_at_the_end > 10
+    assert room(200_000_000, most=2_000_000).blocks == 1
 
 
 def test_a_budget_too_small_for_any_block_names_the_least():

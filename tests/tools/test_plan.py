@@ -56,13 +56,13 @@ def test_a_device_budget_decides_how_many_blocks():
         forecast(capture(), Wanted(max_gaussians=3_000_000, device_budget_gb=gb), Console(quiet=True))
         for gb in (40, 3)
     )
-    assert few.room.blocks == 1
-    assert many.room.blocks > 2
+    assert few.room.blocks_at_the_end == few.room.blocks == many.room.blocks == 1
+    assert many.room.blocks_at_the_end > 2
     assert sum(share.nbytes for share in many.device) <= 3 * GB
 
 
 def test_disk_holds_two_generations_and_a_checkpoint():
-    room = Room(blocks=1, limit=10**9, budget=GB, gaussians=1000)
+    room = Room(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000)
     needs = DeviceNeeds(100, 1)
     assert sum(share.nbytes for share in disk_shares(room, needs)) == 1000 * 236 * (2 * 3 + 1)
     assert device_shares(room, needs)[0].nbytes == 1000 * needs.gaussian_bytes
@@ -71,13 +71,13 @@ def test_disk_holds_two_generations_and_a_checkpoint():
 @pytest.mark.parametrize("where", ["device", "ram", "disk"])
 def test_what_does_not_fit_is_said_with_what_to_do(where):
     shares = {"device": FITS, "ram": FITS, "disk": FITS, where: (Share("too much", 2**60),)}
-    (line,) = warnings_of(Room(2, 100, GB, 100), (5, 5), **shares)
+    (line,) = warnings_of(Room(2, 100, 100, GB, 100), (5, 5), **shares)
     assert {"device": "on the device", "ram": "of RAM", "disk": "of disk"}[where] in line
     assert ": " in line
 
 
 def test_blocks_that_hardly_any_view_sees_are_counted():
-    (line,) = warnings_of(Room(3, 100, GB, 100), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
+    (line,) = warnings_of(Room(3, 100, 100, GB, 100), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
     assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
 
 

@@ -28,7 +28,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.plugin.config import AbcdDataManagerConfig
 from abcd_ns.plugin.data.photos import default_budget
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
-from abcd_ns.plugin.room import EXPECTED_GROWTH, GB, Room, device_budget, find_room
+from abcd_ns.plugin.room import GB, Room, device_budget, find_room
 from abcd_ns.plugin.views import views_of
 from abcd_ns.tools.plan.forecast import (
     Forecast,
@@ -140,7 +140,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     room = find_room(
         device_budget(wanted.device_budget_gb, device),
         pixels=pixels,
-        gaussians=wanted.max_gaussians or EXPECTED_GROWTH * len(points),
+        points=len(points),
+        most=wanted.max_gaussians or None,
         training=training,
     )
     room = replace(room, blocks=wanted.blocks or room.blocks)
@@ -206,6 +207,11 @@ def print_forecast(found: Forecast, console: Console) -> None:
     """Tables for people."""
     room = found.room
     console.print(f"[bold]{room.in_words()}[/]", highlight=False)
+    if room.blocks_at_the_end > room.blocks:
+        console.print(
+            f"In the end {room.blocks_at_the_end} blocks, if {room.gaussians:,} Gaussians come of it.",
+            highlight=False,
+        )
     if room.blocks > 1:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for title in ("by block", "least", "median", "most"):

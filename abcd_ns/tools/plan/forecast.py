@@ -56,7 +56,7 @@ class Forecast:
     @property
     def hours(self) -> tuple[float, float]:
         """Of the whole run: with as many Gaussians as points, and with as many as are expected."""
-        layers = 1 + LAYER_SHARE * (self.room.blocks > 1)
+        layers = 1 + LAYER_SHARE * (self.room.blocks_at_the_end > 1)
         low = self.steps * self.seconds_per_step * layers / 3600
         return low, low * max(self.room.gaussians / max(self.points, 1), 1.0)
 
@@ -79,7 +79,8 @@ def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple
 
 def device_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
     """What a visit to a block of the expected size takes on the device."""
-    largest = min(-(-room.gaussians // room.blocks), room.limit)
+    limit = room.sole if room.blocks == 1 else room.limit
+    largest = min(-(-room.gaussians // room.blocks), limit)
     trained = largest * needs.gaussian_bytes
     return (
         Share(f"a block of {largest:,} Gaussians in training", trained),
@@ -100,7 +101,7 @@ def ram_shares(room: Room, needs: DeviceNeeds, photo_bytes: int, photo_budget: i
 def disk_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
     """What a run leaves and holds on disk."""
     scene = room.gaussians * needs.parameter_bytes
-    layers = LAYER_CACHE_BYTES if room.blocks > 1 else 0
+    layers = LAYER_CACHE_BYTES if room.blocks_at_the_end > 1 else 0
     return (
         Share("blocks with their optimiser's state", GENERATIONS * STATES * scene),
         Share("checkpoint", scene),

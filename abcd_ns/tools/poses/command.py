@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
+import pycolmap
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -105,8 +106,6 @@ def _photos(data: Path) -> tuple[Path, tuple[str, ...]]:
 
 
 def _check_lens(lens: str) -> None:
-    import pycolmap  # slow to import
-
     if lens not in pycolmap.CameraModelId.__members__ or lens == "INVALID":
         known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
         raise UserError(f"--lens {lens} is no camera model of COLMAP's: {known}.")
