@@ -41,13 +41,13 @@ class Args:
     """A data set, at full size."""
     out: Path
     """Folder for the run, `day.json` and the chart; must not exist."""
-    steps: int = 1600
+    steps: int = 500
     """Of the whole run."""
-    device_budget_gb: float = 1.15
+    device_budget_gb: float = 0.985
     """`--pipeline.device-budget-gb`: decides the number of blocks."""
     ram_budget_gb: float = 0.5
     """`--pipeline.ram-budget-gb`: what may be kept at hand. Programs and a step's own work come on top."""
-    max_gaussians: int = 200_000
+    max_gaussians: int = 120_000
     """`--pipeline.training.density.max-gaussians`."""
     ram_limit_gb: float = 2.0
     """What no process may ever exceed for the day to be a good one."""
