@@ -41,9 +41,9 @@ class Args:
     """A data set, at full size."""
     out: Path
     """Folder for the run, `day.json` and the chart; must not exist."""
-    steps: int = 500
+    steps: int = 900
     """Of the whole run."""
-    device_budget_gb: float = 0.985
+    device_budget_gb: float = 0.611
     """`--pipeline.device-budget-gb`: decides the number of blocks."""
     ram_budget_gb: float = 0.5
     """`--pipeline.ram-budget-gb`: what may be kept at hand. Programs and a step's own work come on top."""
@@ -95,6 +95,7 @@ class Day:
         words = ["ns-train", "abcd", "--data", self.args.data, "--output-dir", self.out, "--timestamp", "run"]
         words += ["--max-num-iterations", self.args.steps, "--vis", "tensorboard", "--steps-per-save", 500]
         words += ["--pipeline.device-budget-gb", self.args.device_budget_gb]
+        words += ["--pipeline.training.batch", 1]  # on so small a device
         words += ["--pipeline.ram-budget-gb", self.args.ram_budget_gb]
         words += ["--pipeline.training.density.max-gaussians", self.args.max_gaussians]
         if self.processes:
