@@ -67,7 +67,7 @@ def stability(
     chosen = choose(only, known)
     wanted = () if only or quick else studies()
     began = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    made = (shlex.join(["abcd", *sys.argv[1:]]), describe_machine(), describe_versions())
+    made = (_command(data, out), describe_machine(), describe_versions())
     paths: list[Path] = []
 
     def keep(outcomes: Sequence[Outcome], curves: Sequence[Curve]) -> None:
@@ -81,6 +81,12 @@ def stability(
         console.print(str(path), highlight=False, markup=False, soft_wrap=True)
     console.print(headline(outcomes), highlight=False, soft_wrap=True)
     return 0 if all(outcome.passed for outcome in outcomes) else 1
+
+
+def _command(data: Path | None, out: Path) -> str:
+    """The command line that was typed, with the names of folders instead of where they are."""
+    names = {str(path): path.resolve().name for path in (data, out) if path is not None}
+    return shlex.join(["abcd", *(names.get(word, word) for word in sys.argv[1:])])
 
 
 def choose(only: Sequence[str], known: dict[str, Scenario]) -> list[Scenario]:
