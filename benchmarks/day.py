@@ -151,10 +151,10 @@ class Day:
 
 
 @in_style
-def draw(day: Day, out: Path) -> None:
-    """RAM over the day, with the kills."""
-    figure, axes = plt.subplots(figsize=(7.0, 3.2))
-    for number, process in enumerate(day.processes):
+def draw(processes: list[Process], limit: float, out: Path) -> None:
+    """RAM over the day, with the kills; `limit` is in GB."""
+    figure, axes = plt.subplots(figsize=(7.0, 3.4), layout="constrained")
+    for number, process in enumerate(processes):
         times = [seconds / 60 for seconds, _ in process.rss]
         axes.fill_between(times, [used / GB for _, used in process.rss], color=f"C{number % 3}", alpha=0.75)
         if process.killed_at_step is not None:
@@ -168,8 +168,8 @@ def draw(day: Day, out: Path) -> None:
                 ha="right",
                 va="top",
             )
-    axes.axhline(day.args.ram_limit_gb, color="black", linestyle="--", linewidth=1)
-    axes.set(xlabel="minutes", ylabel="RAM of the process (GB)", ylim=(0, 1.25 * day.args.ram_limit_gb))
+    axes.axhline(limit, color="black", linestyle="--", linewidth=1)
+    axes.set(xlabel="minutes", ylabel="RAM of the process (GB)", ylim=(0, 1.25 * limit))
     save(figure, out, "day")
 
 
@@ -209,7 +209,7 @@ def main(args: Args) -> int:
     found["args"]["data"] = args.data.name
     found["args"]["out"] = args.out.name
     (args.out / "day.json").write_text(json.dumps(found, indent=1) + "\n")
-    draw(day, args.out)
+    draw(day.processes, args.ram_limit_gb, args.out)
     shutil.copy(day.run / "abcd" / "log.jsonl", args.out / "log.jsonl")
     good = last.exit_code == 0 and bool(scores) and peak <= args.ram_limit_gb * GB
     psnr = scores.get("psnr", float("nan"))

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import psutil
 import torch
@@ -60,8 +60,8 @@ class RunLog:
     The log is a by-product: if the disk refuses it, that is said once, and the training goes on.
 
     Args:
-        path: of a new log; its folder must exist.
-        earlier: the log of the run that this one goes on from, as far as that is its past.
+        path: of the log; its folder must exist.
+        earlier: the log of the run that this one goes on from, as far as that is its past; may be the same.
     """
 
     def __init__(
@@ -71,7 +71,9 @@ class RunLog:
         self._path: Path | None = path
         self._psnrs: list[float] = []
         self._visit_psnrs: list[float] = []
-        self._lines: list[str] = [] if earlier is None else past_of(coordinator, earlier)
+        self._lines: list[str] = []
+        if earlier is not None:
+            self._write(past_of(coordinator, earlier), "w")
         self._sampled = coordinator.stopwatch.seconds
         budgets = {meter.name: meter.budget for meter in self._meters}
         limit, blocks = coordinator.config.density.limit, coordinator.scene.tree.num_blocks
@@ -153,10 +155,13 @@ class RunLog:
 
     def _flush(self) -> None:
         lines, self._lines = self._lines, []
+        self._write(lines, "a")
+
+    def _write(self, lines: Sequence[str], mode: Literal["w", "a"]) -> None:
         if self._path is None:
             return
         try:
-            with open(self._path, "a", encoding="utf-8") as file:
+            with open(self._path, mode, encoding="utf-8") as file:
                 file.writelines(f"{line}\n" for line in lines)
         except OSError as error:
             what = f"{self._path} cannot be written ({error.strerror}); the run's log ends here."

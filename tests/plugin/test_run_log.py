@@ -149,6 +149,23 @@ def test_a_torn_or_foreign_past_is_kept_as_far_as_it_can_be_read(tmp_path):
     assert [line["step"] for line in lines_of(tmp_path / "without.jsonl")] == [5]
 
 
+def test_a_run_that_goes_on_in_its_own_folder_tells_its_past_once(tmp_path):
+    path, steps = tmp_path / "log.jsonl", 0
+    log = RunLog(FakeCoordinator(), path)
+    for _ in range(3):
+        coordinator = FakeCoordinator(step=steps, seconds=float(steps))
+        if steps:
+            log = RunLog(coordinator, path, earlier=path)
+        take_steps(log, coordinator, 4, seconds=1.0)
+        log.close()
+        steps = coordinator.state.step
+    lines = lines_of(path)
+    assert [line["step"] for line in lines if line["kind"] == "training"] == [0, 4, 8]
+    samples = [line["step"] for line in lines if line["kind"] == "sample"]
+    assert samples == sorted(samples)
+    assert len({json.dumps(line) for line in lines}) == len(lines)
+
+
 def test_a_visit_that_began_after_the_checkpoint_is_not_told_twice(tmp_path):
     past = FakeCoordinator()
     log = RunLog(past, tmp_path / "old.jsonl")

@@ -127,9 +127,11 @@ def _with_bars(task: Task, console: Console) -> Model | None:
             bars.update(bar, total=progress.total, completed=progress.done)
 
         try:
-            return find_poses(task, show)
+            found = find_poses(task, show)
         except MappingFailed as error:
             raise UserError(f"pycolmap could not find poses: {error}.") from None
+        bars.update(shown[Stage.POSES], completed=len(found.posed) if found else 0)
+        return found
 
 
 def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) -> int:
