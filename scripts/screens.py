@@ -40,7 +40,7 @@ class Args:
 
 def screen(name: str, words: list[str], folder: Path) -> None:
     """What a command prints, as docs/images/NAME.svg."""
-    settings = {"COLUMNS": str(COLUMNS), "FORCE_COLOR": "1", "TERM": "xterm-256color"}
+    settings = {"COLUMNS": str(COLUMNS), "FORCE_COLOR": "1", "TTY_INTERACTIVE": "0", "TERM": "xterm-256color"}
     done = subprocess.run(
         [str(BIN / words[0]), *words[1:]],
         cwd=folder,
