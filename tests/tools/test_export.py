@@ -148,3 +148,17 @@ def test_a_run_in_its_warm_up_has_nothing_to_show_yet(run, tmp_path):
         store.commit({}, state={})
     with pytest.raises(UserError, match="warm-up"):
         export(run, out=tmp_path / "new.ply")
+
+
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_shard_that_is_damaged_or_gone_is_one_line(run, tmp_path, gone):
+    shard = sorted((run / "abcd/store").glob("*.safetensors"))[1]
+    if gone:
+        shard.unlink()
+    else:
+        content = bytearray(shard.read_bytes())
+        content[-9] ^= 1
+        shard.write_bytes(content)
+    with pytest.raises(UserError, match="If the run is training, wait"):
+        export(run, out=tmp_path / "new.ply")
+    assert not (tmp_path / "new.ply").exists()

@@ -3,34 +3,27 @@
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 import tyro
-from jaxtyping import Bool
 from rich.console import Console
 from rich.progress import track
-from torch import Tensor
 
 from abcd_ns import __version__
-from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.frames import Frame
-from abcd_ns.engine.rasterizer.splat_kernels import MIN_ALPHA
-from abcd_ns.engine.run_state import RunState
 from abcd_ns.engine.storage import ParameterStore, StoreError
-from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.run_folder import STATE, STORE
 from abcd_ns.tools.export.ply import ply_file
+from abcd_ns.tools.export.shown import Box, Shown
 
 TRANSFORMS = "dataparser_transforms.json"
 """nerfstudio's file that tells how the data's frame became the run's."""
 LOST_DIGITS = 1e-4
 """A rounding error that is worth a word: this share of the scene's size."""
-
-Box = tuple[float, float, float, float, float, float]
 
 
 def export(
@@ -48,8 +41,8 @@ def export(
 
     abcd export outputs/garden/abcd/TIME --out parts --by-block
 
-    Reads the blocks at rest, one at a time, so that no scene is too large; also of a run that is training
-    or was stopped. Gaussians that no rasterizer draws, being too transparent, are left out.
+    Reads the blocks at rest, one at a time, so that no scene is too large; also of a run that was stopped or
+    killed. Gaussians that no rasterizer draws, being too transparent, are left out.
 
     Args:
         run: A run's folder, outputs/SCENE/METHOD/TIME.
@@ -64,75 +57,19 @@ def export(
     """
     _check(out, box)
     to = _to_data(run) if frame == "data" else None
-    with _open(run / STATE / STORE) as store:
-        scene = Shown(store, to, box)
-        counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
-        if not sum(counts.values()):
-            raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
-        try:
+    try:
+        with _open(run / STATE / STORE) as store:
+            scene = Shown(store, to, box)
+            counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
+            if not sum(counts.values()):
+                raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
             written = _write_parts(scene, counts, out) if by_block else _write(scene, counts, out)
-        except OSError as error:
-            raise UserError(f"{out} cannot be written: {error.strerror}.") from None
+    except StoreError as error:
+        raise UserError(f"{error} If the run is training, wait until it has ended.") from None
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
     _report(written, counts, scene)
     return 0
-
-
-@dataclass
-class Shown:
-    """The Gaussians of a store that are to be written.
-
-    Args:
-        to: the frame to write them in; None is their own.
-        box: which to keep, in that frame.
-    """
-
-    store: ParameterStore
-    to: Frame | None
-    box: Box | None
-
-    def __post_init__(self) -> None:
-        state = RunState.from_json(self.store.state) if self.store.state else None
-        if state is None or (state.active is not None and state.active.is_whole):
-            raise UserError(
-                f"{self.store.folder}: no block has been trained yet. Wait until the warm-up is over, or use "
-                "`ns-export gaussian-splat` on a checkpoint."
-            )
-        self.blocks = range(BlockTree.from_json(self.store.header["tree"]).num_blocks)
-        self.largest, self.size = 0.0, 0.0
-
-    @property
-    def sh_degree(self) -> int:
-        """Of all its Gaussians."""
-        block = next(block for block in self.blocks if self.store.counts(block))
-        return Gaussians(**self.store.load_names(block, PARAM_NAMES)).sh_degree
-
-    def count(self, block: int) -> int:
-        """How many of the block's Gaussians are to be written."""
-        if self.store.counts(block) == 0:
-            return 0
-        found = self.store.load_names(block, ("means", "opacities"))
-        return int(self._kept(self._placed(found["means"]), found["opacities"]).sum())
-
-    def gaussians(self, block: int) -> Gaussians:
-        """Those Gaussians."""
-        found = Gaussians(**self.store.load_names(block, PARAM_NAMES))
-        found = found[self._kept(self._placed(found.means), found.opacities)]
-        if self.to is None or not len(found):
-            return found
-        exact = self.to.points(found.means)
-        self.largest = max(self.largest, float(exact.abs().max()))
-        self.size = max(self.size, float((exact.amax(0) - exact.amin(0)).max()))
-        return self.to.gaussians(found)
-
-    def _placed(self, means: Tensor) -> Tensor:
-        return means.double() if self.to is None else self.to.points(means)
-
-    def _kept(self, means: Tensor, opacities: Tensor) -> Bool[Tensor, "n"]:
-        kept = torch.sigmoid(opacities[:, 0]) >= MIN_ALPHA
-        if self.box is not None:
-            low, high = means.new_tensor(self.box[:3]), means.new_tensor(self.box[3:])
-            kept &= ((means >= low) & (means < high)).all(dim=1)
-        return kept
 
 
 def _check(out: Path, box: Box | None) -> None:
@@ -162,10 +99,7 @@ def _to_data(run: Path) -> Frame:
 def _open(folder: Path) -> ParameterStore:
     if not folder.is_dir():
         raise UserError(f"There is no run of ABCD in {folder.parent.parent}: it has no {folder}.")
-    try:
-        return ParameterStore.open(folder, read_only=True)
-    except StoreError as error:
-        raise UserError(str(error)) from None
+    return ParameterStore.open(folder, read_only=True)
 
 
 def _write(scene: Shown, counts: dict[int, int], out: Path) -> list[Path]:
