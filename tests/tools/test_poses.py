@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.poses import mapping
+from abcd_ns.tools.poses import command, mapping
 from abcd_ns.tools.poses.command import poses
 from tests.plugin.dataparser_scenes import parser
 
@@ -103,7 +103,7 @@ def test_photos_that_show_nothing_are_refused_and_nothing_is_left(tmp_path):
 
 
 def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
-    monkeypatch.setattr(mapping, "find_poses", None)
+    monkeypatch.setattr(command, "find_poses", None)
     with pytest.raises(UserError, match="put the photos there"):
         poses(tmp_path)
     write_blank(tmp_path, 2)

@@ -1,8 +1,10 @@
 """Structure from motion by pycolmap, in a process of its own, step by step."""
 
 import multiprocessing
+import sqlite3
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass
 from enum import IntEnum
 from multiprocessing.sharedctypes import Synchronized
@@ -112,12 +114,18 @@ def _progress(task: Task, stage: Stage, posed: int) -> Progress:
     photos = len(task.names)
     if stage == Stage.POSES:
         return Progress(stage, posed, photos)
-    if not task.database.exists():
-        return Progress(stage, 0, photos)
-    with pycolmap.Database.open(task.database) as database:
-        if stage == Stage.FEATURES:
-            return Progress(stage, database.num_images(), photos)
-        return Progress(stage, database.num_matched_image_pairs(), task.pairs)
+    if stage == Stage.FEATURES:
+        return Progress(stage, _rows(task.database, "images"), photos)
+    return Progress(stage, _rows(task.database, "matches"), task.pairs)
+
+
+def _rows(database: Path, table: Literal["images", "matches"]) -> int:
+    """Of a database that another process is writing; 0 where it cannot be read just now."""
+    try:
+        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as reader:
+            return reader.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+    except sqlite3.Error:
+        return 0
 
 
 _shared: list[Synchronized] = []
@@ -160,13 +168,13 @@ def _best_model(task: Task, posed: Synchronized) -> Model | None:
     """The model of most photos, over the focal lengths to begin with."""
     best: Model | None = None
     for factor in FOCAL_FACTORS:
-        if not _begin_with(task, factor) and best is not None:
-            break  # EXIF tells all focal lengths: nothing to try
+        guessed = _begin_with(task, factor)
         posed.value = 0
         found = _map(task, task.work / f"models-{factor:g}", posed)
         if found is not None and (best is None or len(found.posed) > len(best.posed)):
             best = found
-        if best is not None and len(best.posed) >= ENOUGH * len(task.names):
+        enough = best is not None and len(best.posed) >= ENOUGH * len(task.names)
+        if enough or not guessed:  # another start changes nothing where EXIF tells all focal lengths
             break
     return best
 
