@@ -60,6 +60,8 @@ def cut_at_rest(scene: StoredScene, state: RunState, limit: int, sole: int = 0) 
             continue
         large = {block: BlockState.from_tensors(*scene.store.load(block))}
         tree, parts, parents = split_full(scene.tree, large, limit, sole)
+        if not parents:
+            continue
         for new, parent in parents.items():
             state.inherit(new, parent)
         scene.rest(tree, {number: part.to_tensors() for number, part in parts.items()}, state.to_json())

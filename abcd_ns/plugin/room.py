@@ -76,8 +76,8 @@ def check_room(budget: int, pixels: int, training: TrainingConfig) -> None:
     if needs.block_limit(budget) < LEAST_BLOCK:
         raise UserError(
             f"--pipeline.device-budget-gb {budget / GB:.2f} is too little for images of {pixels:,} px: give "
-            f"{needs.bytes_for(LEAST_BLOCK) / GB:.2f} or more, or smaller images by --pipeline.datamanager."
-            "dataparser.downscale-factor."
+            f"{needs.bytes_for(LEAST_BLOCK) / GB:.2f} or more, one view in a step by --pipeline.training."
+            "batch 1, or smaller images by --pipeline.datamanager.dataparser.downscale-factor."
         )
 
 

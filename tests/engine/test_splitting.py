@@ -131,6 +131,16 @@ def test_a_run_that_was_cut_resumes_bit_for_bit(tmp_path, views, photos, start):
         assert torch.equal(a, b)
 
 
+def test_what_need_not_be_cut_is_not_written_again(tmp_path, views, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=1)
+    scene, store = coordinator.scene, coordinator.scene.store
+    generation = store.generation
+    cut_at_rest(scene, RunState(), limit=20, sole=10**6)
+    assert (store.generation, scene.tree.num_blocks) == (generation, 1)
+    cut_at_rest(scene, RunState(), limit=20)
+    assert scene.tree.num_blocks > 1
+
+
 def test_a_run_goes_on_with_a_smaller_limit(tmp_path, views, photos, start):
     options = {"blocks": 2, "steps": 30, "density": DensityConfig(strategy="off"), "warmup": 0.0}
     first = make_coordinator(tmp_path, start, views, **options)
