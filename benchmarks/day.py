@@ -7,7 +7,6 @@ each process is looked at five times a second.
 """
 
 import json
-import platform
 import random
 import shutil
 import signal
@@ -26,6 +25,7 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.plugin.machine import describe_machine, describe_versions
 from abcd_ns.tools.runs.style import in_style, save
 
 BIN = Path(sys.executable).parent
@@ -100,12 +100,11 @@ class Day:
         words += ["--pipeline.training.density.max-gaussians", self.args.max_gaussians]
         if self.processes:
             words += ["--load-dir", self.run]
-        lines_before = len(self.log())
         process = self._watch(words, lambda: kill_at is not None and self.step() >= kill_at)
         if process.exit_code == -signal.SIGKILL:
             process.killed_at_step = self.step()
         begun = [line["step"] for line in self.log() if line["kind"] == "training"]
-        process.first_step = begun[-1] if len(self.log()) != lines_before and begun else None
+        process.first_step = begun[-1] if begun else None
         return process
 
     def evaluate(self) -> dict[str, Any]:
@@ -118,7 +117,9 @@ class Day:
     def log(self) -> list[dict[str, Any]]:
         """The run's log so far."""
         path = self.run / "abcd" / "log.jsonl"
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        # The last one may be half written.
+        return [json.loads(line) for line in lines if line.endswith("\n")]
 
     def step(self) -> int:
         """The last one that the log tells of."""
@@ -196,7 +197,9 @@ def main(args: Args) -> int:
         "args": {
             name: str(value) if isinstance(value, Path) else value for name, value in vars(args).items()
         },
-        "machine": f"{platform.machine()}, {psutil.cpu_count()} cores, {date.today()}",
+        "machine": asdict(describe_machine()),
+        "versions": asdict(describe_versions()),
+        "date": date.today().isoformat(),
         "blocks": blocks_over_time(day.log()),
         "gaussians": ended[-1]["gaussians"] if ended else None,
         "steps": day.step(),
