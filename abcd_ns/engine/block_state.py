@@ -24,6 +24,8 @@ class Clocks:
     """Visits that have ended."""
     resets: int = 0
     """Times that its opacities were due to be reset, and were."""
+    refined: int = 0
+    """`steps` when it was last refined."""
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,9 @@ class TrainingConfig:
     batch: int = 0
     """Views drawn in one step; learning rates grow with its square root. 0 takes 1 where the scene is one
     block, which is 3DGS, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
+    processes: int = 0
+    """Processes that share the views of a step where there is no GPU; 0 takes as many as torch has threads,
+    `batch` at most. Rounding depends on it."""
     influence_share: float = 0.98
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
@@ -82,6 +85,11 @@ class TrainingConfig:
     """Of the order of blocks and views, backgrounds and splits."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
+
+    @property
+    def shares_steps(self) -> bool:
+        """Whether a step's views may be shared out: not where `exact` and `overlap` go their own ways."""
+        return not self.exact and self.overlap == 0
 
     def room(self, scene: int, block: int, blocks: int) -> int | None:
         """Gaussians that may be added to a block of so many in a scene of so many and of so many blocks; None

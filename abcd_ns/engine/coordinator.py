@@ -6,8 +6,9 @@ everything else at rest in the store, and tells its listeners what happens.
 """
 
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -17,7 +18,8 @@ from abcd_ns.engine.batch import Batch, Rendered, Sample, background
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
-from abcd_ns.engine.density import DensityClock, DensityControl, Infos, for_blocks
+from abcd_ns.engine.crew import Crew
+from abcd_ns.engine.density import DensityClock, DensityControl, Infos, added, for_blocks
 from abcd_ns.engine.events import (
     Announcer,
     BlockSplit,
@@ -28,6 +30,8 @@ from abcd_ns.engine.events import (
     VisitEnded,
 )
 from abcd_ns.engine.health import Health
+from abcd_ns.engine.health_rules import share_of_picture
+from abcd_ns.engine.helper_process import can_fork
 from abcd_ns.engine.influence import influence, share_shown
 from abcd_ns.engine.memory import check_room
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
@@ -41,13 +45,16 @@ from abcd_ns.engine.schedule import (
     endless_order,
     exponential_decay,
     sh_degree_at,
+    size_of_crew,
     view_order,
+    views_of_member,
     views_per_step,
 )
 from abcd_ns.engine.settle import at_rest, count_at_rest, had_reserve, has_reserve, settle
+from abcd_ns.engine.share import DrawShare, Share, Target, Task, share_of
 from abcd_ns.engine.splitting import split_full
 from abcd_ns.engine.storage import LayerCache, crash_points
-from abcd_ns.engine.types import View
+from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.engine.visit import AT_HAND_BYTES, VisitLayers
 
 
@@ -60,6 +67,8 @@ class Coordinator:
             learning rates; that of the means is the one to decay from.
         scene_key: fingerprint of the capture, part of every layer's key.
         at_hand_bytes: see VisitLayers.
+        target: gives what a sample is trained on, so that helpers can share a step (see `crew`); None for
+            one process.
     """
 
     def __init__(
@@ -76,6 +85,7 @@ class Coordinator:
         scene_key: str = "",
         device: torch.device | str = "cpu",
         at_hand_bytes: int = AT_HAND_BYTES,
+        target: Callable[[Sample], Target] | None = None,
     ) -> None:
         self.config, self.budget, self.scene, self.cache = config, budget, scene, cache
         self.params, self.optimizers = params, optimizers
@@ -96,6 +106,8 @@ class Coordinator:
         self._clocks = Clocks()
         self._layers: VisitLayers | None = None
         self._order: tuple[int, ...] = ()
+        self._target = target
+        self._crew: Crew | None = None
 
     @property
     def batch(self) -> int:
@@ -130,15 +142,20 @@ class Coordinator:
         decay = exponential_decay(self.progress, 1.0, self.config.means_lr_decay)
         views = 1 if active.is_whole else self.batch
         self._pace.set(views, means_decay=decay, damping=self.health.damping)
+        if self._crew is not None:
+            task = Task(active.done, self.state.step, self._degree_drawn)
+            self._crew.begin(live_gaussians(self.params), task)
         samples = enumerate(self._next_views(active))
-        return Batch(self.state.step, tuple(self._sample(view, place) for place, view in samples))
+        step = self.state.step
+        return Batch(step, tuple(self._sample(view, place, step) for place, view in samples))
 
     def _next_views(self, active: ActiveVisit) -> tuple[int, ...]:
         if active.is_whole:
             return (endless_order(active.views, active.done, self.config.seed),)
-        return self._order[active.done * self.batch : (active.done + 1) * self.batch]
+        each = self.batch // active.crew
+        return self._order[active.done * each : (active.done + 1) * each]
 
-    def _sample(self, view: int, place: int) -> Sample:
+    def _sample(self, view: int, place: int, step: int) -> Sample:
         around = self._layers.around(view) if self._layers else None
         return Sample(
             view=self.views[view],
@@ -146,25 +163,36 @@ class Coordinator:
             layers=around and around.layers,
             near=around and around.near,
             window=around and around.window,
-            background=background(self.config, self.state.step, place).to(self.device),
+            background=background(self.config, step, place).to(self.device),
         )
+
+    @property
+    def _degree_drawn(self) -> int:
+        """The degree of spherical harmonics in this step."""
+        changes = self._active.is_whole or self.config.sh_restart
+        return self.sh_degree if changes else self._active.sh_degree
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
-        changes = self._active.is_whole or self.config.sh_restart
+        rendered = self._draw(live_gaussians(self.params), batch.samples, self._degree_drawn)
+        if not self._active.shown:
+            for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
+                self.health.see(share_of_picture(sample.layers and sample.layers.front, own))
+        return rendered
+
+    def _draw(self, gaussians: Gaussians, samples: Sequence[Sample], sh_degree: int) -> Rendered:
         rasters = self._rasterizer.draw(
-            live_gaussians(self.params),
-            [sample.shot for sample in batch.samples],
-            sh_degree=self.sh_degree if changes else self._active.sh_degree,
+            gaussians,
+            [sample.shot for sample in samples],
+            sh_degree=sh_degree,
             antialiased=self.config.antialiased,
             absgrad=self.density.absgrad,
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
+        if self._active.crew > 1:  # density control judges by gradients of the sum over all of a step's views
+            infos = tuple({**info, "n_cameras": info["n_cameras"] * self._active.crew} for info in infos)
         self.density.before_backward(infos)
-        pictures = []
-        for sample, raster in zip(batch.samples, rasters, strict=True):
-            self.health.see(sample.layers and sample.layers.front, raster.transmittance)
-            pictures.append(sample.picture(raster))
+        pictures = (sample.picture(raster) for sample, raster in zip(samples, rasters, strict=True))
         return Rendered(tuple(pictures), tuple(raster.transmittance for raster in rasters), infos)
 
     def loss(
@@ -174,18 +202,24 @@ class Coordinator:
         photos: Sequence[Float[Tensor, "_h _w 3"]],
     ) -> Float[Tensor, ""]:
         """The loss of a step: photometric over the crops, the mean of the samples', plus what the density
-        strategy asks for."""
+        strategy asks for. With helpers, all of them included."""
         triples = zip(batch.samples, pictures, photos, strict=True)
         losses = [sample.loss(picture, photo, self.config) for sample, picture, photo in triples]
-        self.health.note(tuple(sample.view.index for sample in batch.samples), losses)
-        photometric = sum(losses, start=torch.zeros((), device=self.device)) / len(batch.samples)
+        members = self._active.crew if self.state.active is not None else 1
+        photometric = sum(losses, start=torch.zeros((), device=self.device)) / (len(losses) * members)
+        known = [(s.view.index, loss.detach()) for s, loss in zip(batch.samples, losses, strict=True)]
+        if self._crew is not None:
+            photometric, drawn = photometric + self._crew.loss(), self._crew.drawn()
+            self.health.see(torch.tensor([part.shown for part in drawn]).amax())
+            known += [(view, torch.tensor(loss)) for part in drawn for view, loss in part.losses]
+        self.health.note(known)
         if self.config.density.strategy != "mcmc":
             return photometric
         return photometric + self.density.regularisation(self.params, self.count())
 
     def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
         """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done."""
-        active, taken = self._active, len(rendered.pictures)
+        active, taken = self._active, len(rendered.pictures) * self._active.crew
         self.state.step += 1
         active.done += 1
         sound = self.health.end_step()
@@ -199,13 +233,16 @@ class Coordinator:
 
     def _refine(self, infos: Infos, taken: int) -> None:
         clock = self._density_clock(taken)
+        if self._crew is not None and infos:
+            for part in self._crew.parts():
+                self._growth = added(self._growth, part.counts)
         self._growth = self.density.after_step(self.params, self.optimizers, self._growth, infos, clock)
-        if not self.health.acts:
-            return
         if self.density.resets(clock):
             self._clocks = replace(self._clocks, resets=clock.steps // self.config.density.reset_every)
         if self.density.is_due(clock):
-            self.health.hold_back_giants(view.center for view in self.views.values())
+            self._clocks = replace(self._clocks, refined=clock.steps)
+            if self.health.acts:
+                self.health.hold_back_giants(view.center for view in self.views.values())
 
     @property
     def _progress_of_blocks(self) -> float:
@@ -216,17 +253,20 @@ class Coordinator:
     def _density_clock(self, taken: int) -> DensityClock:
         active = self._active
         views = self.state.views.get(active.geometry.block, len(active.geometry.views))
-        if self.scene.tree.num_blocks > 1:
+        blocks = self.scene.tree.num_blocks
+        among_others = blocks > 1 and self.config.overlap == 0
+        if blocks > 1:
             views = min(views, active.steps * self.batch)  # once a visit, even with thousands of photos
         return DensityClock(
             progress=self._progress_of_blocks,
             steps=self._clocks.steps,
             taken=taken,
             views=views,
-            room=self.config.room(self.count(), len(self.params["means"]), self.scene.tree.num_blocks),
+            room=self.config.room(self.count(), len(self.params["means"]), blocks),
             seed=random.Random(f"density {self.config.seed} {self.state.step}").getrandbits(62),
-            resets=self._clocks.resets if self.health.acts else None,
-            may_reset=4 * active.done <= active.steps,
+            refined=self._clocks.refined if among_others else None,
+            resets=self._clocks.resets if among_others else None,
+            spent=active.done / active.steps if among_others else 0.0,
         )
 
     # -- at rest -------------------------------------------------------------------------------------
@@ -277,6 +317,7 @@ class Coordinator:
             self.state.active = self._planner.warm_up(degree, began)
         else:
             self.state.active = self._planner.next_visit(self.state, degree, began)
+            self.state.active.crew = self._size_of_crew(self.state.active)
         self.state.visit += 1
         self._attach(self.state.active)
 
@@ -295,7 +336,8 @@ class Coordinator:
         seen = len(active.geometry.views)
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
-        self._layers = self._draw_layers(active)
+        self._crew = self._gather_crew(active)
+        self._layers = self._draw_layers(active, self._order)
         active.layer_seconds += self.stopwatch.seconds - before
         if active.done == 0:
             self._measure_influence(active)
@@ -303,21 +345,56 @@ class Coordinator:
     def _measure_influence(self, active: ActiveVisit) -> None:
         """Find out how much the doubtful views show of the block by now."""
         for view in active.looked_at:
-            sample, live = self._sample(view, 0), live_gaussians(self.params)
+            sample, live = self._sample(view, 0, self.state.step), live_gaussians(self.params)
             before = sample.layers and sample.layers.front.transmittance
             self.state.influence[active.geometry.block][view] = share_shown(
                 live, self._rasterizer, sample.shot, before, antialiased=self.config.antialiased
             )
 
-    def _order_of(self, active: ActiveVisit) -> tuple[int, ...]:
-        taken = 0 if active.is_whole else active.steps * self.batch
-        return view_order(active.views, taken, active.number, self.config.seed)
+    def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:
+        taken = 0 if active.is_whole else active.steps * (self.batch // active.crew)
+        views = views_of_member(active.views, member, active.crew)
+        return view_order(views, taken, active.number, self.config.seed, member)
+
+    # -- helpers -------------------------------------------------------------------------------------
+
+    def _size_of_crew(self, active: ActiveVisit) -> int:
+        if self._target is None or not self.config.shares_steps:
+            return 1
+        threads = torch.get_num_threads() if can_fork(self.device) else 1
+        return size_of_crew(self.config.processes or threads, self.batch, len(active.views))
+
+    def _gather_crew(self, active: ActiveVisit) -> Crew | None:
+        if active.crew == 1:
+            return None
+        members = range(1, active.crew)
+        draws = [partial(self._begin_helping, active, member) for member in members]
+        return Crew(draws, live_gaussians(self.params), forks=can_fork(self.device))
+
+    def _begin_helping(self, active: ActiveVisit, member: int, in_own_process: bool) -> DrawShare:
+        """What draws a helper's shares; in its own process, which alone this changes, with layers drawn."""
+        order = self._order_of(active, member)
+        if in_own_process:
+            self.announce, self.cache = Announcer(), self.cache.beside(f"helper-{member}")
+            self._layers = self._draw_layers(active, order)
+        return partial(self._draw_share, active, member, order)
+
+    def _draw_share(
+        self, active: ActiveVisit, member: int, order: tuple[int, ...], gaussians: Gaussians, task: Task
+    ) -> Share:
+        each = self.batch // active.crew
+        views = order[task.done * each : (task.done + 1) * each]
+        samples = [self._sample(view, member * each + k, task.step) for k, view in enumerate(views)]
+        rendered = self._draw(gaussians, samples, task.sh_degree)
+        return share_of(
+            gaussians, samples, rendered, self._target, self.config, self.density, views=self.batch
+        )
 
     def _surroundings(self) -> BlockScene:
         """Where a visit's frozen blocks are drawn from."""
         return self.scene
 
-    def _draw_layers(self, active: ActiveVisit) -> VisitLayers | None:
+    def _draw_layers(self, active: ActiveVisit, order: tuple[int, ...]) -> VisitLayers | None:
         if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
             return None
         painter = Painter(
@@ -337,9 +414,9 @@ class Coordinator:
             PaintSettings(active.sh_degree, self.config.antialiased),
             window_weight=self.config.window_weight,
             scene_key=self._scene_key,
-            at_hand_bytes=self._at_hand_bytes,
+            at_hand_bytes=self._at_hand_bytes // active.crew,
         )
-        wanted = dict.fromkeys(self._order[active.done * self.batch :])
+        wanted = dict.fromkeys(order[active.done * (self.batch // active.crew) :])
         for done, _ in enumerate(layers.draw(wanted), start=1):
             self.announce(LayersDrawn(active.number, done, len(wanted)))
         return layers
@@ -360,7 +437,9 @@ class Coordinator:
         self.scene.lift()
         if self._layers is not None:
             self._layers.forget()
-        self.state.active, self._layers = None, None
+        if self._crew is not None:
+            self._crew.dismiss()
+        self.state.active, self._layers, self._crew = None, None, None
         self.state.seconds = self.stopwatch.seconds
         crash_points.reached(crash_points.VISIT_TRAINED)
         self.scene.rest(tree, {b: s.to_tensors() for b, s in updates.items()}, self.state.to_json())

@@ -5,7 +5,7 @@ the run and in the block's own steps, so it is kept in this file and the strateg
 step number they are given, either to gather statistics or to refine now.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -23,7 +23,11 @@ from abcd_ns.engine.relocation import binomials, compute_relocation, covariances
 GATHER, REFINE = 1, 6
 BEFORE_RESET, AFTER_RESET = 7, 4
 
+COUNTED = ("grad2d", "count")
+"""What the default strategy adds up for each Gaussian, under gsplat's names."""
 REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
+REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
+"""Shares of a visit after which a block among others is neither refined nor reset."""
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 
@@ -100,10 +104,13 @@ class DensityClock:
     """Gaussians that may still be added to the scene; None for no limit."""
     seed: int
     """Of the random numbers drawn in this step."""
+    refined: int | None = None
+    """`steps` when the block was last refined; None refines at the very step that it is due."""
     resets: int | None = None
     """Resets of the opacities that the block has had; None resets at the very step that one is due."""
-    may_reset: bool = True
-    """Whether enough of the visit is left for a reset to be made good before others see the block."""
+    spent: float = 0.0
+    """Share of the visit that is done, for what is left must make good what growing and resets upset before
+    others see the block; 0 where there are no others."""
 
     def reached(self, every: int) -> bool:
         """Whether `steps` has come to a multiple of `every` in this step."""
@@ -140,7 +147,12 @@ class DensityControl:
         """Whether this step refines."""
         warm = clock.steps >= self.config.warmup_passes * clock.views
         running = self.config.refine_start <= clock.progress < self.config.refine_stop
-        return warm and running and clock.reached(max(self.config.refine_every, clock.views, 1))
+        if not (warm and running):
+            return False
+        every = max(self.config.refine_every, clock.views, 1)
+        if clock.refined is None:
+            return clock.reached(every)
+        return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= every
 
     def resets(self, clock: DensityClock) -> bool:
         """Whether this step resets opacities (`default` strategy)."""
@@ -149,7 +161,24 @@ class DensityControl:
             return False
         if clock.resets is None:
             return clock.reached(every)
-        return clock.may_reset and clock.steps // every > clock.resets
+        return clock.spent <= RESET_UNTIL and clock.steps // every > clock.resets
+
+    def count(self, means: Tensor, infos: Infos) -> dict[str, Tensor]:
+        """What drawings add to a block's statistics, after backward; by name, each [n].
+
+        Args:
+            means: of the block, [n, 3].
+        """
+        if self.config.strategy != "default":
+            return {}
+        with_gradient = [info for info in infos if info["means2d"].grad is not None]
+        if not with_gradient:
+            return {}
+        strategy = DefaultStrategy(refine_every=REFINE, reset_every=BEFORE_RESET, absgrad=self.absgrad)
+        state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": 1.0}
+        for info in with_gradient:
+            strategy.step_post_backward({"means": means}, {}, state, GATHER, info)
+        return {name: state[name] for name in COUNTED}
 
     def after_step(
         self,
@@ -191,6 +220,7 @@ class DensityControl:
         infos = tuple(info for info in infos if info["means2d"].grad is not None)
         if clock.progress >= config.refine_stop or not infos:
             return growth
+        growth = added(growth, self.count(params["means"], infos))
         has_reset = 0 < config.reset_every < clock.steps
         strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
@@ -202,11 +232,9 @@ class DensityControl:
             reset_every=AFTER_RESET if has_reset else BEFORE_RESET,
             absgrad=config.use_absgrad,
         )
-        state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": 1.0, **growth}
-        for info in infos:
-            strategy.step_post_backward(params, optimizers, state, GATHER, info)
+        state: dict[str, Any] = {"scene_scale": 1.0, **growth}
         if self.is_due(clock):
-            strategy.grow_grad2d = _threshold_within(state, config.densify_grad_thresh, clock.room)
+            strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, clock.room)
             # Nothing is visible in this info, so the statistics are not gathered twice.
             unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
             strategy.step_post_backward(params, optimizers, state, REFINE, unseen)
@@ -228,9 +256,15 @@ class DensityControl:
         strategy.step_post_backward(params, optimizers, {"binoms": binomials()}, step, {}, lr=learning_rate)
 
 
-def _threshold_within(state: dict[str, Tensor], threshold: float, room: int | None) -> float:
+def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Statistics of more drawings added to a block's."""
+    sums = {name: growth[name] + value if name in growth else value for name, value in more.items()}
+    return {**growth, **sums}
+
+
+def _threshold_within(growth: dict[str, Tensor], threshold: float, room: int | None) -> float:
     """The gradient over which to grow, such that no more than `room` Gaussians are added."""
-    gradients = state["grad2d"] / state["count"].clamp_min(1)
+    gradients = growth["grad2d"] / growth["count"].clamp_min(1)
     if room is None or int((gradients > threshold).sum()) <= room:
         return threshold
     # gsplat grows where gradient > threshold, so the (room + 1)-th largest is the first that must not.

@@ -7,7 +7,7 @@ without all this: healthy tensors are read, never written.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -33,7 +33,7 @@ from abcd_ns.engine.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.settle import at_rest
-from abcd_ns.engine.types import Gaussians, Layer
+from abcd_ns.engine.types import Gaussians
 
 LEAST_DAMPING = 1 / 16
 """Of learning rates, however often a block's visits were undone."""
@@ -65,7 +65,7 @@ class Health:
         self._ledger: Ledger = {}
         self._attached: Tensor | None = None
         self._bad: Tensor | None = None
-        self._losses: tuple[tuple[int, ...], list[Tensor]] = ((), [])
+        self._losses: list[tuple[int, Tensor]] = []
         self._shares: list[Tensor] = []
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
@@ -89,22 +89,14 @@ class Health:
         self._active, self._ledger = active, ledger
         self._attached, self._bad, self._shares = self._params["means"], None, []
 
-    @torch.no_grad()
-    def see(self, before: Layer | None, own: Float[Tensor, "h w"]) -> None:
-        """Take note of how much of a picture the live block can be.
+    def see(self, share: Float[Tensor, ""]) -> None:
+        """Take note of how large a part of a picture the live block was."""
+        if self._active is not None and not self._active.shown:
+            self._shares.append(share)
 
-        Args:
-            before: the frozen layer in front of the block, if there are layers.
-            own: transmittance of the block, and of what was sorted in with it.
-        """
-        if self._active is None or self._active.shown:
-            return
-        alpha = 1 - own
-        self._shares.append((alpha if before is None else before.transmittance * alpha).mean())
-
-    def note(self, views: tuple[int, ...], losses: list[Float[Tensor, ""]]) -> None:
-        """Remember the loss of each view in this step."""
-        self._losses = (views, [loss.detach() for loss in losses]) if self.acts else ((), [])
+    def note(self, losses: Sequence[tuple[int, Float[Tensor, ""]]]) -> None:
+        """Remember the loss of each view in this step: (view, loss) pairs."""
+        self._losses = list(losses) if self.acts else []
 
     def end_step(self) -> bool:
         """Call after the optimizers stepped; whether the step's gradients were all numbers."""
@@ -244,11 +236,11 @@ class Health:
     # -- accounts ------------------------------------------------------------------------------------
 
     def _read_losses(self) -> None:
-        views, losses = self._losses
-        self._losses = ((), [])
+        losses, self._losses = self._losses, []
         if self._active is None or not losses:
             return
-        for view, loss in zip(views, torch.stack(losses).tolist(), strict=True):
+        values = torch.stack([loss for _, loss in losses]).tolist()
+        for (view, _), loss in zip(losses, values, strict=True):
             if math.isfinite(loss):
                 first = self._active.objective.get(view, [loss])[0]
                 seen = view in self._active.objective

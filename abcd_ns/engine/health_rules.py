@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import Gaussians, Layer
 
 SHOWS = 1 / 255
 """Rasterizers skip a Gaussian wherever its alpha is below this: with less opacity it is never drawn."""
@@ -21,7 +21,7 @@ GIANT_ANGLE = 0.3
 What is far away, sky for instance, may be large."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
-RISE = 0.02
+RISE = 0.1
 """A visit is undone if the loss of its views rose by more than this share ..."""
 SURE = 3.0
 """... and by more than this many standard errors: with random backgrounds losses scatter."""
@@ -35,6 +35,18 @@ def unsound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     for _, value in gaussians.items():
         bad = bad | ~torch.isfinite(value).flatten(1).all(dim=1)
     return bad
+
+
+@torch.no_grad()
+def share_of_picture(before: Layer | None, own: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """How large a part of a picture a block can be, 0..1.
+
+    Args:
+        before: the frozen layer in front of the block, if there are layers.
+        own: transmittance of the block, and of what was sorted in with it.
+    """
+    alpha = 1 - own
+    return (alpha if before is None else before.transmittance * alpha).mean()
 
 
 def stand_ins(sound: Gaussians, count: int) -> Gaussians:

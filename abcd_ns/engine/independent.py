@@ -178,7 +178,7 @@ class IndependentCoordinator(Coordinator):
         first, seed = active.done * self.batch, self.config.seed
         return tuple(endless_order(active.views, first + k, seed) for k in range(self.batch))
 
-    def _order_of(self, active: ActiveVisit) -> tuple[int, ...]:  # noqa: ARG002
+    def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:  # noqa: ARG002
         return ()  # endless: see _next_views
 
     def _density_clock(self, taken: int) -> DensityClock:

@@ -54,6 +54,11 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""
         return self.train_dataset.photos.crop(row, crop).to(self.device).float() / 255
 
+    def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
+        """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""
+        mask = self.train_dataset.photos.mask(row)
+        return None if mask is None else mask[crop.slices].to(self.device)
+
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
         """The next batch: its first camera with all of it in the metadata, and the crops of the photos."""
         if self._coordinator is None:
@@ -65,12 +70,9 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         crops = [sample.crop for sample in samples.samples]
         photos = [self.photo(row, crop) for row, crop in zip(rows, crops, strict=True)]
         batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
-        masks = [self.train_dataset.photos.mask(row) for row in rows]
+        masks = [self.mask(row, crop) for row, crop in zip(rows, crops, strict=True)]
         if any(mask is not None for mask in masks):
-            batch["mask"] = [
-                mask if mask is None else mask[crop.slices].to(self.device)
-                for mask, crop in zip(masks, crops, strict=True)
-            ]
+            batch["mask"] = masks
         return camera, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002

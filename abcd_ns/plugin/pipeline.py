@@ -10,6 +10,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from abcd_ns.engine.batch import Sample
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
@@ -22,6 +23,7 @@ from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget, RunState
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.share import Target
 from abcd_ns.engine.splitting import cut_at_rest
 from abcd_ns.engine.storage import ParameterStore, view_fingerprint
 from abcd_ns.engine.types import Gaussians, View
@@ -134,7 +136,7 @@ class AbcdPipeline(VanillaPipeline):
         store, resumed = self._open_store(folder / STORE, trainer, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
         limit, sole = self._limits(store, resumed)
-        training = replace(config.training, block_limit=limit, sole_limit=sole)
+        training = replace(config.training, block_limit=limit, sole_limit=sole, processes=self._processes())
         if resumed:
             cut_at_rest(scene, RunState.from_json(store.state), limit, sole)
         coordinator = coordinator_for(training)(
@@ -149,10 +151,22 @@ class AbcdPipeline(VanillaPipeline):
             scene_key=scene_fingerprint(self.datamanager.get_datapath(), views),
             device=self.device,
             at_hand_bytes=min(self._ram.at_hand, AT_HAND_BYTES),
+            target=self._target,
         )
         if resumed:
             coordinator.restore()
         return coordinator
+
+    def _processes(self) -> int:
+        """As asked for; where RAM is short, one, since each reads blocks for itself."""
+        asked = self.config.training.processes
+        return asked or int(self.config.ram_budget_gb > 0)
+
+    def _target(self, sample: Sample) -> Target:
+        """What a helper trains on; the training process gets the same by way of `next_train`."""
+        photo = self.datamanager.photo(sample.view.index, sample.crop)
+        wanted = self.model.composite_with_background(self.model.get_gt_img(photo), sample.background)
+        return wanted, self.datamanager.mask(sample.view.index, sample.crop)
 
     def _limits(self, store: ParameterStore, resumed: bool) -> tuple[int, int]:
         """Gaussians in a block, and in a sole one, at most: as the run began, unless it goes on with a budget

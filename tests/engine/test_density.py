@@ -94,11 +94,21 @@ def test_opacities_are_reset_on_the_blocks_own_clock_alone():
 
 def test_a_reset_waits_for_a_visit_that_can_make_it_good():
     control = DensityControl(DensityConfig(reset_every=500))
-    late, early = {"steps": 520, "may_reset": False}, {"steps": 560, "may_reset": True}
+    late, early = {"steps": 520, "spent": 0.3}, {"steps": 560, "spent": 0.2}
     assert not control.resets(clock(resets=0, **late))
     assert control.resets(clock(resets=0, **early))
     assert not control.resets(clock(resets=1, **early))
     assert not control.resets(clock(resets=0, progress=0.6, **early))
+
+
+def test_a_block_among_others_refines_early_in_its_visits_and_makes_up_for_what_it_missed():
+    control = DensityControl(DensityConfig(refine_every=30))
+    late = {"views": 20, "taken": 4, "refined": 100, "spent": 0.6}
+    assert not control.is_due(clock(steps=128, **{**late, "spent": 0.1}))
+    assert control.is_due(clock(steps=132, **{**late, "spent": 0.1}))
+    assert not control.is_due(clock(steps=132, **late))
+    assert control.is_due(clock(steps=190, **{**late, "spent": 0.0}))  # overdue: no multiple of 30 is here
+    assert not control.is_due(clock(steps=19, **{**late, "refined": 0, "spent": 0.0, "views": 40}))
 
 
 def test_giants_are_pruned_only_once_opacities_were_reset():

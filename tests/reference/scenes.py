@@ -95,6 +95,7 @@ def make_coordinator(
     cache: LayerCache | None = None,
     ram_bytes: int = 2 << 30,
     at_hand_bytes: int = AT_HAND_BYTES,
+    target: Callable | None = None,
     **training,
 ) -> Coordinator:
     """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is.
@@ -118,6 +119,7 @@ def make_coordinator(
         TorchRasterizer(compile="never"),
         *nothing_live(gaussians.sh_degree),
         at_hand_bytes=at_hand_bytes,
+        target=target,
     )
     if resume:
         coordinator.restore()

@@ -86,6 +86,7 @@ class LayerCache:
             OSError: the folder cannot be made or written to.
         """
         self.bits = bits
+        self._folder = None if folder is None else Path(folder)
         self.limit = map_size
         """Bytes that it may take."""
         self.hits = 0
@@ -97,6 +98,11 @@ class LayerCache:
         )
         self._mutex = threading.Lock()
         self._process = os.getpid()
+
+    def beside(self, name: str) -> "LayerCache":
+        """A cache for a forked process: in a folder within this one's, of the same size."""
+        folder = None if self._folder is None else self._folder / name
+        return LayerCache(folder, self.limit, self.bits)
 
     def get(self, key: LayerKey) -> Layer | None:
         """The layer under `key`, or None if it was never put, was evicted or is damaged. A hit or a miss."""
