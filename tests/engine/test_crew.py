@@ -66,7 +66,8 @@ def test_a_step_is_the_one_that_a_single_process_takes(make, photos):
     shared, alone = make("shared", batch=4, density=DensityConfig("off")), make("alone", 1, batch=4)
     batch = shared.next_batch()
     crew = shared._crew
-    assert len(batch.samples) == 2 and len(crew.pids) == 1
+    assert len(batch.samples) == 2
+    assert len(crew.pids) == 1
     rendered = shared.render(batch)
     loss = shared.loss(batch, rendered.pictures, [photos(s.view.index, s.crop) for s in batch.samples])
     loss.backward()
@@ -100,7 +101,8 @@ def test_what_density_control_counts_is_that_of_all_views(make, photos):
     drawn = alone.render(every)
     alone.loss(every, drawn.pictures, [photos(s.view.index, s.crop) for s in every.samples]).backward()
     wanted = alone.density.count(alone.params["means"], drawn.infos)
-    assert torch.equal(found["count"], wanted["count"]) and float(wanted["count"].sum()) > 0
+    assert torch.equal(found["count"], wanted["count"])
+    assert float(wanted["count"].sum()) > 0
     assert torch.allclose(found["grad2d"], wanted["grad2d"], rtol=1e-4)
     crew.dismiss()
 
@@ -114,7 +116,7 @@ def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch):
         if lost.state.step % 4 == 0 and lost._crew is not None:
             for pid in lost._crew.pids:
                 os.kill(pid, signal.SIGKILL)
-    monkeypatch.setattr("abcd_ns.engine.coordinator.can_fork", lambda device: False)
+    monkeypatch.setattr("abcd_ns.engine.coordinator.can_fork", lambda _: False)
     train(never, photos)
     assert len(whole_scene(helped)) > 60  # blocks grew
     assert equal(whole_scene(helped), whole_scene(lost))
@@ -195,7 +197,7 @@ time.sleep(600)
 
 def test_crews_share_views_fairly():
     assert [size_of_crew(p, 4, 9) for p in (1, 2, 3, 4, 16)] == [1, 2, 2, 4, 4]
-    assert size_of_crew(4, 4, 3) == 2 and size_of_crew(4, 4, 1) == 1 and size_of_crew(8, 1, 9) == 1
+    assert (size_of_crew(4, 4, 3), size_of_crew(4, 4, 1), size_of_crew(8, 1, 9)) == (2, 1, 1)
     views = (3, 5, 8, 9, 12)
     parts = [views_of_member(views, member, 2) for member in range(2)]
     assert sorted(parts[0] + parts[1]) == list(views)
