@@ -2,8 +2,9 @@
 
     python -m benchmarks.visit --data DIR --downscale 4
 
-Both runs train in this process, one after the other, by the engine alone. Stages are summed over the second
-half of each run and divided by the views that were drawn to train in it.
+The runs follow each other, by the engine alone. Stages are summed over the second half of each run and divided
+by the views that were drawn to train in it, helpers' views included; where the training process waits for its
+helpers, that is part of the loss and of backward.
 """
 
 import os
@@ -117,6 +118,7 @@ def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
         LayerCache(folder / "layers"),
         make_rasterizer("torch", "cpu"),
         *nothing_live(3),
+        target=lambda sample: (capture.photo(sample.view.index, sample.crop), None),
     )
     clock, layers = StageClock(), 0.0
 
@@ -142,6 +144,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
     """training_loop.train_step with a clock."""
     with clock.stage("plan and attach"):
         batch = coordinator.next_batch()
+    crew = coordinator.state.active.crew
     with clock.stage("photos"):
         photos = [photo(sample.view.index, sample.crop) for sample in batch.samples]
     with clock.stage("render"):
@@ -158,7 +161,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
             optimizer.step()
     with clock.stage("density and settling"):
         coordinator.after_step(rendered, mean_psnr(rendered.pictures, photos))
-    clock.views += len(batch.samples)
+    clock.views += len(batch.samples) * crew
 
 
 def main(args: Args) -> None:
