@@ -2,9 +2,9 @@
 
     python -m benchmarks.visit --data DIR --downscale 4
 
-The runs follow each other, by the engine alone. Stages are summed over the second half of each run and divided
-by the views that were drawn to train in it, helpers' views included; where the training process waits for its
-helpers, that is part of the loss and of backward.
+The runs follow each other, by the engine alone. Stages are summed over the second half of each run and
+divided by the views that were drawn to train in it, helpers' views included; where the training process
+waits for its helpers, that is part of the loss and of backward.
 """
 
 import os
