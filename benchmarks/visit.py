@@ -63,6 +63,8 @@ class Args:
     """Of the run with several."""
     seconds: float = 30.0
     """Of each run; the first half is not measured."""
+    processes: int = 0
+    """That share a step of a block; 0 as many as torch has threads."""
     seed: int = 0
     """Of the runs."""
 
@@ -111,7 +113,7 @@ def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
     keep = None if blocks == 1 else len(capture.gaussians) // blocks
     store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=args.seed))
     coordinator = Coordinator(
-        TrainingConfig(seed=args.seed),
+        TrainingConfig(seed=args.seed, processes=args.processes),
         Budget(seconds=args.seconds),
         StoredScene(tree, store),
         capture.views,
