@@ -6,15 +6,13 @@ everything else at rest in the store, and tells its listeners what happens.
 """
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.batch import Batch, Rendered, Sample, background
+from abcd_ns.engine.batch import Batch, Rendered, Sample
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig, resolve_ownership
@@ -30,8 +28,6 @@ from abcd_ns.engine.events import (
     VisitEnded,
 )
 from abcd_ns.engine.health import Health
-from abcd_ns.engine.health_rules import share_of_picture
-from abcd_ns.engine.helper_process import can_fork
 from abcd_ns.engine.influence import influence, share_shown
 from abcd_ns.engine.memory import check_room
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
@@ -45,20 +41,20 @@ from abcd_ns.engine.schedule import (
     endless_order,
     exponential_decay,
     sh_degree_at,
-    size_of_crew,
     view_order,
     views_of_member,
     views_per_step,
 )
 from abcd_ns.engine.settle import at_rest, count_at_rest, had_reserve, has_reserve, settle
-from abcd_ns.engine.share import DrawShare, Share, Target, Task, share_of
+from abcd_ns.engine.share import Target, Task
 from abcd_ns.engine.splitting import split_full
+from abcd_ns.engine.step_drawing import StepDrawing
 from abcd_ns.engine.storage import LayerCache, crash_points
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import AT_HAND_BYTES, VisitLayers
 
 
-class Coordinator:
+class Coordinator(StepDrawing):
     """Runs ABCD over a scene at rest in `store`, through the caller's live parameters and optimizers.
 
     Args:
@@ -154,68 +150,6 @@ class Coordinator:
             return (endless_order(active.views, active.done, self.config.seed),)
         each = self.batch // active.crew
         return self._order[active.done * each : (active.done + 1) * each]
-
-    def _sample(self, view: int, place: int, step: int) -> Sample:
-        around = self._layers.around(view) if self._layers else None
-        return Sample(
-            view=self.views[view],
-            crop=self._active.geometry.crops[view],
-            layers=around and around.layers,
-            near=around and around.near,
-            window=around and around.window,
-            background=background(self.config, step, place).to(self.device),
-        )
-
-    @property
-    def _degree_drawn(self) -> int:
-        """The degree of spherical harmonics in this step."""
-        changes = self._active.is_whole or self.config.sh_restart
-        return self.sh_degree if changes else self._active.sh_degree
-
-    def render(self, batch: Batch) -> Rendered:
-        """Draw the active block between its layers; differentiable in the live parameters."""
-        rendered = self._draw(live_gaussians(self.params), batch.samples, self._degree_drawn)
-        if not self._active.shown:
-            for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
-                self.health.see(share_of_picture(sample.layers and sample.layers.front, own))
-        return rendered
-
-    def _draw(self, gaussians: Gaussians, samples: Sequence[Sample], sh_degree: int) -> Rendered:
-        rasters = self._rasterizer.draw(
-            gaussians,
-            [sample.shot for sample in samples],
-            sh_degree=sh_degree,
-            antialiased=self.config.antialiased,
-            absgrad=self.density.absgrad,
-        )
-        infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
-        if self._active.crew > 1:  # density control judges by gradients of the sum over all of a step's views
-            infos = tuple({**info, "n_cameras": info["n_cameras"] * self._active.crew} for info in infos)
-        self.density.before_backward(infos)
-        pictures = (sample.picture(raster) for sample, raster in zip(samples, rasters, strict=True))
-        return Rendered(tuple(pictures), tuple(raster.transmittance for raster in rasters), infos)
-
-    def loss(
-        self,
-        batch: Batch,
-        pictures: Sequence[Float[Tensor, "_h _w 3"]],
-        photos: Sequence[Float[Tensor, "_h _w 3"]],
-    ) -> Float[Tensor, ""]:
-        """The loss of a step: photometric over the crops, the mean of the samples', plus what the density
-        strategy asks for. With helpers, all of them included."""
-        triples = zip(batch.samples, pictures, photos, strict=True)
-        losses = [sample.loss(picture, photo, self.config) for sample, picture, photo in triples]
-        members = self._active.crew if self.state.active is not None else 1
-        photometric = sum(losses, start=torch.zeros((), device=self.device)) / (len(losses) * members)
-        known = [(s.view.index, loss.detach()) for s, loss in zip(batch.samples, losses, strict=True)]
-        if self._crew is not None:
-            photometric, drawn = photometric + self._crew.loss(), self._crew.drawn()
-            self.health.see(torch.tensor([part.shown for part in drawn]).amax())
-            known += [(view, torch.tensor(loss)) for part in drawn for view, loss in part.losses]
-        self.health.note(known)
-        if self.config.density.strategy != "mcmc":
-            return photometric
-        return photometric + self.density.regularisation(self.params, self.count())
 
     def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
         """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done."""
@@ -355,40 +289,6 @@ class Coordinator:
         taken = 0 if active.is_whole else active.steps * (self.batch // active.crew)
         views = views_of_member(active.views, member, active.crew)
         return view_order(views, taken, active.number, self.config.seed, member)
-
-    # -- helpers -------------------------------------------------------------------------------------
-
-    def _size_of_crew(self, active: ActiveVisit) -> int:
-        if self._target is None or not self.config.shares_steps:
-            return 1
-        threads = torch.get_num_threads() if can_fork(self.device) else 1
-        return size_of_crew(self.config.processes or threads, self.batch, len(active.views))
-
-    def _gather_crew(self, active: ActiveVisit) -> Crew | None:
-        if active.crew == 1:
-            return None
-        members = range(1, active.crew)
-        draws = [partial(self._begin_helping, active, member) for member in members]
-        return Crew(draws, live_gaussians(self.params), forks=can_fork(self.device))
-
-    def _begin_helping(self, active: ActiveVisit, member: int, in_own_process: bool) -> DrawShare:
-        """What draws a helper's shares; in its own process, which alone this changes, with layers drawn."""
-        order = self._order_of(active, member)
-        if in_own_process:
-            self.announce, self.cache = Announcer(), self.cache.beside(f"helper-{member}")
-            self._layers = self._draw_layers(active, order)
-        return partial(self._draw_share, active, member, order)
-
-    def _draw_share(
-        self, active: ActiveVisit, member: int, order: tuple[int, ...], gaussians: Gaussians, task: Task
-    ) -> Share:
-        each = self.batch // active.crew
-        views = order[task.done * each : (task.done + 1) * each]
-        samples = [self._sample(view, member * each + k, task.step) for k, view in enumerate(views)]
-        rendered = self._draw(gaussians, samples, task.sh_degree)
-        return share_of(
-            gaussians, samples, rendered, self._target, self.config, self.density, views=self.batch
-        )
 
     def _surroundings(self) -> BlockScene:
         """Where a visit's frozen blocks are drawn from."""

@@ -9,6 +9,14 @@ import pytest
 from abcd_ns.plugin.stopping import Stopped, StopSignals, command_to_go_on
 
 
+@pytest.fixture(autouse=True)
+def python_handles_interrupts():
+    """Also where the tests run in the background of a shell, which has them ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_acts_at_once_where_nothing_is_held(number):
     with pytest.raises(Stopped) as stopped, StopSignals():
