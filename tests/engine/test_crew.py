@@ -116,7 +116,7 @@ def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch):
         if lost.state.step % 4 == 0 and lost._crew is not None:
             for pid in lost._crew.pids:
                 os.kill(pid, signal.SIGKILL)
-    monkeypatch.setattr("abcd_ns.engine.coordinator.can_fork", lambda _: False)
+    monkeypatch.setattr("abcd_ns.engine.step_drawing.can_fork", lambda _: False)
     train(never, photos)
     assert len(whole_scene(helped)) > 60  # blocks grew
     assert equal(whole_scene(helped), whole_scene(lost))
