@@ -86,11 +86,6 @@ class TrainingConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 
-    @property
-    def shares_steps(self) -> bool:
-        """Whether a step's views may be shared out: not where `exact` and `overlap` go their own ways."""
-        return not self.exact and self.overlap == 0
-
     def room(self, scene: int, block: int, blocks: int) -> int | None:
         """Gaussians that may be added to a block of so many in a scene of so many and of so many blocks; None
         for any number."""

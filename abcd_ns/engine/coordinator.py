@@ -173,7 +173,7 @@ class Coordinator(StepDrawing):
         self._growth = self.density.after_step(self.params, self.optimizers, self._growth, infos, clock)
         if self.density.resets(clock):
             self._clocks = replace(self._clocks, resets=clock.steps // self.config.density.reset_every)
-        if self.density.is_due(clock):
+        if infos and self.density.is_due(clock):
             self._clocks = replace(self._clocks, refined=clock.steps)
             if self.health.acts:
                 self.health.hold_back_giants(view.center for view in self.views.values())

@@ -46,8 +46,7 @@ class SharedRows:
         start = self._starts[name]
         return self._all[start : start + shape[0] * torch.Size(shape[1:]).numel()].view(shape)
 
-    def write(self, tensors: Mapping[str, Tensor | None]) -> None:
-        """Copy tensors in; None writes nothing."""
+    def write(self, tensors: Mapping[str, Tensor]) -> None:
+        """Copy tensors in."""
         for name, value in tensors.items():
-            if value is not None:
-                self.rows(name, len(value)).copy_(value.detach())
+            self.rows(name, len(value)).copy_(value.detach())

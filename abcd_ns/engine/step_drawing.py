@@ -133,7 +133,7 @@ class StepDrawing(ABC):
     # -- helpers -------------------------------------------------------------------------------------
 
     def _size_of_crew(self, active: ActiveVisit) -> int:
-        if self._target is None or not self.config.shares_steps:
+        if self._target is None or self.config.overlap > 0:  # there each pixel counts in a way of its own
             return 1
         threads = torch.get_num_threads() if can_fork(self.device) else 1
         return size_of_crew(self.config.processes or threads, self.batch, len(active.views))

@@ -272,18 +272,22 @@ class AbcdModel(SplatfactoModel):
     def _pairs(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
         """Pictures and their photos, on the same background."""
         photos = [
-            self.composite_with_background(self.get_gt_img(image), background)
+            self.photo_on(image, background)
             for image, background in zip(
                 _as_list(batch["image"]), _as_list(outputs["background"]), strict=True
             )
         ]
         return _as_list(outputs["rgb"]), photos
 
+    def photo_on(self, image: Tensor, background: Tensor) -> Tensor:
+        """What a picture on this background should be: float32 in 0..1, [h, w, 3]."""
+        return self.composite_with_background(self.get_gt_img(image), background)
+
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of a whole picture, and photo and picture side by side."""
-        photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        photo = self.photo_on(batch["image"], outputs["background"])
         return image_metrics(outputs["rgb"], photo), {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
 
     def get_gt_img(self, image: Tensor) -> Tensor:

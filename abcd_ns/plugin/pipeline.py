@@ -164,9 +164,9 @@ class AbcdPipeline(VanillaPipeline):
 
     def _target(self, sample: Sample) -> Target:
         """What a helper trains on; the training process gets the same by way of `next_train`."""
-        photo = self.datamanager.photo(sample.view.index, sample.crop)
-        wanted = self.model.composite_with_background(self.model.get_gt_img(photo), sample.background)
-        return wanted, self.datamanager.mask(sample.view.index, sample.crop)
+        shot = sample.view.index, sample.crop
+        photo = self.model.photo_on(self.datamanager.photo(*shot), sample.background)
+        return photo, self.datamanager.mask(*shot)
 
     def _limits(self, store: ParameterStore, resumed: bool) -> tuple[int, int]:
         """Gaussians in a block, and in a sole one, at most: as the run began, unless it goes on with a budget
