@@ -27,11 +27,17 @@ class TrainingConfig:
     pixels. This much of their weight, in a picture of the block alone, may be nearer than the nearest that
     counts, and as much farther than the farthest; 0 counts all, which is exact and dear."""
     warmup: float = 0.2
-    """Share of the run for which a scaffold, no larger than a block but all over the scene, is trained before
-    blocks are; 0 for none."""
+    """Share of the run, at most, for which a scaffold, no larger than a block but all over the scene, is
+    trained before blocks are; 0 for none."""
+    scaffold_passes: int = 12
+    """Uses of each view in the warm-up, at most: so few Gaussians soon are as good as they can be. 0 for no
+    such limit."""
     batch: int = 0
-    """Views drawn in one step; learning rates grow with its square root. 0 takes 1 where the scene is one
-    block, which is 3DGS, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
+    """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and 4 elsewhere: with
+    small blocks a step's overhead would outweigh its work."""
+    batch_power: float = 0.75
+    """Learning rates grow with this power of the views in a step: 0.5 suits gradients that are noise, 1 such
+    as agree. A scene's views show different Gaussians, but a block's all show the same ones."""
     processes: int = 0
     """Processes that share the views of a step where there is no GPU; 0 takes as many as torch has threads,
     `batch` at most. Rounding depends on it."""

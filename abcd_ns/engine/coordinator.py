@@ -45,7 +45,7 @@ from abcd_ns.engine.schedule import (
     views_of_member,
     views_per_step,
 )
-from abcd_ns.engine.settle import at_rest, count_at_rest, had_reserve, has_reserve, settle
+from abcd_ns.engine.settle import at_rest, count_at_rest, has_reserve, settle
 from abcd_ns.engine.share import Target, Task
 from abcd_ns.engine.splitting import split_full
 from abcd_ns.engine.step_drawing import StepDrawing
@@ -95,7 +95,7 @@ class Coordinator(StepDrawing):
         self._rasterizer = rasterizer
         self._ownership = resolve_ownership(config.ownership, rasterizer)
         self._planner = Planner(config, budget, scene, self.views, rasterizer, device=self.device)
-        self._pace = Pace(optimizers)
+        self._pace = Pace(optimizers, config.batch_power)
         heals = {"may_act": config.heal and config.layers, "may_drop": config.density.strategy == "default"}
         self.health = Health(scene, params, optimizers, self.announce, **heals)
         self._growth: dict[str, Tensor] = {}
@@ -181,8 +181,7 @@ class Coordinator(StepDrawing):
     @property
     def _progress_of_blocks(self) -> float:
         """Share of the run, its warm-up left out, that is done."""
-        before = self.config.warmup if had_reserve(self.scene) else 0.0
-        return max(self.progress - before, 0.0) / (1 - before)
+        return max(self.progress - self.state.warm, 0.0) / (1 - self.state.warm)
 
     def _density_clock(self, taken: int) -> DensityClock:
         active = self._active
@@ -326,6 +325,7 @@ class Coordinator(StepDrawing):
         self._clocks = replace(self._clocks, visits=self._clocks.visits + (not active.is_whole))
         state = self.health.end_visit(active, self._detached)
         if active.is_whole:
+            self.state.warm = min(self.progress, self.config.warmup)
             owner, views = self.scene.tree.assign(state.gaussians.means), self.views.values()
             options = {"antialiased": self.config.antialiased}
             self.state.influence = influence(state.gaussians, owner, views, self._rasterizer, **options)

@@ -1,6 +1,5 @@
 """Puts a block into live parameters and Adam optimizers, and takes it out again, moments included."""
 
-import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import replace
 
@@ -93,25 +92,30 @@ def nothing_live(
 
 
 class Pace:
-    """Learning rates and memories of the optimizers, as they were given for steps of one view each."""
+    """Learning rates and memories of the optimizers, as they were given for steps of one view each.
 
-    def __init__(self, optimizers: Optimizers) -> None:
+    Args:
+        power: of a step's views, with which the rates grow.
+    """
+
+    def __init__(self, optimizers: Optimizers, power: float) -> None:
         groups = {name: optimizer.param_groups[0] for name, optimizer in optimizers.items()}
-        self._optimizers = optimizers
+        self._optimizers, self._power = optimizers, power
         self._given = {name: (group["lr"], group["betas"]) for name, group in groups.items()}
 
     def set(self, batch: int, means_decay: float, damping: float = 1.0) -> None:
         """For a step of `batch` views, with the means' rate at a share of what was given, and all of them
         damped.
 
-        Rates grow with the square root, and moments forget as many views' worth a step: for Adam this follows
-        the path of single views, as far as gradients are noise (Malladi et al. 2022, "On the SDEs and scaling
-        rules for adaptive gradient algorithms"; Zhao et al. 2024 use it for Gaussian Splatting).
+        Moments forget as many views' worth a step. With rates that grow with the square root, Adam then
+        follows the path of single views as far as gradients are noise (Malladi et al. 2022, "On the SDEs and
+        scaling rules for adaptive gradient algorithms"; Zhao et al. 2024 use it for Gaussian Splatting); as
+        far as they agree, with rates in proportion.
         """
         for name, (rate, betas) in self._given.items():
             group = self._optimizers[name].param_groups[0]
             decay = means_decay if name == "means" else 1.0
-            group["lr"] = rate * decay * math.sqrt(batch) * damping
+            group["lr"] = rate * decay * batch**self._power * damping
             group["betas"] = tuple(beta**batch for beta in betas)
 
 

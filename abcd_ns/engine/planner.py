@@ -60,6 +60,8 @@ class Planner:
         crops = {index: view.full for index, view in self._views.items()}
         geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
+        if self._config.scaffold_passes:
+            taken = min(taken, self._config.scaffold_passes * len(crops))
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
     def next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:

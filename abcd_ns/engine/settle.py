@@ -68,14 +68,9 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
     return {**settled, RESERVE: waiting[:0]}
 
 
-def had_reserve(scene: StoredScene) -> bool:
-    """Whether the run began with a scaffold."""
-    return RESERVE in scene.store.blocks
-
-
 def has_reserve(scene: StoredScene) -> bool:
     """Whether Gaussians wait for the scaffold to be done."""
-    return had_reserve(scene) and scene.store.counts(RESERVE) > 0
+    return RESERVE in scene.store.blocks and scene.store.counts(RESERVE) > 0
 
 
 def _at_rest(scene: StoredScene, block: int) -> BlockState:

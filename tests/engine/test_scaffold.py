@@ -5,7 +5,7 @@ import torch
 
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.density import DensityConfig
-from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.initialize import split_off
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.scaffold import RESERVE, REVEALED_OPACITY, blocks_at_rest
@@ -118,3 +118,31 @@ def test_density_controls_clock_starts_when_the_warm_up_is_over(tmp_path, views,
     coordinator.density.after_step = watch
     train(coordinator, photos)
     assert found == pytest.approx([(step + 1) / 20 for step in range(20)])
+
+
+@pytest.mark.parametrize(("passes", "expected"), [(1, 1), (2, 2), (0, 5)])
+def test_the_warm_up_ends_when_each_view_was_used_often_enough(
+    tmp_path, views, photos, start, passes, expected
+):
+    """Growing begins then, and not only when the share of the run is over that it might have taken."""
+    coordinator = make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=4,
+        steps=10 * len(views),
+        scaffold=30,
+        warmup=0.5,
+        scaffold_passes=passes,
+        density=STILL,
+    )
+    ended = []
+    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    while not ended:
+        train_step(coordinator, photos)
+    assert coordinator.state.step == expected * len(views)
+    assert coordinator.state.warm == pytest.approx(expected / 10)
+    assert not coordinator.state.active
+    train_step(coordinator, photos)
+    rest = 10 * len(views) - coordinator.state.step + 1
+    assert coordinator._density_clock(taken=4).progress == pytest.approx(1 / rest)

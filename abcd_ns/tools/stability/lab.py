@@ -169,7 +169,7 @@ class Lab:
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
         params, adam = optimizers or nothing_live(start.sh_degree)
         scene, cache = StoredScene(tree, store), LayerCache(None, bits=bits)
-        steps = Budget(steps=steps_for(budget, config, tree.num_blocks))
+        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views)))
         return kind(config, steps, scene, views, cache, self.rasterizer, params, adam)
 
     def train(
@@ -230,11 +230,16 @@ class Lab:
         return float(torch.stack(errors).mean())
 
 
-def steps_for(views: int, config: TrainingConfig, blocks: int) -> int:
-    """Steps that draw about so many views: one each in the warm-up and with one block, else a batch."""
+def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int) -> int:
+    """Steps that draw about so many views of `views`: one each in the warm-up and with one block, else a
+    batch."""
     batch = views_per_step(config.batch, blocks)
     warmup = config.warmup if blocks > 1 else 0.0
-    return max(round(views / (warmup + (1 - warmup) * batch)), 1)
+    steps = drawn / (warmup + (1 - warmup) * batch)
+    longest = config.scaffold_passes * views
+    if 0 < longest < warmup * steps:
+        steps = longest + (drawn - longest) / batch
+    return max(round(steps), 1)
 
 
 def merged(coordinator: Coordinator) -> Gaussians:
