@@ -149,4 +149,4 @@ class Planner:
             return VisitGeometry(block, {})
         (shows,) = self._frusta.may_show([self._optics.drawn_within(bounds)]).tolist()
         near = [view for view, may in zip(self._views.values(), shows, strict=True) if may]
-        return survey(self._scene.gaussians(block).to(self._device), block, near, self._rasterizer)
+        return survey(self._scene.at_rest(block).to(self._device), block, near, self._rasterizer)

@@ -2,7 +2,8 @@
 
 Blocks that begin among neighbours which are still blobs learn little from them, and each block's first
 visits are spent on that. A scaffold is a coarse picture of everything that fits where one block fits, needs
-no layers, and takes little of the time. The remaining Gaussians wait in reserve, and join it when it ends.
+no layers, and takes little of the time. The remaining Gaussians wait in reserve, then each in its block,
+unseen until that is visited for the first time: neighbours look to each other as they were trained to look.
 """
 
 import math
@@ -10,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.block_state import BlockState
@@ -28,15 +30,35 @@ REVEALED_OPACITY = 0.02
 """Of a Gaussian from the reserve: enough to be drawn and to learn, too little to spoil what is there."""
 REVEALED_SCALE = 0.5
 """Its size, as a share of the distance to its neighbours."""
+WAITING = -100.0
+"""Logit of the opacity of a Gaussian that waits in its block for the first visit."""
 
 
-def revealed(waiting: BlockState) -> BlockState:
-    """The reserve as it joins a trained scaffold: faint and small."""
-    old = waiting.gaussians
-    faint = torch.full_like(old.opacities, math.log(REVEALED_OPACITY / (1 - REVEALED_OPACITY)))
-    return replace(
-        waiting, gaussians=replace(old, opacities=faint, scales=old.scales + math.log(REVEALED_SCALE))
-    )
+def put_to_wait(reserve: BlockState) -> BlockState:
+    """The reserve as it joins a trained scaffold: small, and not to be seen before its block is visited."""
+    old = reserve.gaussians
+    unseen = torch.full_like(old.opacities, WAITING)
+    scales = old.scales + math.log(REVEALED_SCALE)
+    return replace(reserve, gaussians=replace(old, opacities=unseen, scales=scales))
+
+
+def drawn(gaussians: Gaussians) -> Gaussians:
+    """Without those that wait."""
+    waits = _waits(gaussians)
+    return gaussians[~waits] if bool(waits.any()) else gaussians
+
+
+def revealed(gaussians: Gaussians) -> Gaussians:
+    """Those that waited, faint; the others as they are."""
+    waits = _waits(gaussians)
+    if not bool(waits.any()):
+        return gaussians
+    faint = math.log(REVEALED_OPACITY / (1 - REVEALED_OPACITY))
+    return replace(gaussians, opacities=gaussians.opacities.masked_fill(waits[:, None], faint))
+
+
+def _waits(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    return gaussians.opacities[:, 0] == WAITING
 
 
 def part(state: BlockState, owner: Tensor) -> dict[int, BlockState]:

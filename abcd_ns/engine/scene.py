@@ -8,6 +8,7 @@ from torch import Tensor
 
 from abcd_ns.engine.blocks import BlockTree, Box
 from abcd_ns.engine.culling import bounds_of
+from abcd_ns.engine.scaffold import drawn, revealed
 from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
@@ -102,9 +103,13 @@ class StoredScene:
             return everything[self.tree.assign(everything.means) == block]
         if self._live is not None and self._live[0] == block:
             return self._live[1]().detach()
-        return self.at_rest(block)
+        return drawn(self.stored(block))
 
     def at_rest(self, block: int) -> Gaussians:
+        """The block as a visit will find it, whatever is live."""
+        return revealed(self.stored(block))
+
+    def stored(self, block: int) -> Gaussians:
         """The block as it is stored, whatever is live."""
         key = (block, self.version(block))
         if key not in self._ram:

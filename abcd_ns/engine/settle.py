@@ -5,7 +5,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from abcd_ns.engine.block_state import BlockState
-from abcd_ns.engine.scaffold import LIVE, RESERVE, WHOLE, join, part, revealed
+from abcd_ns.engine.scaffold import LIVE, RESERVE, WHOLE, join, part, put_to_wait, revealed
 from abcd_ns.engine.scene import StoredScene
 
 
@@ -15,7 +15,8 @@ def at_rest(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
     Args:
         saved: the visit goes on where a save found it.
     """
-    return join([_at_rest(scene, number) for number in _numbers(scene, block, saved)])
+    state = join([_at_rest(scene, number) for number in _numbers(scene, block, saved)])
+    return replace(state, gaussians=revealed(state.gaussians))
 
 
 def count_at_rest(scene: StoredScene, block: int, saved: bool = False) -> int:
@@ -59,7 +60,7 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
         KeyError: the store holds no reserve.
     """
     waiting = _at_rest(scene, RESERVE).to(state.gaussians.device)
-    trained, arrivals = part(state, _owner(scene, state)), part(revealed(waiting), _owner(scene, waiting))
+    trained, arrivals = part(state, _owner(scene, state)), part(put_to_wait(waiting), _owner(scene, waiting))
     nobody = replace(waiting[:0], clocks=state.clocks)
     settled = {
         block: trained.get(block, nobody).joined_by(arrivals.get(block, nobody))

@@ -8,7 +8,7 @@ from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.initialize import split_off
 from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.scaffold import RESERVE, REVEALED_OPACITY, blocks_at_rest
+from abcd_ns.engine.scaffold import RESERVE, REVEALED_OPACITY, WAITING, blocks_at_rest
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import make_coordinator, whole_scene
@@ -61,9 +61,10 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
     for block in range(4):
         state = BlockState.from_tensors(*store.load(block))
         assert bool((scene.tree.assign(state.gaussians.means) == block).all())
-        faint = torch.sigmoid(state.gaussians.opacities[:, 0]).sub(REVEALED_OPACITY).abs() < 1e-6
+        waits = state.gaussians.opacities[:, 0] == WAITING
         trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)
-        assert not bool((faint & trained).any())
+        assert bool(waits.any())
+        assert not bool((waits & trained).any())
         assert state.clocks.adam_steps == 10
         assert state.clocks.visits == 0
         assert state.clocks.steps == 0
@@ -72,6 +73,29 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
     assert [event.block for event in begun][:2] != [None, None]
     assert begun[0].block is None
     assert {event.block for event in begun[1:]} == {0, 1, 2, 3}
+
+
+def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL, heal=False
+    )
+    scene, visited = coordinator.scene, set()
+    train(coordinator, photos, steps=10)
+    assert len(whole_scene(coordinator)) == 30
+    while len(visited) < 4:
+        coordinator.next_batch()
+        active = coordinator.state.active
+        if active.done == 0:
+            live, found = coordinator.params["opacities"].detach()[:, 0], scene.count(active.geometry.block)
+            faint = torch.sigmoid(live).sub(REVEALED_OPACITY).abs() < 1e-6
+            assert len(live) == found
+            assert bool(faint.any())
+            assert len(scene.at_rest(active.geometry.block)) == found  # what windows and views go by
+            visited.add(active.geometry.block)
+        for block in set(range(4)) - visited:
+            assert 0 < len(scene.gaussians(block)) < scene.count(block)
+        train_step(coordinator, photos)
+    assert len(whole_scene(coordinator)) == coordinator.count() == 120
 
 
 @pytest.mark.parametrize("stop", [4, 10, 13])
