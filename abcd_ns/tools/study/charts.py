@@ -98,9 +98,11 @@ def _draw_gap(axes: Axes, arms: Sequence[Arm]) -> None:
     if gap is None:
         return
     axes.axhspan(gap.best.psnr - GOAL_DB, gap.best.psnr, color=BAND, zorder=0, linewidth=0)
+    at_right = arms[-1].psnr < arms[0].psnr  # where the line is farther below
     axes.annotate(
         f"best - {GOAL_DB:g} dB",
-        xy=(0.01, gap.best.psnr - GOAL_DB),
+        xy=(0.99 if at_right else 0.01, gap.best.psnr - GOAL_DB),
+        ha="right" if at_right else "left",
         xycoords=("axes fraction", "data"),
         xytext=(0, -2),
         textcoords="offset points",
