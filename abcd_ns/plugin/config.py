@@ -94,6 +94,12 @@ def check_training(training: TrainingConfig) -> None:
     """
     if not 0 <= training.warmup < 1:
         raise UserError(f"--pipeline.training.warmup must be from 0 to below 1, not {training.warmup}.")
+    if training.scaffold_passes < 0:
+        raise UserError(
+            f"--pipeline.training.scaffold-passes must be 0 or more, not {training.scaffold_passes}."
+        )
+    if not 0 <= training.batch_power <= 1:
+        raise UserError(f"--pipeline.training.batch-power must be from 0 to 1, not {training.batch_power}.")
     if not training.influence_share > 0:
         raise UserError(
             f"--pipeline.training.influence-share must be above 0, not {training.influence_share}."

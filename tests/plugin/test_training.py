@@ -225,6 +225,8 @@ def test_the_saved_config_is_the_config(trained):
         (lambda c: setattr(c.pipeline, "near_plane", -1.0), "--pipeline.near-plane"),
         (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
         (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),
+        (lambda c: setattr(c.pipeline.training, "scaffold_passes", -1), "training.scaffold-passes"),
+        (lambda c: setattr(c.pipeline.training, "batch_power", float("nan")), "training.batch-power"),
         (lambda c: setattr(c.pipeline.training, "influence_share", 0.0), "training.influence-share"),
         (lambda c: setattr(c.pipeline.training, "window_weight", 1.0), "training.window-weight"),
         (lambda c: setattr(c.pipeline.training, "overlap", 0.2), "--pipeline.training.overlap"),
