@@ -103,14 +103,13 @@ class StoredScene:
             return everything[self.tree.assign(everything.means) == block]
         if self._live is not None and self._live[0] == block:
             return self._live[1]().detach()
-        return drawn(self.stored(block))
+        return drawn(self._stored(block))
 
     def at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
-        return revealed(self.stored(block))
+        return revealed(self._stored(block))
 
-    def stored(self, block: int) -> Gaussians:
-        """The block as it is stored, whatever is live."""
+    def _stored(self, block: int) -> Gaussians:
         key = (block, self.version(block))
         if key not in self._ram:
             self._ram[key] = Gaussians(**self.store.load_names(block, PARAM_NAMES))

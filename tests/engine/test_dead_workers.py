@@ -1,6 +1,5 @@
 """A process that works for another and dies is an error or a warning, never a wait without end."""
 
-import copy
 import os
 import signal
 import sys
@@ -8,9 +7,10 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
+import torch
 
 from abcd_ns.engine.kernels import build
-from abcd_ns.engine.kernels.kernel import FOLDER_VARIABLE, Kernel
+from abcd_ns.engine.kernels.kernel import FOLDER_VARIABLE, Kernel, kernels_folder
 
 
 class Deadly(Kernel):
@@ -24,7 +24,11 @@ class Deadly(Kernel):
         raise AssertionError("it lives")
 
 
-DEADLY = Deadly("deadly", copy.copy, ("n",))
+def alone(values: torch.Tensor) -> tuple[torch.Tensor]:
+    return (values,)
+
+
+DEADLY = Deadly("deadly", alone, ("n",))
 
 
 @pytest.fixture(autouse=True)
@@ -44,3 +48,6 @@ def test_a_killed_builder_is_a_warning_and_kernels_stay_eager(monkeypatch):
     monkeypatch.setattr(build, "can_build", lambda: True)
     with pytest.warns(UserWarning, match="stays slow: exit code -9"):
         build.build_kernels([DEADLY], 4, 16)
+    values = torch.arange(3.0)
+    assert torch.equal(*DEADLY(values), values)
+    assert not any(kernels_folder().iterdir())
