@@ -1,0 +1,24 @@
+"""Budgets in views drawn, by which methods are compared."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.tools.stability.lab import steps_for
+
+
+@given(
+    drawn=st.integers(100, 10_000),
+    views=st.integers(1, 50),
+    passes=st.integers(0, 20),
+    blocks=st.sampled_from([1, 8]),
+)
+def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, passes, blocks):
+    config = TrainingConfig(warmup=0.2, batch=0, scaffold_passes=passes)
+    steps = steps_for(drawn, config, blocks, views)
+    batch, share = (1, 0.0) if blocks == 1 else (4, config.warmup)
+    warm = min(math.ceil(share * steps), passes * views or steps)
+    assert warm + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)
