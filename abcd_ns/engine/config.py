@@ -27,11 +27,13 @@ class TrainingConfig:
     pixels. This much of their weight, in a picture of the block alone, may be nearer than the nearest that
     counts, and as much farther than the farthest; 0 counts all, which is exact and dear."""
     warmup: float = 0.2
-    """Share of the run, at most, for which a scaffold, no larger than a block but all over the scene, is
-    trained before blocks are; 0 for none."""
-    scaffold_passes: int = 12
+    """Share of the run, at most, for which a scaffold is trained before blocks are: as many Gaussians, all
+    over the scene, as take no more memory than a visit to the largest block. 0 for none."""
+    scaffold_passes: int = 24
     """Uses of each view in the warm-up, at most: so few Gaussians soon are as good as they can be. 0 for no
     such limit."""
+    scaffold_gaussians: int = 0
+    """Gaussians of the scaffold; 0 takes as many as the memory of a visit allows."""
     batch: int = 0
     """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and 4 elsewhere: with
     small blocks a step's overhead would outweigh its work."""

@@ -45,7 +45,7 @@ from abcd_ns.engine.schedule import (
     views_of_member,
     views_per_step,
 )
-from abcd_ns.engine.settle import at_rest, count_at_rest, has_reserve, settle
+from abcd_ns.engine.settle import at_rest, count_at_rest, has_scaffold, settle
 from abcd_ns.engine.share import Target, Task
 from abcd_ns.engine.splitting import split_full
 from abcd_ns.engine.step_drawing import StepDrawing
@@ -246,7 +246,7 @@ class Coordinator(StepDrawing):
 
     def _begin_visit(self) -> None:
         degree, began = self.sh_degree, self.stopwatch.seconds
-        if self.state.visit == 0 and has_reserve(self.scene) and self.progress < self.config.warmup:
+        if self.state.visit == 0 and has_scaffold(self.scene) and self.progress < self.config.warmup:
             self.state.active = self._planner.warm_up(degree, began)
         else:
             self.state.active = self._planner.next_visit(self.state, degree, began)

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 import psutil
 import torch
 
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.painter import LEAST_PASS
+from abcd_ns.engine.schedule import views_per_step
 from abcd_ns.engine.visit import AT_HAND_BYTES, PARTS_BYTES
 from abcd_ns.errors import UserError
 
@@ -62,6 +64,19 @@ class DeviceNeeds:
     def block_limit(self, budget: int) -> int:
         """Gaussians that a block may have for its visits to stay within `budget` bytes; may be 0 or less."""
         return (budget - self.fixed_bytes) // self.gaussian_bytes
+
+
+def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
+    """Gaussians of the warm-up: where not given, as many as take no more than a visit to a block does.
+
+    Args:
+        block: Gaussians of the largest block, one of several.
+        pixels: of the largest image.
+    """
+    # The warm-up draws one view a step, and has no neighbours.
+    batches = views_per_step(config.batch, blocks=2), 1
+    visit, warm_up = (DeviceNeeds(pixels, batch, config.sh_degree) for batch in batches)
+    return config.scaffold_gaussians or warm_up.block_limit(visit.bytes_for(block))
 
 
 def fewest_blocks(gaussians: int, limit: int, full: float) -> int:

@@ -1,4 +1,4 @@
-"""The warm-up: as many Gaussians as one block may hold, spread over the whole scene and trained at once.
+"""The warm-up: as many Gaussians as the memory of one visit holds, all over the scene, trained at once.
 
 Blocks that begin among neighbours which are still blobs learn little from them, and each block's first
 visits are spent on that. A scaffold is a coarse picture of everything that fits where one block fits, needs
@@ -80,9 +80,9 @@ def blocks_at_rest(
     """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
 
     Args:
-        keep: begin with a scaffold of so many, the others in reserve; None for all at once.
+        keep: begin with a scaffold of so many, the others, if any, in reserve; None for no warm-up.
     """
-    if keep is None or keep >= len(gaussians):
+    if keep is None:
         at_rest = part(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
         return {b: at_rest.get(b, nobody).to_tensors() for b in range(tree.num_blocks)}

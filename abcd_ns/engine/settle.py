@@ -69,9 +69,9 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
     return {**settled, RESERVE: waiting[:0]}
 
 
-def has_reserve(scene: StoredScene) -> bool:
-    """Whether Gaussians wait for the scaffold to be done."""
-    return RESERVE in scene.store.blocks and scene.store.counts(RESERVE) > 0
+def has_scaffold(scene: StoredScene) -> bool:
+    """Whether the scene begins with a warm-up; the reserve may be empty."""
+    return RESERVE in scene.store.blocks
 
 
 def _at_rest(scene: StoredScene, block: int) -> BlockState:

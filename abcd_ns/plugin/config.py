@@ -98,6 +98,10 @@ def check_training(training: TrainingConfig) -> None:
         raise UserError(
             f"--pipeline.training.scaffold-passes must be 0 or more, not {training.scaffold_passes}."
         )
+    if training.scaffold_gaussians < 0:
+        raise UserError(
+            f"--pipeline.training.scaffold-gaussians must be 0 or more, not {training.scaffold_gaussians}."
+        )
     if not 0 <= training.batch_power <= 1:
         raise UserError(f"--pipeline.training.batch-power must be from 0 to 1, not {training.batch_power}.")
     if not training.influence_share > 0:

@@ -18,6 +18,7 @@ from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.exact import ExactCoordinator
 from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
 from abcd_ns.engine.initialize import thin_out
+from abcd_ns.engine.memory import scaffold_size
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget, RunState
@@ -178,14 +179,20 @@ class AbcdPipeline(VanillaPipeline):
 
     def _room(self, points: int) -> Room:
         """How many blocks for a scene that begins with so many points."""
-        config, cameras = self.config, self.datamanager.train_dataset.cameras
+        config = self.config
         return find_room(
             device_budget(config.device_budget_gb, self.device),
-            pixels=int((cameras.width * cameras.height).max()),
+            pixels=self._pixels,
             points=points,
             most=config.training.density.limit,
             training=config.training,
         )
+
+    @property
+    def _pixels(self) -> int:
+        """Of the largest image."""
+        cameras = self.datamanager.train_dataset.cameras
+        return int((cameras.width * cameras.height).max())
 
     def _first_cut(self, points: int) -> tuple[int, dict[str, int]]:
         """The number of blocks to begin with, and the limits of their Gaussians, by option; 0 for none."""
@@ -229,9 +236,9 @@ class AbcdPipeline(VanillaPipeline):
         if training.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))
             return store, False
-        largest = -(-len(gaussians) // tree.num_blocks)
         warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.exact
-        keep = largest if warms_up else None
+        largest = limits["block_limit"] or -(-len(gaussians) // tree.num_blocks)
+        keep = scaffold_size(training, largest, self._pixels) if warms_up else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
 

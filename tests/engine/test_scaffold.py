@@ -34,8 +34,22 @@ def test_scaffold_and_reserve_are_all_there_is(start):
 def test_without_a_scaffold_nothing_waits(start):
     tree = build_kd(start.means, 4)
     assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
-    assert sorted(blocks_at_rest(tree, start, keep=len(start))) == [0, 1, 2, 3]
     assert sorted(blocks_at_rest(tree, start, keep=30)) == [0, 1, 2, 3, RESERVE]
+
+
+def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=1000, warmup=0.25, density=STILL
+    )
+    train(coordinator, photos, steps=3)
+    assert coordinator.state.active.is_whole
+    assert len(coordinator.params["means"]) == len(start)
+    train(coordinator, photos, steps=7)
+    assert coordinator.state.active is None
+    assert len(whole_scene(coordinator)) == coordinator.count() == len(start)
+    assert [coordinator.scene.count(block) for block in range(4)] == pytest.approx([30] * 4, abs=2)
+    train(coordinator, photos)
+    assert coordinator.finished
 
 
 def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, photos, start):

@@ -3,7 +3,7 @@
 import pytest
 
 from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.memory import DeviceNeeds
+from abcd_ns.engine.memory import DeviceNeeds, scaffold_size
 from abcd_ns.engine.splitting import FULL
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.room import GB, check_room, device_budget, find_room
@@ -23,6 +23,28 @@ def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
     if room.blocks > 1:
         assert gaussians <= room.blocks * FULL * room.limit
         assert room.blocks == 2 or gaussians > (room.blocks - 1) * FULL * room.limit
+
+
+@pytest.mark.parametrize("block", [1, 3_333, 5_000_000])
+@pytest.mark.parametrize("pixels", [160 * 106, PIXELS])
+def test_the_warm_up_takes_what_a_visit_takes_and_no_more(block, pixels):
+    size = scaffold_size(TRAINING, block, pixels)
+    visit, warm_up = DeviceNeeds(pixels, batch=4), DeviceNeeds(pixels, batch=1)
+    assert warm_up.bytes_for(size) <= visit.bytes_for(block) < warm_up.bytes_for(size + 1)
+    assert size > block
+
+
+def test_the_warm_up_may_be_as_large_as_a_sole_block():
+    room = find_room(8 * GB, pixels=PIXELS, points=30_000_000, training=TRAINING)
+    assert abs(scaffold_size(TRAINING, room.limit, PIXELS) - room.sole) <= 1
+
+
+def test_the_warm_up_has_the_size_that_is_asked_for():
+    assert scaffold_size(TrainingConfig(scaffold_gaussians=500), 3_333, PIXELS) == 500
+
+
+def test_with_one_view_in_a_step_the_warm_up_is_no_larger_than_a_block():
+    assert scaffold_size(TrainingConfig(batch=1), 3_333, PIXELS) == 3_333
 
 
 def test_a_scene_that_fits_is_one_block():

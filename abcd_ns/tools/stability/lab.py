@@ -19,6 +19,7 @@ from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Event
 from abcd_ns.engine.initialize import gaussians_from_points, thin_out
 from abcd_ns.engine.loss import psnr
+from abcd_ns.engine.memory import scaffold_size
 from abcd_ns.engine.param_swap import Optimizers, nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
@@ -165,7 +166,8 @@ class Lab:
         start = thin_out(start, config.density.limit, config.seed)
         store = ParameterStore.create(Path(tempfile.mkdtemp(dir=self._folder)) / "store", {})
         warms = config.warmup > 0 and tree.num_blocks > 1
-        keep = math.ceil(len(start) / tree.num_blocks) if warms else None
+        largest, pixels = math.ceil(len(start) / tree.num_blocks), max(v.width * v.height for v in views)
+        keep = scaffold_size(config, largest, pixels) if warms else None
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
         params, adam = optimizers or nothing_live(start.sh_degree)
         scene, cache = StoredScene(tree, store), LayerCache(None, bits=bits)
