@@ -176,7 +176,7 @@ class Coordinator(StepDrawing):
         if infos and self.density.is_due(clock):
             self._clocks = replace(self._clocks, refined=clock.steps)
             if self.health.acts:
-                self.health.hold_back_giants(view.center for view in self.views.values())
+                self.health.hold_back_giants(self.views.values())
 
     @property
     def _progress_of_blocks(self) -> float:

@@ -20,10 +20,8 @@ from abcd_ns.engine.events import Announcer, Mended, VisitUndone
 from abcd_ns.engine.health_record import BlockHealth, Ledger
 from abcd_ns.engine.health_rules import (
     GIANT_ANGLE,
-    GIANT_SHARE,
     HIDDEN,
     SHOWS,
-    extent,
     is_worse,
     loss_rise,
     stand_ins,
@@ -33,7 +31,7 @@ from abcd_ns.engine.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.settle import at_rest
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import Gaussians, View
 
 LEAST_DAMPING = 1 / 16
 """Of learning rates, however often a block's visits were undone."""
@@ -110,27 +108,23 @@ class Health:
         return False
 
     @torch.no_grad()
-    def hold_back_giants(self, cameras: Iterable[Float[Tensor, "3"]]) -> None:
-        """Shrink Gaussians that are too large for their block and for every camera, along the axes that are.
+    def hold_back_giants(self, views: Iterable[View]) -> None:
+        """Shrink Gaussians that are too large for every camera, along the axes that are.
 
-        Such a Gaussian veils half the scene from anywhere near it, is drawn with every other block, and no
-        single photo holds it back.
+        Photos may agree on such a Gaussian, as a far wall say. But its place in the order is that of its
+        mean: from anywhere else it may come before what it lies behind, and veil half the picture.
         """
         scales, means = self._params["scales"], self._params["means"]
-        limit = GIANT_SHARE * extent(means)
-        rows = (scales.amax(dim=1).exp() > limit).nonzero()[:, 0]
+        nearest = means.new_full((len(means),), math.inf)
+        for view in views:
+            away = (means - view.center.to(means)).norm(dim=1).clamp_min(view.near)
+            nearest = torch.minimum(nearest, away)
+        allowed = (GIANT_ANGLE * nearest).log()[:, None]
+        over = scales > allowed
+        rows = over.any(dim=1).nonzero()[:, 0]
         if len(rows) == 0:
             return
-        nearest = means.new_full((len(rows),), math.inf)
-        for camera in cameras:
-            nearest = torch.minimum(nearest, (means[rows] - camera.to(means)).norm(dim=1))
-        allowed = (GIANT_ANGLE * nearest).clamp_min(limit).clamp_min(1e-12).log()[:, None]
-        over = scales[rows] > allowed
-        giants = over.any(dim=1)
-        if not bool(giants.any()):
-            return
-        rows, over, allowed = rows[giants], over[giants], allowed[giants]
-        scales[rows] = torch.where(over, allowed, scales[rows])
+        scales[rows] = torch.where(over[rows], allowed[rows], scales[rows])
         self._forget_moments("scales", rows)
         self._count("giants", len(rows))
 

@@ -14,11 +14,9 @@ STAND_IN_OPACITY = -9.0
 """Logit of the opacity of a Gaussian that takes the place of one that was lost; far below SHOWS."""
 LARGEST_LOG_SCALE = 40.0
 """A standard deviation of e^40; its square still is a number in float32."""
-GIANT_SHARE = 0.5
-"""A giant's standard deviation is over this share of its block's extent ..."""
 GIANT_ANGLE = 0.3
-"""... and over this share of its distance to the nearest camera: 3 sigma cover 45 degrees to either side.
-What is far away, sky for instance, may be large."""
+"""A giant's standard deviation is over this share of its distance to the nearest camera: 3 sigma cover 45
+degrees to either side. What is far away, sky for instance, may be large."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
 RISE = 0.1
@@ -59,15 +57,6 @@ def stand_ins(sound: Gaussians, count: int) -> Gaussians:
     values["quats"][:, 0] = 1.0
     values["opacities"] += STAND_IN_OPACITY
     return Gaussians(**values)
-
-
-def extent(means: Float[Tensor, "n 3"]) -> float:
-    """The longest side of the box that holds all means but the outermost hundredths; 0 for none."""
-    if len(means) == 0:
-        return 0.0
-    ranked, last = means.sort(dim=0).values, len(means) - 1
-    low, high = round(0.01 * last), round(0.99 * last)
-    return float((ranked[high] - ranked[low]).max())
 
 
 def loss_rise(uses: list[list[float]]) -> tuple[float, float, float] | None:

@@ -12,7 +12,7 @@ from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
 from abcd_ns.engine.health import Health
 from abcd_ns.engine.health_record import BlockHealth, standing, summary
-from abcd_ns.engine.health_rules import extent, is_worse, loss_rise, stand_ins, unsound
+from abcd_ns.engine.health_rules import is_worse, loss_rise, stand_ins, unsound
 from abcd_ns.engine.memory import OutOfRoomError, bytes_for, check_room
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import RunState
@@ -209,7 +209,7 @@ def test_a_run_with_an_undone_visit_can_be_resumed_within_it(tmp_path, views, ph
     assert equal(*results)
 
 
-def test_giants_shrink_to_their_block_or_to_what_cameras_see_of_them(tmp_path, views, photos, start):
+def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, photos, start):
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30)
     train_step(coordinator, photos)
     means, scales = coordinator.params["means"].detach(), coordinator.params["scales"].detach()
@@ -217,10 +217,10 @@ def test_giants_shrink_to_their_block_or_to_what_cameras_see_of_them(tmp_path, v
         scales[0] = torch.tensor([5.0, -3.0, 5.0])
         means[1], scales[1] = torch.tensor([500.0, 0.0, 0.0]), math.log(100.0)
     told, kept = listen(coordinator, Mended), scales[2:].clone()
-    coordinator.health.hold_back_giants(view.center for view in views)
+    coordinator.health.hold_back_giants(views)
     assert [(event.what, event.count) for event in told] == [("giants", 1)]
     nearest = min(float((means[0] - view.center).norm()) for view in views)
-    limit = max(health_rules.GIANT_SHARE * extent(means), health_rules.GIANT_ANGLE * nearest)
+    limit = health_rules.GIANT_ANGLE * nearest
     assert scales[0].tolist() == pytest.approx([math.log(limit), -3.0, math.log(limit)])
     assert float(scales[1].max()) == pytest.approx(math.log(100.0))
     assert torch.equal(scales[2:], kept)
@@ -256,13 +256,6 @@ def test_stand_ins_are_numbers_even_among_none():
         made = stand_ins(sound, 3)
         assert len(made) == 3
         assert not bool(unsound(made).any())
-
-
-def test_extent_ignores_the_outermost_hundredth():
-    means = torch.rand((500, 3), generator=torch.Generator().manual_seed(0))
-    means[0] = 1e6
-    assert 0.9 < extent(means) < 1.0
-    assert extent(means[:0]) == 0.0
 
 
 @pytest.mark.parametrize("name", PARAM_NAMES)

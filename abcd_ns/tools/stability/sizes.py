@@ -9,7 +9,7 @@ from torch import Tensor
 
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Mended
-from abcd_ns.engine.health_rules import GIANT_ANGLE, GIANT_SHARE, SHOWS, extent
+from abcd_ns.engine.health_rules import GIANT_ANGLE, SHOWS
 from abcd_ns.engine.influence import weights
 from abcd_ns.engine.loss import psnr
 from abcd_ns.engine.painter import Painter, PaintSettings
@@ -37,21 +37,23 @@ def with_giants(start: Gaussians, tree, sigmas=SIGMAS) -> Gaussians:
         rows = (owner == block).nonzero()[:, 0]
         middle = start.means[rows].median(dim=0).values
         giant = rows[(start.means[rows] - middle).norm(dim=1).argmin()]
-        scales[giant], opacities[giant] = math.log(sigma * extent(start.means[rows])), 0.0
+        scales[giant], opacities[giant] = math.log(sigma * _extent(start.means[rows])), 0.0
     return replace(start, scales=scales, opacities=opacities)
 
 
-def largest_share(gaussians: Gaussians, tree, views: list[View]) -> float:
-    """The largest standard deviation, as a share of what a Gaussian of its block and distance may have."""
-    owner, largest = tree.assign(gaussians.means), 0.0
-    centers = torch.stack([view.center for view in views])
-    for block in range(tree.num_blocks):
-        own = gaussians[owner == block]
-        if len(own):
-            nearest = torch.cdist(own.means, centers).amin(dim=1)
-            allowed = (GIANT_ANGLE * nearest).clamp_min(GIANT_SHARE * extent(own.means))
-            largest = max(largest, float((own.scales.amax(dim=1).exp() / allowed).max()))
-    return largest
+def _extent(means: Float[Tensor, "n 3"]) -> float:
+    """The longest side of the box that holds all means but the outermost hundredths; 0 for none."""
+    if len(means) == 0:
+        return 0.0
+    ranked, last = means.sort(dim=0).values, len(means) - 1
+    low, high = round(0.01 * last), round(0.99 * last)
+    return float((ranked[high] - ranked[low]).max())
+
+
+def largest_share(gaussians: Gaussians, views: list[View]) -> float:
+    """The largest standard deviation, as a share of what a Gaussian of its distance may have."""
+    nearest = torch.cdist(gaussians.means, torch.stack([view.center for view in views])).amin(dim=1)
+    return float((gaussians.scales.amax(dim=1).exp() / (GIANT_ANGLE * nearest)).max())
 
 
 def ordering_gap(lab: Lab, trained: Trained, views: list[View]) -> float:
@@ -69,18 +71,18 @@ def giants(lab: Lab) -> Finding:
     stage = make_stage(views=ring(12), points=400)
     tree = build_kd(stage.start().means, BLOCKS)
     start, numbers, said = with_giants(stage.start(), tree), {}, {}
-    before = largest_share(start, tree, stage.views)
+    before = largest_share(start, stage.views)
     eager = DensityConfig(refine_start=0.0, refine_stop=1.0)
     for name, heal in (("abcd", True), ("abcd, not healing", False)):
         options = {"budget": lab.views_drawn(320), "tree": tree, "warmup": 0.0, "density": eager}
         trained = lab.train(stage, start=start, heal=heal, **options)
-        after = largest_share(trained.gaussians, tree, stage.views)
+        after = largest_share(trained.gaussians, stage.views)
         gap = ordering_gap(lab, trained, stage.held_out[:4])
         held = [event.visit for event in trained.of(Mended) if event.what == "giants"]
         numbers |= {f"largest {name}": after, f"gap {name}": gap, f"visits {name}": len(held)}
         said[name] = f"largest {before:.1f} -> {after:.2f} of what is allowed, gap {gap:.0f} dB"
     mono = lab.train(stage, "abcd-monolithic", start=start, budget=lab.views_drawn(320), density=eager)
-    left = largest_share(mono.gaussians, tree, stage.views)
+    left = largest_share(mono.gaussians, stage.views)
     said["abcd-monolithic"] = f"largest {before:.1f} -> {left:.2f}"
     passed = numbers["largest abcd"] < 1.25 and numbers["gap abcd"] >= GAP_DB and numbers["visits abcd"] > 0
     return Finding(passed, said, {"largest before": before, **numbers, "largest abcd-monolithic": left})
