@@ -54,7 +54,7 @@ def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, sta
             monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
         folder = tmp_path / str(watched)
         folder.mkdir()
-        options = {"blocks": 2, "steps": 18, "density": GROWING, "scaffold": 60}
+        options = {"blocks": 2, "steps": 18, "density": GROWING, "scaffold": 120}
         coordinator = make_coordinator(folder, start, views, heal=watched, **options)
         told = listen(coordinator, Mended | VisitUndone)
         train(coordinator, photos)
