@@ -175,8 +175,11 @@ class Coordinator(StepDrawing):
             self._clocks = replace(self._clocks, resets=clock.steps // self.config.density.reset_every)
         if infos and self.density.is_due(clock):
             self._clocks = replace(self._clocks, refined=clock.steps)
-            if self.health.acts:
-                self.health.hold_back_giants(self.views.values())
+            self._hold_back_giants()
+
+    def _hold_back_giants(self) -> None:
+        if self.health.acts:
+            self.health.hold_back_giants(self.views.values())
 
     @property
     def _progress_of_blocks(self) -> float:
@@ -263,6 +266,8 @@ class Coordinator(StepDrawing):
         attach(rest, self.params, self.optimizers)
         self.health.begin_visit(active, self.state.health)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
+        if active.done == 0 and not active.is_whole:
+            self._hold_back_giants()
         block = None if active.is_whole else active.geometry.block
         self.scene.lay_over(block, lambda: live_gaussians(self.params))
         self._order = self._order_of(active)
