@@ -226,6 +226,18 @@ def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, 
     assert torch.equal(scales[2:], kept)
 
 
+def test_giants_are_held_back_in_visits_that_refine_nothing(tmp_path, views, photos, start):
+    start.scales[0] = 5.0
+    still = DensityConfig(strategy="off")
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=20, warmup=0.0, density=still)
+    told = listen(coordinator, Mended)
+    train(coordinator, photos)
+    assert {event.what for event in told} == {"giants"}
+    scene = whole_scene(coordinator)
+    nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
+    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) < 1.2 * health_rules.GIANT_ANGLE
+
+
 def test_what_no_picture_can_show_is_dropped_and_no_picture_changes(tmp_path, views, photos, start):
     start.opacities[::5] = -7.0
     density = dataclasses.replace(GROWING, cull_alpha_thresh=0.0, refine_stop=0.0)
