@@ -43,9 +43,7 @@ def with_giants(start: Gaussians, tree, sigmas=SIGMAS) -> Gaussians:
 
 
 def _extent(means: Float[Tensor, "n 3"]) -> float:
-    """The longest side of the box that holds all means but the outermost hundredths; 0 for none."""
-    if len(means) == 0:
-        return 0.0
+    """The longest side of the box that holds all means but the outermost hundredths."""
     ranked, last = means.sort(dim=0).values, len(means) - 1
     low, high = round(0.01 * last), round(0.99 * last)
     return float((ranked[high] - ranked[low]).max())
