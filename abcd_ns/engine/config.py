@@ -43,7 +43,7 @@ class TrainingConfig:
     processes: int = 0
     """Processes that share the views of a step where there is no GPU; 0 takes as many as torch has threads,
     `batch` at most. Rounding depends on it."""
-    influence_share: float = 0.98
+    influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
     visit_views: int = 32
