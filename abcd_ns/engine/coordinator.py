@@ -44,6 +44,7 @@ from abcd_ns.engine.schedule import (
     view_order,
     views_of_member,
     views_per_step,
+    views_per_warm_up_step,
 )
 from abcd_ns.engine.settle import at_rest, count_at_rest, has_scaffold, settle
 from abcd_ns.engine.share import Target, Task
@@ -107,7 +108,9 @@ class Coordinator(StepDrawing):
 
     @property
     def batch(self) -> int:
-        """Views in a step, the warm-up's apart."""
+        """Views in a step of the visit that is under way."""
+        if self.state.active is not None and self.state.active.is_whole:
+            return views_per_warm_up_step(self.config.batch)
         return views_per_step(self.config.batch, self.scene.tree.num_blocks)
 
     def _density_control(self) -> DensityControl:
@@ -136,20 +139,22 @@ class Coordinator(StepDrawing):
             self._begin_visit()
         active = self._active
         decay = exponential_decay(self.progress, 1.0, self.config.means_lr_decay)
-        views = 1 if active.is_whole else self.batch
-        self._pace.set(views, means_decay=decay, damping=self.health.damping)
+        self._pace.set(self.batch, means_decay=decay, damping=self.health.damping)
         if self._crew is not None:
             task = Task(active.done, self.state.step, self._degree_drawn)
             self._crew.begin(live_gaussians(self.params), task)
-        samples = enumerate(self._next_views(active))
+        samples = enumerate(self._views_of_step(active, self._order, active.done))
         step = self.state.step
         return Batch(step, tuple(self._sample(view, place, step) for place, view in samples))
 
-    def _next_views(self, active: ActiveVisit) -> tuple[int, ...]:
-        if active.is_whole:
-            return (endless_order(active.views, active.done, self.config.seed),)
+    def _views_of_step(
+        self, active: ActiveVisit, order: tuple[int, ...], done: int, member: int = 0
+    ) -> tuple[int, ...]:
         each = self.batch // active.crew
-        return self._order[active.done * each : (active.done + 1) * each]
+        if active.is_whole:  # nobody knows how many steps there will be
+            places = range(done * self.batch + member * each, done * self.batch + (member + 1) * each)
+            return tuple(endless_order(active.views, place, self.config.seed) for place in places)
+        return order[done * each : (done + 1) * each]
 
     def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
         """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done."""
@@ -253,7 +258,7 @@ class Coordinator(StepDrawing):
             self.state.active = self._planner.warm_up(degree, began)
         else:
             self.state.active = self._planner.next_visit(self.state, degree, began)
-            self.state.active.crew = self._size_of_crew(self.state.active)
+        self.state.active.crew = self._size_of_crew(self.state.active)
         self.state.visit += 1
         self._attach(self.state.active)
 

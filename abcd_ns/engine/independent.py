@@ -174,12 +174,18 @@ class IndependentCoordinator(Coordinator):
         if self.state.active is not None and self.progress >= self._active.until:
             self._end_visit()
 
-    def _next_views(self, active: ActiveVisit) -> tuple[int, ...]:
-        first, seed = active.done * self.batch, self.config.seed
+    def _views_of_step(
+        self,
+        active: ActiveVisit,
+        order: tuple[int, ...],  # noqa: ARG002
+        done: int,
+        member: int = 0,  # noqa: ARG002
+    ) -> tuple[int, ...]:
+        first, seed = done * self.batch, self.config.seed
         return tuple(endless_order(active.views, first + k, seed) for k in range(self.batch))
 
     def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:  # noqa: ARG002
-        return ()  # endless: see _next_views
+        return ()  # endless: see _views_of_step
 
     def _density_clock(self, taken: int) -> DensityClock:
         """On the visit's share, with room for the block's part of the scene's limit."""

@@ -12,7 +12,7 @@ import torch
 
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.painter import LEAST_PASS
-from abcd_ns.engine.schedule import views_per_step
+from abcd_ns.engine.schedule import views_per_step, views_per_warm_up_step
 from abcd_ns.engine.visit import AT_HAND_BYTES, PARTS_BYTES
 from abcd_ns.errors import UserError
 
@@ -73,8 +73,7 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
         block: Gaussians of the largest block, one of several.
         pixels: of the largest image.
     """
-    # The warm-up draws one view a step, and has no neighbours.
-    batches = views_per_step(config.batch, blocks=2), 1
+    batches = views_per_step(config.batch, blocks=2), views_per_warm_up_step(config.batch)
     visit, warm_up = (DeviceNeeds(pixels, batch, config.sh_degree) for batch in batches)
     return config.scaffold_gaussians or warm_up.block_limit(visit.bytes_for(block))
 

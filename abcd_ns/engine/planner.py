@@ -19,6 +19,7 @@ from abcd_ns.engine.schedule import (
     plan_sweep,
     views_per_step,
     views_per_visit,
+    views_per_warm_up_step,
     visit_views,
 )
 from abcd_ns.engine.types import View
@@ -61,7 +62,8 @@ class Planner:
         geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
         if self._config.scaffold_passes:
-            taken = min(taken, self._config.scaffold_passes * len(crops))
+            uses = self._config.scaffold_passes * len(crops)
+            taken = min(taken, math.ceil(uses / views_per_warm_up_step(self._config.batch)))
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
     def next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
+WARM_UP_BATCH = 2
+"""Views in a step of the warm-up, at most: as many as the processors of a small machine, for more of them
+leave less room for Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,11 @@ def plan_sweep(
 def views_per_step(batch: int, blocks: int) -> int:
     """`TrainingConfig.batch`, its 0 resolved."""
     return batch or (1 if blocks == 1 else DEFAULT_BATCH)
+
+
+def views_per_warm_up_step(batch: int) -> int:
+    """How many views a step of the warm-up draws, which only scenes of several blocks have."""
+    return min(views_per_step(batch, blocks=2), WARM_UP_BATCH)
 
 
 def views_per_visit(seen: int, most_seen: int, limit: int) -> int:

@@ -41,7 +41,7 @@ class StepDrawing(ABC):
     density: DensityControl
     health: Health
     batch: int
-    """Views in a step, the warm-up's apart."""
+    """Views in a step of the visit that is under way."""
     sh_degree: int
     """The degree of spherical harmonics in use."""
     _rasterizer: Rasterizer
@@ -61,6 +61,12 @@ class StepDrawing(ABC):
     @abstractmethod
     def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:
         """The views that a member of the crew draws in a visit, in order."""
+
+    @abstractmethod
+    def _views_of_step(
+        self, active: ActiveVisit, order: tuple[int, ...], done: int, member: int = 0
+    ) -> tuple[int, ...]:
+        """Those that it draws in the step after `done` others."""
 
     @abstractmethod
     def _draw_layers(self, active: ActiveVisit, order: tuple[int, ...]) -> VisitLayers | None:
@@ -156,9 +162,9 @@ class StepDrawing(ABC):
     def _draw_share(
         self, active: ActiveVisit, member: int, order: tuple[int, ...], gaussians: Gaussians, task: Task
     ) -> Share:
-        each = self.batch // active.crew
-        views = order[task.done * each : (task.done + 1) * each]
-        samples = [self._sample(view, member * each + k, task.step) for k, view in enumerate(views)]
+        views = self._views_of_step(active, order, task.done, member)
+        first = member * len(views)
+        samples = [self._sample(view, first + k, task.step) for k, view in enumerate(views)]
         rendered = self._draw(gaussians, samples, task.sh_degree)
         return share_of(
             gaussians, samples, rendered, self._target, self.config, self.density, views=self.batch

@@ -9,6 +9,7 @@ from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.initialize import split_off
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.scaffold import RESERVE, REVEALED_OPACITY, WAITING, blocks_at_rest
+from abcd_ns.engine.schedule import WARM_UP_BATCH
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import make_coordinator, whole_scene
@@ -58,8 +59,9 @@ def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, ph
     assert coordinator.state.active.is_whole
     assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == 30
     batch = coordinator.next_batch()
-    assert [sample.crop for sample in batch.samples] == [views[0].full]
-    assert batch.samples[0].layers is None
+    assert [sample.crop for sample in batch.samples] == [views[0].full] * WARM_UP_BATCH
+    assert all(sample.layers is None for sample in batch.samples)
+    assert len({sample.view.index for sample in batch.samples}) == WARM_UP_BATCH
 
 
 def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, start):
@@ -158,7 +160,7 @@ def test_density_controls_clock_starts_when_the_warm_up_is_over(tmp_path, views,
     assert found == pytest.approx([(step + 1) / 20 for step in range(20)])
 
 
-@pytest.mark.parametrize(("passes", "expected"), [(1, 1), (2, 2), (0, 5)])
+@pytest.mark.parametrize(("passes", "expected"), [(1, 3), (2, 5), (0, 25)])
 def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     tmp_path, views, photos, start, passes, expected
 ):
@@ -178,8 +180,8 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
     while not ended:
         train_step(coordinator, photos)
-    assert coordinator.state.step == expected * len(views)
-    assert coordinator.state.warm == pytest.approx(expected / 10)
+    assert coordinator.state.step == expected
+    assert coordinator.state.warm == pytest.approx(expected / (10 * len(views)))
     assert not coordinator.state.active
     train_step(coordinator, photos)
     rest = 10 * len(views) - coordinator.state.step + 1

@@ -4,6 +4,7 @@ import pytest
 
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.memory import DeviceNeeds, scaffold_size
+from abcd_ns.engine.schedule import WARM_UP_BATCH
 from abcd_ns.engine.splitting import FULL
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.room import GB, check_room, device_budget, find_room
@@ -29,14 +30,9 @@ def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
 @pytest.mark.parametrize("pixels", [160 * 106, PIXELS])
 def test_the_warm_up_takes_what_a_visit_takes_and_no_more(block, pixels):
     size = scaffold_size(TRAINING, block, pixels)
-    visit, warm_up = DeviceNeeds(pixels, batch=4), DeviceNeeds(pixels, batch=1)
+    visit, warm_up = DeviceNeeds(pixels, batch=4), DeviceNeeds(pixels, batch=WARM_UP_BATCH)
     assert warm_up.bytes_for(size) <= visit.bytes_for(block) < warm_up.bytes_for(size + 1)
     assert size > block
-
-
-def test_the_warm_up_may_be_as_large_as_a_sole_block():
-    room = find_room(8 * GB, pixels=PIXELS, points=30_000_000, training=TRAINING)
-    assert abs(scaffold_size(TRAINING, room.limit, PIXELS) - room.sole) <= 1
 
 
 def test_the_warm_up_has_the_size_that_is_asked_for():

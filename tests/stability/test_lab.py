@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.schedule import WARM_UP_BATCH
 from abcd_ns.tools.stability.lab import steps_for
 
 
@@ -20,5 +21,5 @@ def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, passes, blocks):
     config = TrainingConfig(warmup=0.2, batch=0, scaffold_passes=passes)
     steps = steps_for(drawn, config, blocks, views)
     batch, share = (1, 0.0) if blocks == 1 else (4, config.warmup)
-    warm = min(math.ceil(share * steps), passes * views or steps)
-    assert warm + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)
+    warm = min(math.ceil(share * steps), math.ceil(passes * views / WARM_UP_BATCH) or steps)
+    assert warm * WARM_UP_BATCH + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)

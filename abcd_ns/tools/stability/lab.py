@@ -26,7 +26,7 @@ from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.schedule import views_per_step
+from abcd_ns.engine.schedule import views_per_step, views_per_warm_up_step
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -233,14 +233,13 @@ class Lab:
 
 
 def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int) -> int:
-    """Steps that draw about so many views of `views`: one each in the warm-up and with one block, else a
-    batch."""
-    batch = views_per_step(config.batch, blocks)
+    """Steps that draw about so many views of `views`, in the warm-up and after it."""
+    batch, batch_warm = views_per_step(config.batch, blocks), views_per_warm_up_step(config.batch)
     warmup = config.warmup if blocks > 1 else 0.0
-    steps = drawn / (warmup + (1 - warmup) * batch)
-    longest = config.scaffold_passes * views
+    steps = drawn / (warmup * batch_warm + (1 - warmup) * batch)
+    longest = config.scaffold_passes * views / batch_warm
     if 0 < longest < warmup * steps:
-        steps = longest + (drawn - longest) / batch
+        steps = longest + (drawn - longest * batch_warm) / batch
     return max(round(steps), 1)
 
 
