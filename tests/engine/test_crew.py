@@ -23,6 +23,8 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 pytestmark = pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
 GROWING = DensityConfig(refine_start=0.0, refine_stop=0.8, refine_every=5, densify_grad_thresh=1e-5)
 """So that blocks grow within a visit."""
+WARM = {"scaffold": 40, "warmup": 0.3, "steps": 40}
+"""A run that begins with a warm-up."""
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +110,27 @@ def test_what_density_control_counts_is_that_of_all_views(make, photos):
     crew.dismiss()
 
 
-def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch):
+def test_a_step_of_the_warm_up_draws_what_a_single_process_would(make, photos):
+    shared, alone = make("shared", **WARM), make("alone", 1, **WARM)
+    for _ in range(5):
+        (own,) = shared.next_batch().samples
+        active = shared.state.active
+        assert active.is_whole
+        assert active.crew == 2
+        helped = shared._views_of_step(active, (), active.done, member=1)
+        assert [own.view.index, *helped] == [s.view.index for s in alone.next_batch().samples]
+        train_step(shared, photos)
+        train_step(alone, photos)
+    one, other = whole_scene(shared), whole_scene(alone)
+    for name in PARAM_NAMES:
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-3, atol=1e-4)
+    shared._crew.dismiss()
+
+
+@pytest.mark.parametrize("options", [{}, WARM], ids=["blocks", "warm-up"])
+def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch, options):
     """Nor on those that are killed in the midst of it."""
-    helped, lost, never = make("helped"), make("lost"), make("never")
+    helped, lost, never = (make(name, **options) for name in ("helped", "lost", "never"))
     train(helped, photos)
     while not lost.finished:
         train_step(lost, photos)
@@ -135,14 +155,14 @@ def test_a_block_that_outgrows_the_shared_memory_is_trained_all_the_same(make, p
     assert equal(whole_scene(wide), whole_scene(narrow))
 
 
-@pytest.mark.parametrize("stop", [3, 8, 17])
-def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, stop):
-    straight, stopped = make("straight"), make("stopped")
+@pytest.mark.parametrize(("options", "stop"), [({}, 3), ({}, 8), ({}, 17), (WARM, 5), (WARM, 12)])
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, options, stop):
+    straight, stopped = make("straight", **options), make("stopped", **options)
     train(straight, photos)
     train(stopped, photos, steps=stop)
     stopped.save()
     stopped.scene.store.close()
-    resumed = make("stopped", resume=True)
+    resumed = make("stopped", resume=True, **options)
     train(resumed, photos)
     assert equal(whole_scene(straight), whole_scene(resumed))
 
