@@ -27,6 +27,8 @@ KNEE_LINE = 0.065
 """Height of a line of text, as a share of the axis' height."""
 BETTER, WORSE, SAME = "#007A5A", "#D55E00", "#666666"
 ROW_INCHES, LINE_INCHES = 0.3, 0.17
+CHANCE = 0.25
+"""How far the axis of differences reaches at least, dB: what chance does must not fill the chart."""
 COLUMNS = ("change", "PSNR", "Gaussians")
 """Numbers beside the bars, right-aligned at COLUMN_POINTS from the axis."""
 COLUMN_POINTS = (40, 80, 140)
@@ -279,6 +281,8 @@ def _draw_options(results: StudyResults) -> Figure | None:
     axes.spines["left"].set_visible(False)
     axes.set_ylim(-0.6, len(rows) - 0.1)
     axes.margins(x=0.08)
+    low, high = axes.get_xlim()
+    axes.set_xlim(min(low, -CHANCE), max(high, CHANCE))
     dots = "; dots: seeds" if len(default.runs) > 1 else ""
     axes.set_xlabel(f"held-out PSNR against the default's (dB){dots}")
     axes.set_title(f"{_title(results, default.method)}\ndefault: {default.psnr:.2f} dB", loc="left")

@@ -140,6 +140,11 @@ def test_the_written_table_begins_with_what_was_found(make, tmp_path):
 # Charts
 
 
+def texts_of(svg: Path) -> list[str]:
+    nodes = ET.fromstring(svg.read_bytes()).iter("{http://www.w3.org/2000/svg}text")
+    return ["".join(node.itertext()) for node in nodes]
+
+
 @pytest.mark.parametrize("seeds", [(0,), (0, 1, 2)])
 @pytest.mark.parametrize("make", STUDIES)
 def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp_path):
@@ -150,15 +155,25 @@ def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp
         assert [path.name for path in paths] == [f"{study.study}.png", f"{study.study}.svg"]
         drawn.append(paths[1].read_bytes())
     assert drawn[0] == drawn[1]
-    texts = [
-        "".join(node.itertext()) for node in ET.fromstring(drawn[0]).iter("{http://www.w3.org/2000/svg}text")
-    ]
+    texts = texts_of(paths[1])
     wanted = {
         "blocks": ["held-out PSNR (dB)", "blocks", "27", "Gaussians", "peak RAM (GiB)", "best - 0.5 dB"],
         "gaussians": ["held-out PSNR (dB)", "32k", "knee 16k"],
         "options": ["training.warmup=0", "change", "PSNR", "Gaussians"],
     }[study.study]
     assert [text for text in wanted if text not in texts] == []
+
+
+def test_what_chance_does_hardly_shows_in_a_chart_of_options(tmp_path):
+    near = made_up_arm("default", None, {0: 25.0}), made_up_arm("training.batch=1", None, {0: 25.01})
+    _, svg = draw_study(made_up_study("options", *near), tmp_path)
+    ticks = [
+        float(t.replace("\N{MINUS SIGN}", "-"))
+        for t in texts_of(svg)
+        if t.strip("\N{MINUS SIGN}.0123456789") == ""
+    ]
+    assert min(ticks) <= -0.2
+    assert max(tick for tick in ticks if tick < 20) >= 0.2
 
 
 @pytest.mark.parametrize("study", ["blocks", "gaussians", "options"])
