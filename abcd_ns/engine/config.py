@@ -36,7 +36,7 @@ class TrainingConfig:
     """Gaussians of the scaffold; 0 takes as many as the memory of a visit allows."""
     batch: int = 0
     """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and 4 elsewhere: with
-    small blocks a step's overhead would outweigh its work."""
+    small blocks a step's overhead would outweigh its work. The warm-up draws 2 at most."""
     batch_power: float = 0.75
     """Learning rates grow with this power of the views in a step: 0.5 suits gradients that are noise, 1 such
     as agree. A scene's views show different Gaussians, but a block's all show the same ones."""
