@@ -151,7 +151,7 @@ class Coordinator(StepDrawing):
         self, active: ActiveVisit, order: tuple[int, ...], done: int, member: int = 0
     ) -> tuple[int, ...]:
         each = self.batch // active.crew
-        if active.is_whole:  # nobody knows how many steps there will be
+        if not order:  # nobody knows how many steps there will be
             places = range(done * self.batch + member * each, done * self.batch + (member + 1) * each)
             return tuple(endless_order(active.views, place, self.config.seed) for place in places)
         return order[done * each : (done + 1) * each]

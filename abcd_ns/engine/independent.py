@@ -36,7 +36,7 @@ from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.scaffold import blocks_at_rest, join
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.schedule import endless_order, exponential_decay, plan_sweep, sh_degree_at
+from abcd_ns.engine.schedule import exponential_decay, plan_sweep, sh_degree_at
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitGeometry, survey
 
@@ -174,18 +174,8 @@ class IndependentCoordinator(Coordinator):
         if self.state.active is not None and self.progress >= self._active.until:
             self._end_visit()
 
-    def _views_of_step(
-        self,
-        active: ActiveVisit,
-        order: tuple[int, ...],  # noqa: ARG002
-        done: int,
-        member: int = 0,  # noqa: ARG002
-    ) -> tuple[int, ...]:
-        first, seed = done * self.batch, self.config.seed
-        return tuple(endless_order(active.views, first + k, seed) for k in range(self.batch))
-
     def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:  # noqa: ARG002
-        return ()  # endless: see _views_of_step
+        return ()  # nobody knows how many steps there will be
 
     def _density_clock(self, taken: int) -> DensityClock:
         """On the visit's share, with room for the block's part of the scene's limit."""

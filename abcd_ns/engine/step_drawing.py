@@ -60,7 +60,8 @@ class StepDrawing(ABC):
 
     @abstractmethod
     def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:
-        """The views that a member of the crew draws in a visit, in order."""
+        """The views that a member of the crew draws in a visit, in order; none where nobody knows how many
+        steps it will have, and its views are drawn in turn."""
 
     @abstractmethod
     def _views_of_step(

@@ -35,6 +35,11 @@ def test_the_warm_up_takes_what_a_visit_takes_and_no_more(block, pixels):
     assert size > block
 
 
+def test_the_warm_up_is_larger_than_a_block_and_smaller_than_a_sole_one():
+    room = find_room(8 * GB, pixels=PIXELS, points=30_000_000, training=TRAINING)
+    assert room.limit < scaffold_size(TRAINING, room.limit, PIXELS) < room.sole
+
+
 def test_the_warm_up_has_the_size_that_is_asked_for():
     assert scaffold_size(TrainingConfig(scaffold_gaussians=500), 3_333, PIXELS) == 500
 
