@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.schedule import WARM_UP_BATCH
-from abcd_ns.tools.stability.lab import steps_for
+from abcd_ns.tools.stability.lab import Lab, make_stage, steps_for
 
 
 @given(
@@ -23,3 +23,10 @@ def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, passes, blocks):
     batch, share = (1, 0.0) if blocks == 1 else (4, config.warmup)
     warm = min(math.ceil(share * steps), math.ceil(passes * views / WARM_UP_BATCH) or steps)
     assert warm * WARM_UP_BATCH + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)
+
+
+def test_a_labs_seed_is_that_of_its_trainings_unless_they_name_one(tmp_path):
+    stage = make_stage()
+    lab = Lab(tmp_path, compile="never", seed=3)
+    assert lab.coordinator(stage.start(), stage.views, budget=100).config.seed == 3
+    assert lab.coordinator(stage.start(), stage.views, budget=100, seed=5).config.seed == 5

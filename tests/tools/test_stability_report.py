@@ -119,3 +119,8 @@ def test_the_command_writes_a_report(tmp_path, capsys):
     report = read_report(tmp_path / "out" / "stability.json")
     assert [outcome.id for outcome in report.outcomes] == ["A7", "A21"]
     assert "2 of 2 scenarios pass." in printed
+
+
+def test_a_seed_below_0_is_refused(tmp_path, capsys):
+    assert cli.main(["stability", "--out", str(tmp_path / "out"), "--only", "A7", "--seed", "-1"]) == 2
+    assert "--seed is -1; it must be at least 0." in " ".join(capsys.readouterr().err.split())

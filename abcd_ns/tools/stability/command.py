@@ -39,6 +39,7 @@ def stability(
     downscale: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="A1 A3 ...", help_behavior_hint="")] = (),
     quick: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")] = False,
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
 ) -> int:
     """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
 
@@ -52,6 +53,7 @@ def stability(
         downscale: Divides the width and height of its photos.
         only: Scenarios to carry out, by id, without the charts.
         quick: A third of the training, no charts: to see that everything works. Its rules may fail.
+        seed: Of every training.
 
     Raises:
         UserError: an option cannot be used, or OUT holds something else.
@@ -59,6 +61,8 @@ def stability(
     claim(out)
     if downscale < 1:
         raise UserError(f"--downscale is {downscale}; it must be at least 1.")
+    if seed < 0:
+        raise UserError(f"--seed is {seed}; it must be at least 0.")
     console = Console()
     known = dict(SCENARIOS)
     if data is not None:
@@ -75,7 +79,7 @@ def stability(
 
     with tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder, _bar(console) as progress:
         meter = Meter(progress, sum(scenario.cost for scenario in chosen) + sum(map(len, wanted)))
-        lab = Lab(Path(folder), quick=quick, tick=meter.step)
+        lab = Lab(Path(folder), quick=quick, seed=seed, tick=meter.step)
         outcomes = carry_out(lab, chosen, wanted, meter, keep)
     for path in paths:
         console.print(str(path), highlight=False, markup=False, soft_wrap=True)

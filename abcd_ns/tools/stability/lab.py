@@ -117,6 +117,7 @@ class Lab:
     Args:
         compile: of the rasterizer; "never" where last bits must not depend on the machine.
         quick: a third of the work, to see that everything runs.
+        seed: of every training that names none.
         tick: called after every training step.
     """
 
@@ -126,9 +127,10 @@ class Lab:
         *,
         compile: Literal["auto", "never"] = "auto",
         quick: bool = False,
+        seed: int = 0,
         tick: Callable[[], None] = lambda: None,
     ) -> None:
-        self.quick, self.tick = quick, tick
+        self.quick, self.seed, self.tick = quick, seed, tick
         self._scores: dict[str, float] = {}
         self.rasterizer = TorchRasterizer(compile)
         self._folder = folder
@@ -158,7 +160,8 @@ class Lab:
             optimizers: parameters and their optimizers; new ones if left out.
             training: options of TrainingConfig.
         """
-        options = {"sh_degree": start.sh_degree, "layers": method != "abcd-ablated", **training}
+        usual = {"sh_degree": start.sh_degree, "layers": method != "abcd-ablated", "seed": self.seed}
+        options = {**usual, **training}
         tree = tree or build_kd(start.means, blocks)
         if method == "abcd-monolithic":
             tree = build_kd(start.means, 1)
