@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from abcd_ns.engine.density import DensityConfig
-from abcd_ns.engine.rasterizer import Rasterizer
 
 
 @dataclass
@@ -19,13 +18,14 @@ class TrainingConfig:
     exact: bool = False
     """Exact joint training: every step trains all blocks, one at a time on the device, each drawn twice.
     Slow; the reference for gradients. There are no visits, so what concerns them has no effect."""
-    ownership: Literal["auto", "fragments", "means"] = "auto"
+    ownership: Literal["fragments", "means"] = "fragments"
     """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
-    paper). `auto` takes fragments where the rasterizer can mask by depth."""
+    paper)."""
     window_weight: float = 0.06
-    """Frozen fragments between a block's nearest and farthest ones are sorted in with these, in each 4 x 4
-    pixels. This much of their weight, in a picture of the block alone, may be nearer than the nearest that
-    counts, and as much farther than the farthest; 0 counts all, which is exact and dear."""
+    """Frozen fragments between a block's nearest and farthest ones are sorted in with these, in each tile of
+    4 x 4 pixels (gsplat: 16 x 16). This much of their weight, in a picture of the block alone, may be nearer
+    than the nearest that counts, and as much farther than the farthest; 0 counts all, which is exact and
+    dear."""
     warmup: float = 0.2
     """Share of the run, at most, for which a scaffold is trained before blocks are: as many Gaussians, all
     over the scene, as take no more memory than a visit to the largest block. 0 for none."""
@@ -101,12 +101,3 @@ class TrainingConfig:
         rooms = [] if self.density.limit is None else [self.density.limit - scene]
         rooms += [limit - block] if limit else []
         return min(rooms, default=None)
-
-
-def resolve_ownership(
-    wanted: Literal["auto", "fragments", "means"], rasterizer: Rasterizer
-) -> Literal["fragments", "means"]:
-    """What `auto` means for a rasterizer."""
-    if wanted == "auto":
-        return "fragments" if rasterizer.supports_z_window else "means"
-    return wanted

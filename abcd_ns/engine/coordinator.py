@@ -15,7 +15,7 @@ from torch import Tensor
 from abcd_ns.engine.batch import Batch, Rendered, Sample
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.config import TrainingConfig, resolve_ownership
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.crew import Crew
 from abcd_ns.engine.density import DensityClock, DensityControl, Infos, added, for_blocks
 from abcd_ns.engine.events import (
@@ -86,7 +86,7 @@ class Coordinator(StepDrawing):
     ) -> None:
         self.config, self.budget, self.scene, self.cache = config, budget, scene, cache
         self.params, self.optimizers = params, optimizers
-        self.views = {view.index: view.to(device) for view in views}
+        self.views = {view.index: view for view in views}
         self.device = torch.device(device)
         self.announce = Announcer()
         self.stopwatch = Stopwatch()
@@ -94,7 +94,6 @@ class Coordinator(StepDrawing):
         self.state = RunState()
         self._scene_key, self._at_hand_bytes = scene_key, at_hand_bytes
         self._rasterizer = rasterizer
-        self._ownership = resolve_ownership(config.ownership, rasterizer)
         self._planner = Planner(config, budget, scene, self.views, rasterizer, device=self.device)
         self._pace = Pace(optimizers, config.batch_power)
         heals = {"may_act": config.heal and config.layers, "may_drop": config.density.strategy == "default"}
@@ -310,7 +309,7 @@ class Coordinator(StepDrawing):
             self._surroundings(),
             list(self.views.values()),
             self._rasterizer,
-            ownership=self._ownership,
+            ownership=self.config.ownership,
             pass_gaussians=self.config.pass_gaussians or default_pass(self.scene),
             device=self.device,
         )

@@ -12,17 +12,23 @@ from torch import Tensor
 
 from abcd_ns.engine.blocks import Box, in_float64
 from abcd_ns.engine.types import Crop, Gaussians, View
-from abcd_ns.engine.visibility import BLUR_PIXELS, blur_reach, reach_radius, widest_slant
+from abcd_ns.engine.visibility import (
+    BLUR_PIXELS,
+    half_diagonal,
+    reach_radius,
+    widest_slant,
+    world_size,
+)
 
 BOUNDS_SLANT = 3.0
 """The largest `widest_slant` that bounds allow for: fields of view up to about 140 degrees."""
-FRUSTUM_MARGIN = 2.0 + BLUR_PIXELS
-"""Frusta are this much wider than their crop, px: the screen's blur, and generously for rounding."""
+ROUNDING = 2.0
+"""Frusta are this much wider than what they must hold, px; generously."""
 EVERYWHERE = Box(torch.full((3,), -torch.inf).double(), torch.full((3,), torch.inf).double())
 
 
 def bounds_of(gaussians: Gaussians) -> Box | None:
-    """A box that holds the means and, but for the screen's blur, all that any view may draw of them.
+    """A box that holds the means and, but for the screen's slack, all that any view may draw of them.
 
     None without Gaussians; all of space where a mean or a size is not finite.
     """
@@ -43,11 +49,15 @@ def intersection(a: Box, b: Box) -> Box | None:
 
 
 class Frusta:
-    """What some crops look at: the space between five planes each, kept on the CPU."""
+    """What some crops look at: the space between five planes each, kept on the CPU.
 
-    def __init__(self, seen: Iterable[tuple[View, Crop]]) -> None:
+    Args:
+        tile_side: of the tiles in which fragments are given to cells, px; see intervals.py.
+    """
+
+    def __init__(self, seen: Iterable[tuple[View, Crop]], tile_side: int) -> None:
         self.seen = tuple(seen)
-        planes = [_planes(view, crop) for view, crop in self.seen]
+        planes = [_planes(view, crop, ROUNDING + screen_slack(tile_side)) for view, crop in self.seen]
         self._planes = torch.stack(planes) if planes else torch.zeros(0, 5, 4, dtype=torch.float64)
 
     def may_show(self, boxes: Sequence[Box]) -> Bool[Tensor, "n v"]:
@@ -63,7 +73,12 @@ class Frusta:
         return ~(inward < 0).all(dim=3).any(dim=2)
 
 
-def _planes(view: View, crop: Crop) -> Float64[Tensor, "5 4"]:
+def screen_slack(tile_side: int) -> float:
+    """How far beyond its own size a Gaussian may count on screen, px: blur, and half a tile's diagonal."""
+    return BLUR_PIXELS + half_diagonal(tile_side)
+
+
+def _planes(view: View, crop: Crop, margin: float) -> Float64[Tensor, "5 4"]:
     """(a, b) of each plane, a x + b >= 0 being the side that is seen."""
     matrix, K = in_float64(view.viewmat).cpu(), in_float64(view.K).cpu()
     x, y, z = matrix[:3]
@@ -72,8 +87,8 @@ def _planes(view: View, crop: Crop) -> Float64[Tensor, "5 4"]:
     planes = [near]
     for row, axis, start, size in ((x, 0, crop.x, crop.width), (y, 1, crop.y, crop.height)):
         pixel = K[axis, axis] * row + K[axis, 2] * z  # the pixel's coordinate times z
-        planes.append(pixel - (start - FRUSTUM_MARGIN) * z)
-        planes.append((start + size + FRUSTUM_MARGIN) * z - pixel)
+        planes.append(pixel - (start - margin) * z)
+        planes.append((start + size + margin) * z - pixel)
     return torch.stack(planes)
 
 
@@ -83,24 +98,30 @@ def _corners(boxes: Float64[Tensor, "n 2 3"]) -> Float64[Tensor, "n 8 3"]:
 
 
 class Optics:
-    """Bounds over all views, for tests of reach that do not depend on the view."""
+    """Bounds over all views, for tests of reach that do not depend on the view.
 
-    def __init__(self, views: Sequence[View]) -> None:
+    Args:
+        tile_side: of the tiles in which fragments are given to cells, px; see intervals.py.
+    """
+
+    def __init__(self, views: Sequence[View], tile_side: int) -> None:
         centers = torch.stack([view.center.double().cpu() for view in views])
         self._middle = centers.mean(dim=0)
         self._spread = float((centers - self._middle).norm(dim=1).max())
         self._widest = min(views, key=lambda view: float(view.K.diagonal()[:2].min()))
+        self._pixels = screen_slack(tile_side)
         self.slant = max(widest_slant(view) for view in views)
 
-    def blur(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """World size of the rasterizer's blur at each mean, as the farthest camera would see it."""
+    def slack(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """What the screen adds to the reach of Gaussians with these means, as the farthest camera would see
+        it; world units."""
         distance = (means - self._middle.to(means)).norm(dim=1) + self._spread
-        return blur_reach(distance, self._widest)
+        return world_size(self._pixels, distance, self._widest)
 
     def drawn_within(self, bounds: Box) -> Box:
-        """Where fragments of Gaussians with these bounds may lie, whatever the view; the blur included."""
+        """Where fragments of Gaussians with these bounds may lie, whatever the view; the slack included."""
         if self.slant > BOUNDS_SLANT or not bool(bounds.lower.isfinite().all()):
             return EVERYWHERE
-        # The blur grows with the distance from a point, which is largest at a corner.
+        # The slack grows with the distance from a point, which is largest at a corner.
         corners = _corners(torch.stack((bounds.lower, bounds.upper))[None])[0]
-        return bounds.grown(float(self.blur(corners).max()))
+        return bounds.grown(float(self.slack(corners).max()))

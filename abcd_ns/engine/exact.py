@@ -79,7 +79,7 @@ class ExactCoordinator(Coordinator):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._optics = Optics(list(self.views.values()))
+        self._optics = Optics(list(self.views.values()), self._rasterizer.window_side)
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []
@@ -103,7 +103,7 @@ class ExactCoordinator(Coordinator):
         samples = []
         for place in range(self.batch):
             view = self.views[endless_order(rows, step * self.batch + place, self.config.seed)]
-            behind = background(self.config, step, place).to(view.viewmat)
+            behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
             samples.append(Sample(view, view.full, None, None, None, behind))
         return Batch(step, tuple(samples))
 
@@ -202,11 +202,11 @@ class ExactCoordinator(Coordinator):
     def _cells(self) -> Iterator[tuple[int, Int64[Tensor, "m"], Gaussians]]:
         """(block, rows, Gaussians on the device) of every layer that holds any."""
         everything, tree = self._all.gaussians, self.scene.tree
-        owner, blur = self._owner_of_all(), self._optics.blur(everything.means)
+        owner, slack = self._owner_of_all(), self._optics.slack(everything.means)
         for block in range(tree.num_blocks):
             inside = owner == block
-            if self._ownership == "fragments":
-                inside = inside | reaches(everything, tree.cell(block), blur, self._optics.slant)
+            if self.config.ownership == "fragments":
+                inside = inside | reaches(everything, tree.cell(block), slack, self._optics.slant)
             rows = inside.nonzero()[:, 0]
             if len(rows):
                 yield block, rows, everything[rows].to(self.device)
@@ -214,8 +214,9 @@ class ExactCoordinator(Coordinator):
     def _draw(self, block: int, gaussians: Gaussians, place: int) -> Raster:
         sample = self._batch.samples[place]
         window = None
-        if self._ownership == "fragments":
-            window = ray_interval(self.scene.tree.cell(block), sample.view, sample.crop)
+        if self.config.ownership == "fragments":
+            grid = self._rasterizer.window_grid(sample.crop)
+            window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
         options = {"antialiased": self.config.antialiased, "absgrad": self.density.absgrad}
         return self._rasterizer.draw(gaussians, [shot], sh_degree=self._degree, **options)[0]

@@ -33,6 +33,7 @@ from abcd_ns.engine.density import DensityClock
 from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.param_swap import live_gaussians
 from abcd_ns.engine.rasterizer import Rasterizer
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.scaffold import blocks_at_rest, join
 from abcd_ns.engine.scene import StoredScene
@@ -88,6 +89,10 @@ class Region:
     clear: Bool[Tensor, "h w"]
     """Behind the cell, or the ray misses it: the block must let all light through."""
 
+    def to(self, device: torch.device) -> "Region":
+        """On a device."""
+        return Region(self.own.to(device), self.clear.to(device))
+
     def __getitem__(self, crop: Crop) -> "Region":
         """The crop of a whole view's."""
         return Region(self.own[crop.slices], self.clear[crop.slices])
@@ -112,9 +117,10 @@ class Surfaces:
         """What every pixel of `view` is to a block with this cell."""
         camera = self._views[view]
         depth = self._depths[view].to(camera.viewmat)
-        span = ray_interval(cell, camera, camera.full)
-        own = (span.near <= depth) & (depth < span.far)
-        hidden = (depth < span.near) & span.near.isfinite()
+        span = ray_interval(cell, camera, TileGrid(camera.full, 1))
+        near, far = (plane.view_as(depth) for plane in (span.near, span.far))
+        own = (near <= depth) & (depth < far)
+        hidden = (depth < near) & near.isfinite()
         return Region(own, ~own & ~hidden)
 
     @staticmethod
@@ -248,7 +254,7 @@ class IndependentCoordinator(Coordinator):
         begun = self._joined(block).gaussians.to(self.device)
         crops = survey(begun, block, self.views.values(), self._rasterizer).crops
         for view, crop in crops.items():
-            region = self._surfaces.region(view, box)[crop]
+            region = self._surfaces.region(view, box)[crop].to(self.device)
             if bool((region.own | region.clear).any()):
                 self._regions[view], self._crops[view] = region, crop
 

@@ -2,12 +2,10 @@
 
 With ownership by *fragments* (design, section 2) a layer holds the fragments of one convex node of the
 block tree, drawn from all Gaussians that reach into it, so that folding layers gives the merged picture.
-With ownership by *means* a layer holds a node's own Gaussians whole, as the paper has it; that is what
-stock gsplat can draw.
+With ownership by *means* a layer holds a node's own Gaussians whole, as the paper has it.
 """
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -85,18 +83,20 @@ class Painter:
         pass_gaussians: int,
         device: torch.device | str = "cpu",
     ) -> None:
-        if ownership == "fragments" and not rasterizer.supports_z_window:
-            raise ValueError(f"{rasterizer.name} cannot mask fragments by depth: use ownership='means'")
         self.scene = scene
         self.rasterizer = rasterizer
         self.ownership = ownership
         self.device = torch.device(device)
         self._pass_gaussians = pass_gaussians
-        self._optics = Optics(views)
+        self._optics = Optics(views, rasterizer.window_side)
 
     @property
     def tree(self) -> BlockTree:
         return self.scene.tree
+
+    def frusta(self, seen: Iterable[tuple[View, Crop]]) -> Frusta:
+        """What crops look at, for `load`."""
+        return Frusta(seen, self.rasterizer.window_side)
 
     def units(self, exclude: int | None = None) -> tuple[int, ...]:
         """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass.
@@ -132,11 +132,11 @@ class Painter:
                 for k, (view, _) in enumerate(seen_by.seen)
                 if any(row[k] for row in shown.values())
             )
-        parts = [self.scene.gaussians(block) for block in inside]
+        # The live block is on the device already, the others are not.
+        parts = [self.scene.gaussians(block).to(self.device) for block in inside]
         own = sum(map(len, parts))
-        parts += [self.reaching(block, self.tree.box(unit)) for block in outside]
-        gaussians = Gaussians.cat(parts) if parts else Gaussians.empty()
-        return Loaded(gaussians.to(self.device), own, seen)
+        parts += [self.reaching(block, self.tree.box(unit)).to(self.device) for block in outside]
+        return Loaded(Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device), own, seen)
 
     def _shown(self, unit: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
         """Of these blocks, those with fragments in the unit that some crop may show, and which crops."""
@@ -152,8 +152,7 @@ class Painter:
     def reaching(self, block: int, box: Box) -> Gaussians:
         """The block's Gaussians that some view may see inside `box`."""
         gaussians = self.scene.gaussians(block)
-        blur = self._optics.blur(gaussians.means)
-        return gaussians[reaches(gaussians, box, blur, self._optics.slant)]
+        return gaussians[reaches(gaussians, box, self._optics.slack(gaussians.means), self._optics.slant)]
 
     def paint(
         self,
@@ -176,23 +175,28 @@ class Painter:
             layer = self._draw(gaussians, view, crop, settings, None)
             front = active is None or self._is_in_front(unit, active, view)
             return Parts(layer, nothing) if front else Parts(nothing, layer)
-        span = ray_interval(self.tree.box(unit), view, crop) if unit != 0 else _everywhere(crop, self.device)
+        span = self.span(unit, view, crop)
         if window is None:
             return Parts(self._draw(gaussians, view, crop, settings, span), nothing)
-        before = ZWindow(span.near, torch.minimum(span.far, window.near))
-        behind = ZWindow(torch.maximum(span.near, window.far), span.far)
         cut = self.rasterizer.cut(
             gaussians,
             view,
-            front=before,
+            front=span.before(window),
             inside=window,
-            back=behind,
+            back=span.behind(window),
             crop=crop,
             sh_degree=settings.sh_degree,
             antialiased=settings.antialiased,
         )
         # What reaches in from another unit is inside that one's.
         return Parts(cut.front, cut.back, cut.inside[torch.where(cut.members < loaded.own)[0]])
+
+    def span(self, unit: int, view: View, crop: Crop) -> ZWindow:
+        """Where the rays through the crop's tiles are inside a unit."""
+        grid = self.rasterizer.window_grid(crop)
+        if unit == 0:
+            return ZWindow.everything(grid, self.device, view.viewmat.dtype)
+        return ray_interval(self.tree.box(unit), view, grid, self.device)
 
     def order(self, units: Sequence[int], view: View) -> tuple[int, ...]:
         """The units front to back, as `view` sees them."""
@@ -230,7 +234,7 @@ class Painter:
         crop = crop or view.full
         parts: dict[int, Parts | None] = {}
         for unit in self.units():
-            loaded = self.load(unit, seen_by=Frusta([(view, crop)]))
+            loaded = self.load(unit, seen_by=self.frusta([(view, crop)]))
             parts[unit] = self.paint(unit, loaded, view, crop, settings)
             self.fold_up(parts, unit, view)
         return self.fold(parts, view, crop).front
@@ -238,7 +242,7 @@ class Painter:
     def _draw(
         self, gaussians: Gaussians, view: View, crop: Crop, settings: PaintSettings, window: ZWindow | None
     ) -> Layer:
-        if len(gaussians) == 0 or (window is not None and not bool((window.near < window.far).any())):
+        if len(gaussians) == 0:
             return self._nothing(view, crop)
         with torch.no_grad():
             return self.rasterizer(
@@ -295,8 +299,3 @@ def _over(front: Parts | None, behind: Parts | None) -> Parts | None:
 def default_pass(scene: BlockScene) -> int:
     """Frozen Gaussians to draw in one pass: room for twice the largest block, and for any small scene."""
     return max(2 * max(map(scene.count, range(scene.tree.num_blocks))), LEAST_PASS)
-
-
-def _everywhere(crop: Crop, device: torch.device) -> ZWindow:
-    infinity = torch.full((crop.height, crop.width), math.inf, device=device)
-    return ZWindow(-infinity, infinity)

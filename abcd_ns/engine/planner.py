@@ -53,8 +53,9 @@ class Planner:
     ) -> None:
         self._config, self._budget, self._scene = config, budget, scene
         self._views, self._rasterizer, self._device = views, rasterizer, device
-        self._frusta = Frusta((view, view.full) for view in views.values())
-        self._optics = Optics(list(views.values()))
+        side = rasterizer.window_side
+        self._frusta = Frusta(((view, view.full) for view in views.values()), side)
+        self._optics = Optics(list(views.values()), side)
 
     def warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the scaffold of all blocks is trained."""

@@ -53,13 +53,14 @@ def reach_radius(scales: Float[Tensor, "n 3"], sigma: float = DRAWN_SIGMAS) -> F
     return sigma * scales.amax(dim=1).exp()
 
 
-def blur_reach(depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:
-    """How much further than its own size a Gaussian at camera z = `depths` is drawn, world units.
+def half_diagonal(side: int) -> float:
+    """From the middle of a tile of `side` px to its farthest point, px."""
+    return side / math.sqrt(2)
 
-    BLUR_PIXELS px, which is that many z / f; at most, as sqrt(a^2 + b^2) <= a + b.
-    """
-    focal = torch.minimum(view.K[0, 0], view.K[1, 1])
-    return BLUR_PIXELS * depths / focal
+
+def world_size(pixels: float, depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:
+    """How large so many px are at camera z = `depths`, at most; world units: z / f for each."""
+    return depths * (pixels / min(float(view.K[0, 0]), float(view.K[1, 1])))
 
 
 def widest_slant(view: View) -> float:
@@ -79,20 +80,21 @@ def widest_slant(view: View) -> float:
 
 
 def reaches(
-    gaussians: Gaussians, box: Box, blur: Float[Tensor, "n"] | float = 0.0, slant: float = 2.0
+    gaussians: Gaussians, box: Box, slack: Float[Tensor, "n"] | float = 0.0, slant: float = 2.0
 ) -> Bool[Tensor, "n"]:
     """Whether any fragment of each Gaussian may lie in `box`, from any view: False is certain.
 
-    True where the distance from the mean to the box is at most slant * reach_radius + blur.
+    True where the distance from the mean to the box is at most slant * reach_radius + slack.
 
     Args:
-        blur: world-size addition for the screen's blur; blur_reach gives it for one view.
+        slack: what the screen adds, world units: its blur (at most, as sqrt(a^2 + b^2) <= a + b), and half a
+            tile's diagonal, as a fragment's place is looked up on the ray through the middle of its tile.
         slant: the largest `widest_slant` of the views in question. 2 covers fields of view up to about
             90 degrees horizontally by 60 vertically.
     """
     means = gaussians.means
     outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
-    return outside.norm(dim=1) <= slant * reach_radius(gaussians.scales) + blur
+    return outside.norm(dim=1) <= slant * reach_radius(gaussians.scales) + slack
 
 
 def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -> tuple[int, int]:

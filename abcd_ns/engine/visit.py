@@ -8,11 +8,9 @@ from typing import Any, Literal
 import torch
 
 from abcd_ns.engine.compositing import empty_layer
-from abcd_ns.engine.culling import Frusta
 from abcd_ns.engine.painter import Loaded, Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
-from abcd_ns.engine.rasterizer.base import DepthWindow
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
@@ -124,9 +122,9 @@ class VisitLayers:
         self._units = painter.units(exclude=geometry.block)
         self._own = own if painter.ownership == "fragments" and self._units else None
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
-        self._seen_by = Frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
+        self._seen_by = painter.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
         self._near: dict[int, Splats | None] = {}
-        self._windows: dict[int, DepthWindow] = {}
+        self._windows: dict[int, ZWindow] = {}
         self._at_hand: dict[int, Surroundings] = {}
         self._room = at_hand_bytes
         self._uses_cache = False
@@ -227,7 +225,7 @@ class VisitLayers:
                 )
 
     def _window(self, view: int) -> ZWindow | None:
-        return None if self._own is None else self._windows[view].by_pixel()
+        return None if self._own is None else self._windows[view]
 
     def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts | None:
         return self._painter.paint(

@@ -53,7 +53,7 @@ class AbcdModelConfig(SplatfactoModelConfig):
     render: Literal["merged", "composited"] = "merged"
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 
-    ownership: Literal["auto", "fragments", "means"] = "auto"
+    ownership: Literal["fragments", "means"] = "fragments"
     """What a layer holds in composited pictures; taken over from the training options."""
 
     def mirror(self, training: TrainingConfig) -> None:

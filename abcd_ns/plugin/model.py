@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.config import TrainingConfig, resolve_ownership
+from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Batch, Coordinator
 from abcd_ns.engine.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.loss import mean_psnr, photometric_loss, ssim_windows
@@ -193,7 +193,7 @@ class AbcdModel(SplatfactoModel):
         In training, where the scene is larger than a pass and units can be drawn one by one without changing
         the picture, it is drawn so: the device need not hold it all.
         """
-        if self._exceeds_a_pass() and self._ownership() == "fragments":
+        if self._exceeds_a_pass() and self.config.ownership == "fragments":
             return self._by_units(view).everything()
         gaussians = self._crop(self.merged().to(self.device))
         return self.draws_with()(
@@ -226,16 +226,13 @@ class AbcdModel(SplatfactoModel):
             scene,
             [view],
             self.draws_with(),
-            ownership=self._ownership(),
+            ownership=self.config.ownership,
             pass_gaussians=default_pass(scene) if pass_gaussians is None else pass_gaussians,
             device=self.device,
         )
         settings = PaintSettings(self.config.sh_degree, self.config.rasterize_mode == "antialiased")
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
         return BlockPictures(painter, view, settings, training.window_weight)
-
-    def _ownership(self) -> Literal["fragments", "means"]:
-        return resolve_ownership(self.config.ownership, self.draws_with())
 
     def _exceeds_a_pass(self) -> bool:
         """Whether the device should not hold the whole scene; a loaded one it holds already."""

@@ -11,9 +11,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.compositing import empty_layer, over
-from abcd_ns.engine.culling import Frusta
 from abcd_ns.engine.influence import coarser
-from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.painter import Painter, PaintSettings, Parts
 from abcd_ns.engine.rasterizer import Raster, Shot, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
@@ -110,13 +108,13 @@ class BlockPictures:
     def everything(self) -> Raster:
         """The whole scene, nearest unit first, until nothing behind can be seen."""
         painter, view = self.painter, self.view
-        whole, seen_by = self._nothing(), Frusta([(view, view.full)])
+        whole, seen_by = self._nothing(), painter.frusta([(view, view.full)])
         for unit in painter.order(painter.units(), view):
             if float(whole.transmittance.max()) < OPAQUE:
                 break
             loaded, window = painter.load(unit, seen_by=seen_by), None
             if painter.ownership == "fragments" and unit != 0:
-                window = ray_interval(painter.tree.box(unit), view, view.full)
+                window = painter.span(unit, view, view.full)
             next_one = self._raster(loaded.gaussians, None, window)
             layer = over(whole.layer, next_one.layer)
             depth = whole.depth + whole.transmittance * next_one.depth
@@ -142,11 +140,11 @@ class BlockPictures:
             return None
         options = {"visible": self.window_weight, "antialiased": self.settings.antialiased}
         rasterizer, view = self.painter.rasterizer, self.view
-        return rasterizer.depth_window(own, view, crop=view.full, **options).by_pixel()
+        return rasterizer.depth_window(own, view, crop=view.full, **options)
 
     def _around(self, block: int, window: ZWindow | None) -> Parts:
         painter, view = self.painter, self.view
-        seen_by = Frusta([(view, view.full)])
+        seen_by = painter.frusta([(view, view.full)])
         parts: dict[int, Parts | None] = {}
         for unit in painter.units(exclude=block):
             loaded = painter.load(unit, block, seen_by)

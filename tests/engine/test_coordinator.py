@@ -8,7 +8,6 @@ import torch
 
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
-from abcd_ns.engine.config import resolve_ownership
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.ordering import front_to_back
@@ -280,15 +279,6 @@ def test_the_state_of_a_run_survives_json(tmp_path, views, photos, start):
     again = RunState.from_json(state.to_json())
     assert again.to_json() == state.to_json()
     assert again.active.geometry.crops == state.active.geometry.crops
-
-
-def test_auto_ownership_is_what_the_rasterizer_can_do():
-    class Plain(TorchRasterizer):
-        supports_z_window = False
-
-    assert resolve_ownership("auto", TorchRasterizer(compile="never")) == "fragments"
-    assert resolve_ownership("auto", Plain(compile="never")) == "means"
-    assert resolve_ownership("means", TorchRasterizer(compile="never")) == "means"
 
 
 @pytest.mark.parametrize("pass_gaussians", [0, 30])

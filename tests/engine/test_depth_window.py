@@ -70,7 +70,7 @@ def test_many_faint_gaussians_together_count():
     gaussians, view = scene(0, n=400, size=0.3)
     gaussians.opacities[:] = math.log(0.02 / 0.98)
     window = DRAW.depth_window(gaussians, view, crop=view.full, visible=0.05)
-    through = DRAW(gaussians, view, sh_degree=0, z_window=window.by_pixel())
+    through = DRAW(gaussians, view, sh_degree=0, z_window=window)
     whole = DRAW(gaussians, view, sh_degree=0)
     assert 1 - float(whole.transmittance.mean()) > 0.4
     assert float((through.transmittance - whole.transmittance).mean()) < 0.1
@@ -102,8 +102,8 @@ def test_tiles_that_stick_out_of_the_crop_count_their_own_pixels():
 @pytest.mark.parametrize("visible", [0.0, 0.01])
 def test_a_window_of_no_gaussians_is_empty(visible):
     _, view = scene(0)
-    window = DRAW.depth_window(Gaussians.empty(0), view, crop=Crop(3, 5, 20, 9), visible=visible).by_pixel()
-    assert window.near.shape == (9, 20)
+    window = DRAW.depth_window(Gaussians.empty(0), view, crop=Crop(3, 5, 20, 9), visible=visible)
+    assert window.near.shape == (window.grid.tiles,)
     assert bool((window.near == window.far).all())
 
 
@@ -114,13 +114,13 @@ def test_at_0_front_inside_and_back_are_the_merged_picture(seed, crop):
     everyone.opacities[:] -= 2.5  # so thin that no drawing stops early
     crop = crop or view.full
     active, frozen = everyone[torch.arange(20)], everyone[torch.arange(20, 60)]
-    window = DRAW.depth_window(active, view, crop=crop, visible=0.0).by_pixel()
+    window = DRAW.depth_window(active, view, crop=crop, visible=0.0)
     assert torch.equal(
         DRAW(active, view, sh_degree=0, crop=crop, z_window=window).color,
         DRAW(active, view, sh_degree=0, crop=crop).color,
     )
-    before = ZWindow(torch.full_like(window.near, -math.inf), window.near)
-    behind = ZWindow(window.far, torch.full_like(window.far, math.inf))
+    span = ZWindow.everything(window.grid, "cpu", torch.float64)
+    before, behind = span.before(window), span.behind(window)
     cut = DRAW.cut(frozen, view, front=before, inside=window, back=behind, crop=crop, sh_degree=0)
     assert torch.equal(cut.members, cut.members.unique())
     assert torch.equal(cut.inside.planes, DRAW.project(frozen, view)[cut.members].planes)

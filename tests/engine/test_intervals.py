@@ -1,8 +1,12 @@
-"""Intervals: along every ray the cells' windows tile camera z, with no gap or overlap, to the last bit."""
+"""Intervals: along every ray the cells' windows tile camera z, with no gap or overlap, to the last bit.
+
+Most tests look at tiles of one pixel, which are the pixels' own rays.
+"""
 
 import math
 import random
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,6 +15,8 @@ from abcd_ns.engine.blocks import BlockTree, Box
 from abcd_ns.engine.intervals import cell_windows, ray_directions, ray_interval
 from abcd_ns.engine.ordering import front_to_back
 from abcd_ns.engine.partition import build_grid
+from abcd_ns.engine.rasterizer import ZWindow
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.types import Crop, View
 from tests.engine.test_blocks import SEEDS, lattice_points, random_tree
 
@@ -45,10 +51,16 @@ def tree_around(seed: int, view: View) -> BlockTree:
     return tree
 
 
+def pixels(view: View) -> TileGrid:
+    """The image in tiles of one pixel."""
+    return TileGrid(view.full, 1)
+
+
 def leaf_windows(tree: BlockTree, view: View) -> tuple[torch.Tensor, torch.Tensor]:
     """near and far of all blocks, [K, h, w]."""
-    windows = cell_windows(tree, view, view.full, [tree.node_of(b) for b in range(tree.num_blocks)])
-    return torch.stack([w.near for w in windows]), torch.stack([w.far for w in windows])
+    windows = cell_windows(tree, view, pixels(view), [tree.node_of(b) for b in range(tree.num_blocks)])
+    near, far = torch.stack([w.near for w in windows]), torch.stack([w.far for w in windows])
+    return near.view(-1, view.height, view.width), far.view(-1, view.height, view.width)
 
 
 @given(SEEDS, DTYPES)
@@ -98,16 +110,46 @@ def test_the_window_is_the_one_of_the_cell_that_holds_the_point(seed, dtype):
             assert near[block, row, column] <= z[row, column] < far[block, row, column]
 
 
-@given(SEEDS, DTYPES, st.integers(0, 5), st.integers(0, 4))
-def test_a_crop_of_the_windows_is_the_windows_of_the_crop(seed, dtype, x, y):
+@given(SEEDS, DTYPES, st.integers(0, 5), st.integers(0, 4), st.sampled_from([1, 2, 4]))
+def test_a_crop_of_the_windows_is_the_windows_of_the_crop(seed, dtype, x, y, side):
     view = random_view(seed, dtype)
     tree, crop = tree_around(seed, view), Crop(x, y, 6 - x, 5 - y)
-    assert torch.equal(ray_directions(view, crop), ray_directions(view, view.full)[:, y:, x:])
     for block in range(tree.num_blocks):
-        whole = ray_interval(tree.cell(block), view, view.full)
-        part = ray_interval(tree.cell(block), view, crop)
-        assert torch.equal(part.near, whole.near[crop.slices])
-        assert torch.equal(part.far, whole.far[crop.slices])
+        whole = ray_interval(tree.cell(block), view, TileGrid(view.full, side))
+        part = ray_interval(tree.cell(block), view, TileGrid(crop, side))
+        assert torch.equal(part.near, whole.on(part.grid).near)
+        assert torch.equal(part.far, whole.on(part.grid).far)
+
+
+@pytest.mark.parametrize("side", [2, 4])
+def test_a_tile_has_the_ray_through_its_middle(side):
+    view = random_view(1, torch.float64)
+    grid = TileGrid(view.full, side)
+    found = ray_directions(view, grid).view(3, grid.rows, grid.cols)
+    for row in range(grid.rows):
+        for col in range(grid.cols):
+            pixel = torch.tensor([(col + 0.5) * side, (row + 0.5) * side, 1.0], dtype=torch.float64)
+            expected = view.viewmat[:3, :3].T @ torch.linalg.inv(view.K) @ pixel
+            torch.testing.assert_close(found[:, row, col], expected)
+
+
+@given(SEEDS, st.sampled_from([(1, 1), (2, 1), (4, 2), (16, 4)]), st.data())
+def test_a_window_says_the_same_of_parts_of_its_tiles(seed, sides, data):
+    outer = Crop(data.draw(st.integers(0, 40)), data.draw(st.integers(0, 40)), 37, 29)
+    x, y = data.draw(st.integers(0, 36)), data.draw(st.integers(0, 28))
+    inner = Crop(outer.x + x, outer.y + y, 37 - x, 29 - y)
+    grid, finer = TileGrid(outer, sides[0]), TileGrid(inner, sides[1])
+    near, far = torch.randn(2, grid.tiles, generator=torch.Generator().manual_seed(seed))
+    found = ZWindow(grid, near, far).on(finer)
+    by_pixel = grid.to_image(near.expand(1, grid.pixels_per_tile, -1))[0, y:, x:]
+    assert torch.equal(finer.to_image(found.near.expand(1, finer.pixels_per_tile, -1))[0], by_pixel)
+
+
+def test_a_window_says_nothing_about_larger_tiles_or_what_lies_beside_it():
+    window = ZWindow.everything(TileGrid(Crop(8, 8, 16, 16), 4), "cpu", torch.float32)
+    for grid in (TileGrid(Crop(8, 8, 16, 16), 8), TileGrid(Crop(4, 8, 16, 16), 4)):
+        with pytest.raises(ValueError, match="says nothing"):
+            window.on(grid)
 
 
 @given(SEEDS, DTYPES)
@@ -116,7 +158,7 @@ def test_a_block_and_its_siblings_tile_z_too(seed, dtype):
     tree = tree_around(seed, view)
     block = seed % tree.num_blocks
     nodes = [tree.node_of(block), *tree.siblings_to_root(block)]
-    windows = cell_windows(tree, view, view.full, nodes)
+    windows = cell_windows(tree, view, pixels(view), nodes)
     z = torch.stack([end for w in windows for end in (w.near, w.far)]).nan_to_num(posinf=9.0, neginf=-9.0)
     holders = sum(((w.near <= z) & (z < w.far)).int() for w in windows)
     assert bool((holders == 1).all())
@@ -135,9 +177,9 @@ def test_a_box_in_front_of_the_camera_is_entered_and_left_where_the_slab_test_sa
     view = random_view(seed, dtype)
     corner, size = torch.randn(2, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     box = Box(corner, corner + size.abs())
-    window = ray_interval(box, view, view.full)
+    window = ray_interval(box, view, pixels(view))
     # Directions of exactly 0 become tiny here, which sends the planes they are parallel to far away.
-    direction = ray_directions(view, view.full).double().movedim(0, -1)
+    direction = ray_directions(view, pixels(view)).double().movedim(0, -1)
     direction = torch.where(direction == 0, 1e-300, direction)
     a, b = (box.lower - view.center) / direction, (box.upper - view.center) / direction
     enter, leave = torch.minimum(a, b).amax(dim=-1), torch.maximum(a, b).amin(dim=-1)
@@ -157,11 +199,11 @@ def test_rays_that_miss_get_an_empty_window_at_infinity():
     view = random_view(0, torch.float32, center=torch.zeros(3))
     behind_camera = view.center.double() - 10 * view.viewmat[2, :3].double()
     box = Box(behind_camera - 0.1, behind_camera + 0.1)
-    window = ray_interval(box, view, view.full)
+    window = ray_interval(box, view, pixels(view))
     assert bool((window.near == math.inf).all() and (window.far == math.inf).all())
 
 
 def test_windows_have_the_views_dtype():
     for dtype in (torch.float32, torch.float64):
         view = random_view(0, dtype)
-        assert ray_interval(random_tree(0, 4).cell(2), view, view.full).near.dtype == dtype
+        assert ray_interval(random_tree(0, 4).cell(2), view, pixels(view)).near.dtype == dtype

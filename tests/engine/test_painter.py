@@ -7,24 +7,28 @@ import torch
 
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.compositing import fold
-from abcd_ns.engine.intervals import ray_interval
+from abcd_ns.engine.intervals import cell_windows, ray_interval
+from abcd_ns.engine.ordering import front_to_back
 from abcd_ns.engine.painter import Painter, PaintSettings
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.rasterizer import Shot
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.scene import MemoryScene
-from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, Layer, View
+from tests.engine.rasterizer_scenes import as_leaves, probe, relative_error
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer(compile="never")
+BY_SIDE = {side: TorchRasterizer(compile="never", tile_side=side) for side in (1, 4, 16)}
+"""Rasterizers by the side of their tiles, and so of their windows."""
 SETTINGS = PaintSettings(sh_degree=1)
 
 
 def painter(
-    tree: BlockTree, gaussians: Gaussians, views, *, ownership="fragments", pass_gaussians=0
+    tree: BlockTree, gaussians: Gaussians, views, *, ownership="fragments", pass_gaussians=0, draw=DRAW
 ) -> Painter:
     scene = MemoryScene(tree, gaussians)
-    return Painter(scene, views, DRAW, ownership=ownership, pass_gaussians=pass_gaussians)
+    return Painter(scene, views, draw, ownership=ownership, pass_gaussians=pass_gaussians)
 
 
 def merged(gaussians: Gaussians, view: View) -> Layer:
@@ -51,8 +55,16 @@ def translucent(count: int, size: float = 0.1, dtype=torch.float64) -> Gaussians
 
 
 @pytest.mark.parametrize("tree", ["kd", "grid", "thin"])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-6)])
-def test_folding_cells_by_fragments_gives_the_merged_picture(tree, dtype, tolerance):
+@pytest.mark.parametrize(
+    ("dtype", "tolerance", "side"),
+    [
+        (torch.float64, 1e-12, 1),
+        (torch.float64, 1e-12, 4),
+        (torch.float64, 1e-12, 16),
+        (torch.float32, 1e-6, 4),
+    ],
+)
+def test_folding_cells_by_fragments_gives_the_merged_picture(tree, dtype, tolerance, side):
     gaussians = translucent(200, 0.12, dtype)
     cut = {
         "kd": lambda: build_kd(gaussians.means, 7),
@@ -60,9 +72,33 @@ def test_folding_cells_by_fragments_gives_the_merged_picture(tree, dtype, tolera
         "thin": lambda: build_grid(gaussians.means, counts=(6, 1, 1)),
     }[tree]()
     views = views_in_and_out(dtype)
-    paint = painter(cut, gaussians, views)
+    paint = painter(cut, gaussians, views, draw=BY_SIDE[side])
     for view in views:
         assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < tolerance
+
+
+@pytest.mark.parametrize("side", [4, 16])
+def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(side):
+    gaussians, (view, *_) = translucent(60, 0.12), views_in_and_out(torch.float64)
+    tree, draw = build_kd(gaussians.means, 5), BY_SIDE[side]
+    weights = probe(view.height, view.width)[..., :4]
+
+    def gradients_of(layer_of) -> dict[str, torch.Tensor]:
+        leaves = as_leaves(gaussians)
+        layer = layer_of(leaves)
+        picture = torch.cat((layer.color, layer.transmittance[..., None]), dim=-1)
+        (picture * weights).sum().backward()
+        return {name: value.grad for name, value in leaves.items()}
+
+    def folded(leaves: Gaussians) -> Layer:
+        windows = cell_windows(tree, view, draw.window_grid(view.full), [tree.node_of(b) for b in range(5)])
+        drawn = {b: draw(leaves, view, sh_degree=1, z_window=window) for b, window in enumerate(windows)}
+        return fold([drawn[block].layer for block in front_to_back(tree, view.center)])
+
+    found = gradients_of(folded)
+    expected = gradients_of(lambda leaves: draw(leaves, view, sh_degree=1).layer)
+    for name in PARAM_NAMES:
+        assert relative_error(found[name], expected[name]) < 1e-10, name
 
 
 @pytest.mark.parametrize("pass_gaussians", [0, 60, 130, 1000])
@@ -101,22 +137,23 @@ def test_units_hold_every_block_but_the_active_one_exactly_once(ownership):
             assert sorted(held) == [b for b in range(11) if b != active]
 
 
-@pytest.mark.parametrize("pass_gaussians", [0, 60, 10_000])
-def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussians):
+@pytest.mark.parametrize(("pass_gaussians", "side"), [(0, 4), (60, 4), (10_000, 4), (60, 16)])
+def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussians, side):
     """Wherever the window lies, and however many units share the frozen blocks."""
     gaussians = translucent(200)
     views = views_in_and_out(torch.float64)
     tree = build_kd(gaussians.means, 8)
     owner = tree.assign(gaussians.means)
     own, frozen = gaussians[owner == 3], gaussians[owner != 3]
-    paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians)
+    draw = BY_SIDE[side]
+    paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians, draw=draw)
     units = paint.units(exclude=3)
     loaded = {unit: paint.load(unit, exclude=3) for unit in units}
     assert sum(unit.own for unit in loaded.values()) == len(frozen)
     for view in views:
         windows = [
-            ray_interval(tree.cell(3).grown(0.2), view, view.full),
-            DRAW.depth_window(own, view, crop=view.full, visible=0.05).by_pixel(),
+            ray_interval(tree.cell(3).grown(0.2), view, draw.window_grid(view.full)),
+            draw.depth_window(own, view, crop=view.full, visible=0.05),
         ]
         for window in windows:
             parts = {
@@ -127,7 +164,7 @@ def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussian
             splats = cut.inside.planes if cut.inside is not None else torch.zeros(2, 0)
             assert splats.unique(dim=1).shape == splats.shape
             with torch.no_grad():
-                (inside,) = DRAW.draw(own[:0], [Shot(view, view.full, cut.inside, window)], sh_degree=1)
+                (inside,) = draw.draw(own[:0], [Shot(view, view.full, cut.inside, window)], sh_degree=1)
             layers = (cut.front, inside.layer, cut.back)
             assert difference(fold(list(layers)), merged(frozen, view)) < 1e-12
 
@@ -164,13 +201,3 @@ def test_giants_and_far_gaussians_are_drawn_in_every_cell_they_reach():
     paint = painter(build_kd(gaussians.means, 8), gaussians, views)
     for view in views:
         assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12
-
-
-def test_a_rasterizer_without_windows_cannot_own_fragments():
-    class Plain(TorchRasterizer):
-        supports_z_window = False
-
-    gaussians = random_gaussians(10)
-    scene = MemoryScene(build_kd(gaussians.means, 2), gaussians)
-    with pytest.raises(ValueError, match="ownership='means'"):
-        Painter(scene, ring_of_views(1), Plain(compile="never"), ownership="fragments", pass_gaussians=0)

@@ -1,6 +1,7 @@
 """TorchRasterizer against the naive twin: forward, gradient, crops, windows, frozen Gaussians."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -29,29 +30,36 @@ CROP = Crop(5, 3, 22, 15)
 EAGER = TorchRasterizer("never")
 
 
-def window_for(crop: Crop, seed: int = 3) -> ZWindow:
+def window_for(grid: TileGrid, seed: int = 3) -> ZWindow:
     """Random windows; about one in ten is empty."""
     generator = torch.Generator().manual_seed(seed)
-    near = 4 * torch.rand(crop.height, crop.width, generator=generator, dtype=torch.float64) + 1
-    far = near + 2.5 * torch.rand(crop.height, crop.width, generator=generator, dtype=torch.float64) - 0.25
-    return ZWindow(near, far)
+    near = 4 * torch.rand(grid.tiles, generator=generator, dtype=torch.float64) + 1
+    far = near + 2.5 * torch.rand(grid.tiles, generator=generator, dtype=torch.float64) - 0.25
+    return ZWindow(grid, near, far)
+
+
+def by_pixel(window: ZWindow) -> torch.Tensor:
+    """(near, far) of each pixel, [2, h, w]."""
+    planes = torch.stack((window.near, window.far))[:, None]
+    return window.grid.to_image(planes.expand(-1, window.grid.pixels_per_tile, -1))
 
 
 @pytest.mark.parametrize(
-    ("sh_degree", "antialiased", "crop", "with_frozen", "with_window"),
+    ("sh_degree", "antialiased", "crop", "with_frozen", "window_side"),
     [
-        (0, False, None, False, False),
-        (1, True, None, False, False),
-        (2, False, CROP, False, False),
-        (3, False, None, True, False),
-        (3, True, CROP, False, True),
-        (3, False, CROP, True, True),
+        (0, False, None, False, 0),
+        (1, True, None, False, 0),
+        (2, False, CROP, False, 0),
+        (3, False, None, True, 0),
+        (3, True, CROP, False, 4),
+        (3, False, CROP, True, 4),
+        (1, False, CROP, True, 16),
     ],
 )
-def test_equals_the_naive_twin(sh_degree, antialiased, crop, with_frozen, with_window):
+def test_equals_the_naive_twin(sh_degree, antialiased, crop, with_frozen, window_side):
     gaussians, frozen = random_gaussians(12), random_gaussians(8, seed=7) if with_frozen else None
-    window = window_for(crop or VIEW.full) if with_window else None
-    near, far = (window.near, window.far) if window else (None, None)
+    window = window_for(TileGrid(crop or VIEW.full, window_side)) if window_side else None
+    near, far = by_pixel(window) if window else (None, None)
     options = {"sh_degree": sh_degree, "crop": crop, "frozen": frozen, "antialiased": antialiased}
 
     expected, expected_grads = gradients(
@@ -165,14 +173,13 @@ def test_fold_of_complementary_windows_is_the_whole_drawing(dtype, tolerance):
     )
     whole = EAGER(faint, view, sh_degree=3)
     assert whole.transmittance.min() > 1e-4  # no ray stops early: a layer of its own would not know
-    cuts = (
-        torch.rand(3, view.height, view.width, generator=torch.Generator().manual_seed(0)).to(dtype) * 4 + 2
-    )
+    grid = EAGER.window_grid(view.full)
+    cuts = torch.rand(3, grid.tiles, generator=torch.Generator().manual_seed(0)).to(dtype) * 4 + 2
     edge = torch.full_like(cuts[:1], math.inf)
     bounds = torch.cat((-edge, cuts.sort(dim=0).values, edge))
     color, transmittance = torch.zeros_like(whole.color), torch.ones_like(whole.transmittance)
     for near, far in pairwise(bounds):
-        layer = EAGER(faint, view, sh_degree=3, z_window=ZWindow(near, far)).layer
+        layer = EAGER(faint, view, sh_degree=3, z_window=ZWindow(grid, near, far)).layer
         color = color + transmittance[..., None] * layer.color
         transmittance = transmittance * layer.transmittance
     torch.testing.assert_close(color, whole.color, rtol=0, atol=tolerance)
@@ -184,17 +191,17 @@ def test_window_work_is_in_proportion_to_its_fragments():
     splats, grid = project(gaussians, VIEW), TileGrid(VIEW.full, 4)
     everything = bin_splats(splats, grid, 16)
     cut = float(splats.depths[splats.radii > 0].quantile(0.1))
-    near = torch.full((VIEW.height, VIEW.width), -math.inf, dtype=torch.float64)
-    window = ZWindow(near, torch.full_like(near, cut))
-    nothing_left = ZWindow(-near, near)
-    windowed = torch.ones(300, dtype=torch.bool)
+    everywhere = ZWindow.everything(grid, "cpu", torch.float64)
+    window = replace(everywhere, far=torch.full_like(everywhere.far, cut))
+    nothing_left = ZWindow(grid, everywhere.far, everywhere.near)
+    masked = torch.ones(300, dtype=torch.bool)
     assert (
-        bin_splats(splats, grid, 16, windowed=windowed, window=window).slots.numel()
+        bin_splats(splats, grid, 16, masked=masked, window=window).slots.numel()
         < 0.35 * everything.slots.numel()
     )
-    assert bin_splats(splats, grid, 16, windowed=windowed, window=nothing_left).slots.numel() == 0
+    assert bin_splats(splats, grid, 16, masked=masked, window=nothing_left).slots.numel() == 0
     assert (
-        bin_splats(splats, grid, 16, windowed=~windowed, window=nothing_left).slots.numel()
+        bin_splats(splats, grid, 16, masked=~masked, window=nothing_left).slots.numel()
         == everything.slots.numel()
     )
 
@@ -289,8 +296,11 @@ def test_clear_errors():
         EAGER(gaussians, VIEW, sh_degree=2)
     with pytest.raises(ValueError, match="tile_side is 5"):
         TorchRasterizer(tile_side=5)
-    with pytest.raises(ValueError, match="z window"):
-        EAGER(gaussians, VIEW, sh_degree=0, crop=CROP, z_window=window_for(VIEW.full))
+    for grid in (TileGrid(CROP, 4), TileGrid(VIEW.full, 2)):
+        with pytest.raises(ValueError, match="a window on"):
+            EAGER(gaussians, VIEW, sh_degree=0, z_window=window_for(grid))
+    with pytest.raises(ValueError, match="window_side is 6"):
+        TorchRasterizer(window_side=6)
     with pytest.raises(ValueError, match="CUDA device"):
         make_rasterizer("gsplat", "cpu")
     assert make_rasterizer("auto", "cpu").name == TorchRasterizer.name

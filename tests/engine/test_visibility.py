@@ -10,13 +10,15 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.blocks import Box
 from abcd_ns.engine.intervals import ray_directions
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visibility import (
-    blur_reach,
+    BLUR_PIXELS,
     footprint,
     reach_radius,
     reaches,
     widest_slant,
+    world_size,
 )
 from tests.engine.test_blocks import SEEDS
 
@@ -104,7 +106,8 @@ def drawn_in_box(view: View, crop: Crop, box: Box, means2d, radii, depths, conic
     dy = torch.arange(crop.y, crop.y + crop.height)[:, None] + 0.5 - means2d[:, 1, None, None]
     a, b, c = conics.T[..., None, None]
     drawn = torch.exp(-0.5 * (a * dx**2 + c * dy**2) - b * dx * dy) >= 1 / 255
-    along = depths.double()[:, None, None, None] * ray_directions(view, crop).double()
+    directions = ray_directions(view, TileGrid(crop, 1)).view(3, crop.height, crop.width)
+    along = depths.double()[:, None, None, None] * directions.double()
     points = (view.center.double()[:, None, None] + along).movedim(1, -1)
     inside = box.contains(points.reshape(-1, 3)).reshape(drawn.shape)
     return (radii > 0) & (drawn & inside).flatten(1).any(dim=1)
@@ -118,7 +121,7 @@ def test_no_gaussian_draws_in_a_box_it_is_said_not_to_reach(seed, cropped):
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
     box = Box(middle - 0.7, torch.tensor([math.inf, 0.5, 0.9]).double() + middle)
     truth = drawn_in_box(view, crop, box, means2d, radii, depths, conics)
-    anywhere = reaches(gaussians, box, blur_reach(depths.clamp(min=0), view), widest_slant(view))
+    anywhere = reaches(gaussians, box, world_size(BLUR_PIXELS, depths.clamp(min=0), view), widest_slant(view))
     assert not bool((truth & ~anywhere).any())
 
 
@@ -128,7 +131,7 @@ def test_the_tests_of_reach_are_not_vacuous():
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
     box = Box(middle - 1.2, middle + 1.2)
     truth = drawn_in_box(view, view.full, box, means2d, radii, depths, conics)
-    anywhere = reaches(gaussians, box, blur_reach(depths.clamp(min=0), view), widest_slant(view))
+    anywhere = reaches(gaussians, box, world_size(BLUR_PIXELS, depths.clamp(min=0), view), widest_slant(view))
     assert int(truth.sum()) >= 20
     assert int(anywhere.sum()) < 400
 
@@ -141,9 +144,9 @@ def test_reach_is_measured_to_the_nearest_point_of_the_box():
     assert reach_radius(gaussians.scales, sigma=3.0).tolist() == pytest.approx([0.3, 3.0, 3.0])
     # Distances 0, 5 and 9.
     assert reaches(gaussians, box, slant=1.0).tolist() == [True, False, False]
-    assert reaches(gaussians, box, blur=1.7, slant=1.0).tolist() == [True, True, False]
+    assert reaches(gaussians, box, slack=1.7, slant=1.0).tolist() == [True, True, False]
     assert reaches(gaussians, box, slant=3.0).tolist() == [True, True, True]
-    assert reaches(gaussians, box, blur=torch.tensor([0.0, 0.0, 6.0]), slant=1.0).tolist() == [
+    assert reaches(gaussians, box, slack=torch.tensor([0.0, 0.0, 6.0]), slant=1.0).tolist() == [
         True,
         False,
         True,

@@ -4,10 +4,11 @@ from typing import Literal
 
 import torch
 
-from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot, ZWindow
+from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot
 from abcd_ns.engine.rasterizer.chunk_kernels import CompilePolicy
 from abcd_ns.engine.rasterizer.self_check import self_check
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+from abcd_ns.engine.rasterizer.z_window import ZWindow
 
 __all__ = [
     "Raster",

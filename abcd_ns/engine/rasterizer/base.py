@@ -4,40 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
+from abcd_ns.engine.rasterizer.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
-
-
-@dataclass(frozen=True)
-class ZWindow:
-    """Per pixel, the half-open interval of camera z in which fragments count (fragment ownership).
-
-    A fragment is one Gaussian at one pixel; its z is the camera z of the Gaussian's mean. It is drawn
-    where near <= z < far. An empty interval (near >= far) draws nothing. Infinities are allowed.
-    """
-
-    near: Float[Tensor, "h w"]
-    far: Float[Tensor, "h w"]
-
-
-@dataclass(frozen=True)
-class DepthWindow:
-    """A range of camera z for each tile of a crop: near <= z < far."""
-
-    grid: TileGrid
-    near: Float[Tensor, "t"]
-    far: Float[Tensor, "t"]
-
-    def by_pixel(self) -> ZWindow:
-        """The same for each pixel."""
-        tiles = torch.stack((self.near, self.far))[:, None]
-        image = self.grid.to_image(tiles.expand(-1, self.grid.pixels_per_tile, -1))
-        return ZWindow(*image.contiguous())
 
 
 @dataclass(frozen=True)
@@ -69,7 +42,7 @@ class Shot:
     frozen: Splats | None = None
     """What occludes and is occluded, without gradients: projected into `view` by the same rasterizer."""
     z_window: ZWindow | None = None
-    """Masks the fragments of `frozen` where it is given, else those of the Gaussians; of the crop's size."""
+    """Masks the fragments of `frozen` where it is given, else those of the Gaussians; of this crop."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +66,12 @@ class Rasterizer(Protocol):
 
     name: str
     """Identifies backend and version; part of every layer's key."""
-    supports_z_window: bool
+    window_side: int
+    """Side of the tiles that z windows are given by, px."""
+
+    def window_grid(self, crop: Crop) -> TileGrid:
+        """The tiles of a crop that its z windows are given by."""
+        return TileGrid(crop, self.window_side)
 
     def warm_up(self) -> None:
         """Do now, before a clock runs, what would otherwise be done on first use or not at all: compile."""
@@ -128,8 +106,8 @@ class Rasterizer(Protocol):
             absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward.
 
         Raises:
-            ValueError: a window for a backend whose `supports_z_window` is False, or of another size than its
-                crop; or `sh_degree` is above what the Gaussians hold.
+            ValueError: a window is of another crop, or of tiles that are no multiples of the rasterizer's; or
+                `sh_degree` is above what the Gaussians hold.
         """
         ...
 
@@ -166,27 +144,12 @@ class Rasterizer(Protocol):
         sh_degree: int,
         antialiased: bool = False,
     ) -> Cut:
-        """The fragments in two windows as layers, and what has fragments in a third; no gradients.
-
-        Raises:
-            ValueError: for a backend whose `supports_z_window` is False.
-        """
+        """The fragments in two windows as layers, and what has fragments in a third; no gradients."""
         ...
 
     def depth_window(
         self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
-    ) -> DepthWindow:
-        """In each small tile of the crop the range of camera z in which the Gaussians show; no gradients.
-
-        Args:
-            visible: what is in front of the range, and what is behind it, has less weight alpha T than this,
-                together, with nothing else in the scene, as a mean over the tile; 0 leaves nothing out.
-
-        Returns:
-            A window that holds all else. Where there is nothing it is empty, and lies in the midst of what
-            the crop shows.
-
-        Raises:
-            ValueError: for a backend whose `supports_z_window` is False.
-        """
+    ) -> ZWindow:
+        """In each tile of the crop the range of camera z in which the Gaussians show, with nothing else in
+        the scene; no gradients. See z_window.showing."""
         ...

@@ -8,17 +8,17 @@ fragment is lost by that, and none is added.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.rasterizer.splat_kernels import DEPTH, TILE_COLUMNS, TILE_ROWS
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid, TileSheet
+from abcd_ns.engine.rasterizer.z_window import ZWindow
 
 SHRINK = 0.875
 """A level is narrowed once fewer than this share of its tiles still have Gaussians to draw."""
@@ -106,17 +106,8 @@ def _count(items: Tensor) -> Int[Tensor, "n"]:
     return torch.arange(items.numel(), device=items.device)
 
 
-def _within_window(
-    pairs: _Pairs,
-    depths: Float[Tensor, "m"],
-    windowed: Bool[Tensor, "m"],
-    window: Float[Tensor, "2 p t"],
-) -> _Pairs:
-    """Without the pairs of windowed Gaussians that no pixel of their tile lets through."""
-    near, far = window[0].amin(dim=0), window[1].amax(dim=0)
-    z = depths.index_select(0, pairs.rank)
-    keep = (z >= near.index_select(0, pairs.tile)) & (z < far.index_select(0, pairs.tile))
-    keep |= ~windowed.index_select(0, pairs.rank)
+def _only(pairs: _Pairs, keep: Bool[Tensor, "q"]) -> _Pairs:
+    """Some of the pairs."""
     kept_before = torch.cat((keep.new_zeros(1, dtype=torch.long), keep.cumsum(0)))
     kept = keep.nonzero()[:, 0]
     rank, tile = pairs.rank.index_select(0, kept), pairs.tile.index_select(0, kept)
@@ -177,29 +168,48 @@ class Candidates:
     """Theirs."""
     pairs: _Pairs
 
-    def lists(
-        self,
-        chunk: int,
-        windowed: Bool[Tensor, "n"] | None = None,
-        window: Float[Tensor, "2 p t"] | None = None,
-    ) -> TileLists:
+    def lists(self, chunk: int) -> TileLists:
         """The lists of the Gaussians that each tile draws.
 
         Args:
             chunk: Gaussians per chunk; lists are padded to multiples of it.
-            windowed: which splats `window` masks. Given together with `window` or not at all.
-            window: near and far of each pixel; +inf and -inf outside the crop.
         """
-        pairs = self.pairs
-        if windowed is not None and window is not None:
-            pairs = _within_window(pairs, self.depths, windowed.index_select(0, self.rows), window)
-        return _lay_out(pairs, self.rows, self.sheet, chunk)
+        return _lay_out(self.pairs, self.rows, self.sheet, chunk)
 
-    def touching(self, window: Float[Tensor, "2 p t"]) -> Int[Tensor, "k"]:
-        """Indices of the splats that have a fragment in the window, as far as tiles can tell; ascending."""
-        everyone = torch.ones_like(self.rows, dtype=torch.bool)
-        inside = _within_window(self.pairs, self.depths, everyone, window)
-        return self.rows.index_select(0, inside.rank.unique_consecutive()).sort().values
+    def within(
+        self, windows: Sequence[ZWindow | None], masked: Bool[Tensor, "n"] | None = None
+    ) -> "Candidates":
+        """Without the pairs that lie outside of their window.
+
+        Args:
+            windows: of each of the sheet's grids; None masks nothing there.
+            masked: which splats the windows apply to; None for all.
+        """
+        inside = self._holds(windows)
+        if masked is not None:
+            inside |= ~masked.index_select(0, self.rows.index_select(0, self.pairs.rank))
+        return replace(self, pairs=_only(self.pairs, inside))
+
+    @property
+    def z(self) -> Float[Tensor, "q"]:
+        """Camera z of each pair's Gaussian."""
+        return self.depths.index_select(0, self.pairs.rank)
+
+    @property
+    def members(self) -> Int[Tensor, "k"]:
+        """Indices of the splats that any tile may draw; ascending."""
+        return self.rows.index_select(0, self.pairs.rank.unique_consecutive()).sort().values
+
+    def _holds(self, windows: Sequence[ZWindow | None]) -> Bool[Tensor, "q"]:
+        everything = torch.tensor([-math.inf, math.inf]).to(self.depths)[:, None]
+        planes = []
+        for grid, window in zip(self.sheet.grids, windows, strict=True):
+            found = None if window is None else window.on(grid)
+            planes.append(
+                everything.expand(2, grid.tiles) if found is None else torch.stack((found.near, found.far))
+            )
+        near, far = torch.cat(planes, dim=1).index_select(1, self.pairs.tile)
+        return (self.z >= near) & (self.z < far)
 
 
 @torch.no_grad()
@@ -222,24 +232,16 @@ def find_candidates(
     return Candidates(sheet, rows, depths.values, _pairs(spans, bands, places, built))
 
 
-@torch.no_grad()
-def window_planes(sheet: TileSheet, windows: Sequence[ZWindow]) -> Float[Tensor, "2 p t"]:
-    """near and far of every pixel of the sheet; an empty interval outside the crops."""
-    near = sheet.to_tiles([window.near[None] for window in windows], fill=math.inf)
-    far = sheet.to_tiles([window.far[None] for window in windows], fill=-math.inf)
-    return torch.cat((near, far))
-
-
 def bin_splats(
     splats: Splats,
     grid: TileGrid,
     chunk: int,
     *,
-    windowed: Bool[Tensor, "n"] | None = None,
+    masked: Bool[Tensor, "n"] | None = None,
     window: ZWindow | None = None,
     built: bool = True,
 ) -> TileLists:
-    """The lists of a single view: see Candidates.lists."""
-    sheet = TileSheet((grid,))
-    candidates = find_candidates(splats, torch.zeros(len(splats), dtype=torch.long), sheet, built=built)
-    return candidates.lists(chunk, windowed, window and window_planes(sheet, [window]))
+    """The lists of a single view: see Candidates.lists and Candidates.within."""
+    grid_of = torch.zeros(len(splats), dtype=torch.long, device=splats.planes.device)
+    candidates = find_candidates(splats, grid_of, TileSheet((grid,)), built=built)
+    return (candidates if window is None else candidates.within([window], masked)).lists(chunk)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.kernels.build import build_kernels
-from abcd_ns.engine.rasterizer import splat_kernels, torch_kernels
-from abcd_ns.engine.rasterizer.splat_kernels import SPLAT_KERNELS
+from abcd_ns.engine.rasterizer import splat_kernels
+from abcd_ns.engine.rasterizer.splat_kernels import GRADED, SPLAT_KERNELS
 from abcd_ns.engine.rasterizer.torch_kernels import STATE_PLANES, backward_chunk, forward_chunk
 
 CompilePolicy = Literal["auto", "always", "never"]
@@ -20,14 +20,14 @@ CompilePolicy = Literal["auto", "always", "never"]
 def chunk_kernels(side: int, chunk: int) -> tuple[Kernel, Kernel]:
     """`forward_chunk` and `backward_chunk` for tiles of `side` pixels and `chunk` Gaussians a call."""
     pixels = side * side
-    state, planes = f"{STATE_PLANES} {pixels} a", f"2 {pixels} a"
-    given = (f"{torch_kernels.PARAMETERS} {chunk} a", "2 a", state)
+    state = f"{STATE_PLANES} {pixels} a"
+    given = (f"{GRADED} {chunk} a", "2 a", state)
     depends = (splat_kernels.__file__,)
     forward = functools.partial(forward_chunk, side)
     backward = functools.partial(backward_chunk, side)
     return (
-        Kernel(f"forward-{side}-{chunk}", forward, (*given, planes), depends),
-        Kernel(f"backward-{side}-{chunk}", backward, (*given, state, planes), depends),
+        Kernel(f"forward-{side}-{chunk}", forward, given, depends),
+        Kernel(f"backward-{side}-{chunk}", backward, (*given, state), depends),
     )
 
 
@@ -62,10 +62,9 @@ class ChunkKernels:
         params: Float[Tensor, "c k a"],
         origins: Float[Tensor, "2 a"],
         state: Float[Tensor, "s p a"],
-        window: Float[Tensor, "2 p a"],
     ) -> Float[Tensor, "s p a"]:
         """See torch_kernels.forward_chunk."""
-        wide = _two_wide(params, origins, state, window)
+        wide = _two_wide(params, origins, state)
         return self._forward(*wide, built=self.built)[0][..., : params.shape[-1]]
 
     def backward(
@@ -74,10 +73,9 @@ class ChunkKernels:
         origins: Float[Tensor, "2 a"],
         state: Float[Tensor, "s p a"],
         upstream: Float[Tensor, "s p a"],
-        window: Float[Tensor, "2 p a"],
     ) -> Float[Tensor, "g k a"]:
         """See torch_kernels.backward_chunk."""
-        wide = _two_wide(params, origins, state, upstream, window)
+        wide = _two_wide(params, origins, state, upstream)
         return self._backward(*wide, built=self.built)[0][..., : params.shape[-1]]
 
 

@@ -32,10 +32,6 @@ class Job:
     splats: int
     """How many there are in all, drawn or not."""
     kernels: ChunkKernels
-    windows: Float[Tensor, "2 p a"] | None
-    """near and far, in the columns of `lists.tiles`; None where every `always` is 1."""
-    always: Float[Tensor, "m"]
-    """By rank: 1 where no window applies."""
     absgrad_target: Tensor | None
     """Gets an attribute `absgrad` in the backward pass: means2d [v, n, 2] of the first v n splats."""
 
@@ -76,13 +72,6 @@ def _take(planes: Tensor, width: int, columns: Tensor | None) -> Tensor:
     return planes[..., :width].contiguous() if columns is None else planes.index_select(-1, columns)
 
 
-def _take_window(job: Job, like: Float[Tensor, "s p a"], width: int, columns: Tensor | None) -> Tensor:
-    """Any window will do where there is none: every Gaussian's ALWAYS is 1."""
-    if job.windows is None:
-        return like[:2]
-    return _take(job.windows, width, columns)
-
-
 def _composite(
     job: Job, table: Tensor, origins: Float[Tensor, "2 a"], keep_states: bool
 ) -> tuple[Float[Tensor, "5 p a"], _Trace]:
@@ -109,12 +98,7 @@ def _composite(
             trace.columns.append(columns)
             trace.states.append(state)
         params = gather_params(table, _level_ranks(lists, index, columns))
-        state = job.kernels.forward(
-            params,
-            _take(origins, level.width, columns),
-            state,
-            _take_window(job, state, level.width, columns),
-        )
+        state = job.kernels.forward(params, _take(origins, level.width, columns), state)
     if columns is None:
         final[..., : state.shape[2]] = state
     else:
@@ -125,7 +109,7 @@ def _composite(
 class Composite(torch.autograd.Function):
     """Drawn Gaussians by rank [10, m] -> planes [5, p, t] of all tiles: transmittance, colour, depth.
 
-    Rows are those of torch_kernels up to ALWAYS. Memory for the backward pass: five planes per tile and chunk
+    Rows are the GRADED ones of splat_kernels. Memory for the backward pass: five planes per tile and chunk
     of K Gaussians, that is 5/K floats per fragment instead of the dozens that autograd would keep; everything
     else is computed again.
     """
@@ -168,8 +152,7 @@ def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> 
         level = lists.levels[index]
         params = gather_params(table, _level_ranks(lists, index, columns))
         level_origins, level_upstream = (_take(x, level.width, columns) for x in (origins, upstream))
-        window = _take_window(job, state, level.width, columns)
-        sums = job.kernels.backward(params, level_origins, state, level_upstream, window)
+        sums = job.kernels.backward(params, level_origins, state, level_upstream)
         by_slot = sums[:kept].reshape(kept, -1).T
         if columns is None:
             per_slot[level.start : level.start + by_slot.shape[0]] = by_slot
@@ -193,8 +176,8 @@ def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
 
 
 def _table(drawn: Float[Tensor, "d m"], job: Job) -> tuple[Float[Tensor, "c n"], Float[Tensor, "2 a"]]:
-    """The kernels' parameters, with a last column of opacity 0 for empty slots, and the tiles' corners."""
-    table = F.pad(torch.cat((drawn, job.always[None])), (0, 1))
+    """What is drawn, with a last column of opacity 0 for empty slots, and the tiles' corners."""
+    table = F.pad(drawn, (0, 1))
     return table, job.lists.sheet.origins(table).index_select(1, job.lists.tiles)
 
 

@@ -1,11 +1,14 @@
-"""The gsplat rasterizer: gsplat 1.4.0's CUDA kernels, unmodified, with crops and frozen Gaussians.
+"""The gsplat rasterizer: gsplat 1.4.0's CUDA kernels, unmodified, with crops, frozen Gaussians and z windows.
+
+gsplat draws from a sorted list of (tile, depth) keys, each with the Gaussian that it belongs to. Leaving out
+those whose depth is not within the tile's window is all that a z window takes.
 
 Importing this module imports gsplat, which compiles its CUDA extension at the first call if need be.
 """
 
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gsplat
@@ -17,10 +20,10 @@ from gsplat.cuda._wrapper import (
     rasterize_to_pixels,
     spherical_harmonics,
 )
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Cut, DepthWindow, Raster, Rasterizer, Shot
+from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot
 from abcd_ns.engine.rasterizer.projection import Splats, check_degree
 from abcd_ns.engine.rasterizer.splat_kernels import (
     CONIC_XX,
@@ -31,11 +34,12 @@ from abcd_ns.engine.rasterizer.splat_kernels import (
     RED,
     SPLAT_ROWS,
 )
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
+from abcd_ns.engine.rasterizer.z_window import ZWindow, showing
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 TILE = 16
 """gsplat's tile size, pixels."""
-NO_WINDOW = 'The gsplat rasterizer has no z window; use ownership by means or the rasterizer "torch".'
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,33 @@ class _Projected:
     opacities: Float[Tensor, "1 n"]
     features: Float[Tensor, "1 n 4"]
     """Colour, then depth: what is composited."""
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """The (Gaussian, tile) pairs of a crop as gsplat sorts them: by tile, then by depth.
+
+    Crops begin where a tile of the full image does, so their tiles are those of a TileGrid, in its order.
+    """
+
+    grid: TileGrid
+    ids: Int[Tensor, "q"]
+    """The keys: tile << 32 | bits of the depth."""
+    gaussians: Int[Tensor, "q"]
+    """Whose they are."""
+
+    @property
+    def tile(self) -> Int[Tensor, "q"]:
+        """Number of each pair's tile."""
+        return self.ids >> 32
+
+    def __getitem__(self, keep: Bool[Tensor, "q"]) -> "_Pairs":
+        """Some of them, in order."""
+        return _Pairs(self.grid, self.ids[keep], self.gaussians[keep])
+
+    def offsets(self) -> Int[Tensor, "1 r c"]:
+        """Where each tile's pairs begin."""
+        return isect_offset_encode(self.ids, 1, self.grid.cols, self.grid.rows)
 
 
 def _project(gaussians: Gaussians, view: View, sh_degree: int, antialiased: bool) -> _Projected:
@@ -94,7 +125,7 @@ def _shift_into(crop: Crop, means2d: Tensor, radii: Tensor) -> tuple[Tensor, Ten
 
     Shifting the principal point instead would change the picture: the projection's clamp depends on it.
     """
-    shifted = means2d - means2d.new_tensor([crop.x, crop.y])
+    shifted = means2d - means2d.new_tensor([crop.x, crop.y]) if crop.x or crop.y else means2d
     center = shifted.detach()
     size = center.new_tensor([crop.width, crop.height])
     # A tile's width of slack: gsplat draws on whole tiles, so a Gaussian beside the crop may still count.
@@ -120,9 +151,9 @@ def _forward_absgrad(means2d: Tensor, drawn: Tensor) -> None:
 
 
 class GsplatRasterizer(Rasterizer):
-    """gsplat 1.4.0 on CUDA, float32. Has no z window; the picture of a crop is that of the full image."""
+    """gsplat 1.4.0 on CUDA, float32. The picture of a crop is that of the full image."""
 
-    supports_z_window = False
+    window_side = TILE
 
     def __init__(self) -> None:
         self.name = f"gsplat-{gsplat.__version__}"
@@ -136,8 +167,10 @@ class GsplatRasterizer(Rasterizer):
     ) -> Splats:
         """See Rasterizer.project."""
         check_degree(gaussians, sh_degree)
-        seen = _project(gaussians, view, sh_degree, antialiased)
         planes = gaussians.means.new_zeros((SPLAT_ROWS, len(gaussians)))  # covariances stay 0
+        if len(gaussians) == 0:
+            return Splats(planes)
+        seen = _project(gaussians, view, sh_degree, antialiased)
         planes[:DEPTH], planes[DEPTH] = seen.means2d[0].T, seen.depths[0]
         planes[CONIC_XX:OPACITY], planes[OPACITY] = seen.conics[0].T, seen.opacities[0]
         planes[RED:GRADED], planes[RADIUS] = seen.features[0, :, :3].T, seen.radii[0]
@@ -154,20 +187,38 @@ class GsplatRasterizer(Rasterizer):
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One call of gsplat for each shot."""
         check_degree(gaussians, sh_degree)
-        if any(shot.z_window is not None for shot in shots):
-            raise ValueError(NO_WINDOW)
         rasters = [_draw_shot(gaussians, shot, sh_degree, antialiased, absgrad) for shot in shots]
         for raster in rasters:
             raster.info["n_cameras"] = len(shots)
         return tuple(rasters)
 
-    def cut(self, *_args: Any, **_options: Any) -> Cut:
-        """See Rasterizer.cut: stock gsplat cannot."""
-        raise ValueError(NO_WINDOW)
+    @torch.no_grad()
+    def cut(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        *,
+        front: ZWindow,
+        inside: ZWindow,
+        back: ZWindow,
+        crop: Crop,
+        sh_degree: int,
+        antialiased: bool = False,
+    ) -> Cut:
+        """See Rasterizer.cut. Projected and sorted once."""
+        splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
+        drawing = _Drawing.of(_projected(splats), crop)
+        members = drawing.within(inside).pairs.gaussians.unique().long()
+        layers = (drawing.within(window).layer() for window in (front, back))
+        return Cut(*layers, splats[members], members)
 
-    def depth_window(self, *_args: Any, **_options: Any) -> DepthWindow:
-        """See Rasterizer.depth_window: stock gsplat cannot."""
-        raise ValueError(NO_WINDOW)
+    @torch.no_grad()
+    def depth_window(
+        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
+    ) -> ZWindow:
+        """See Rasterizer.depth_window."""
+        drawing = _Drawing.of(_projected(self.project(gaussians, view, antialiased=antialiased)), crop)
+        return showing(drawing.pairs.grid, drawing.pairs.tile, drawing.z, drawing.weights(), visible)
 
 
 def _draw_shot(gaussians: Gaussians, shot: Shot, sh_degree: int, antialiased: bool, absgrad: bool) -> Raster:
@@ -176,11 +227,13 @@ def _draw_shot(gaussians: Gaussians, shot: Shot, sh_degree: int, antialiased: bo
         return _nothing(gaussians, view, crop)
     own = _project(gaussians, view, sh_degree, antialiased)
     everyone = own if frozen is None or len(frozen) == 0 else _join(own, _projected(frozen))
-    drawn = _aligned(crop)
-    features, alphas = _draw(own, everyone, drawn, view, absgrad)
-    rows, cols = Crop(crop.x - drawn.x, crop.y - drawn.y, crop.width, crop.height).slices
-    features, alphas = features[rows, cols], alphas[rows, cols]
-    return Raster(features[..., :3], 1.0 - alphas[..., 0], features[..., 3], _info(own, view))
+    drawing = _Drawing.of(everyone, crop)
+    if shot.z_window is not None:
+        drawing = drawing.within(shot.z_window, always=0 if frozen is None else len(gaussians))
+    if absgrad and own.means2d.requires_grad and drawing.means2d is not own.means2d:
+        _forward_absgrad(own.means2d, drawing.means2d)
+    features, transmittance = drawing.draw(absgrad)
+    return Raster(features[..., :3], transmittance, features[..., 3], _info(own, view))
 
 
 def _projected(splats: Splats) -> _Projected:
@@ -190,31 +243,90 @@ def _projected(splats: Splats) -> _Projected:
     return _Projected(*(value[None].contiguous() for value in values))
 
 
-def _draw(
-    own: _Projected, everyone: _Projected, crop: Crop, view: View, absgrad: bool
-) -> tuple[Tensor, Tensor]:
-    """Second half of gsplat's `rasterization`: (features [h, w, 4], alphas [h, w, 1]) of an aligned crop."""
-    means2d, radii = everyone.means2d, everyone.radii
-    if crop != view.full:
-        means2d, radii = _shift_into(crop, means2d, radii)
-    tile_width, tile_height = -(-crop.width // TILE), -(-crop.height // TILE)
-    _, isect_ids, flatten_ids = isect_tiles(means2d, radii, everyone.depths, TILE, tile_width, tile_height)
-    means2d = means2d.contiguous()
-    if absgrad and means2d.requires_grad and means2d is not own.means2d:
-        _forward_absgrad(own.means2d, means2d)
-    features, alphas = rasterize_to_pixels(
-        means2d,
-        everyone.conics,
-        everyone.features,
-        everyone.opacities,
-        crop.width,
-        crop.height,
-        TILE,
-        isect_offset_encode(isect_ids, 1, tile_width, tile_height),
-        flatten_ids,
-        absgrad=absgrad,
-    )
-    return features[0], alphas[0]
+@dataclass(frozen=True)
+class _Drawing:
+    """Second half of gsplat's `rasterization`, for the tiles of a crop."""
+
+    everyone: _Projected
+    means2d: Float[Tensor, "1 n 2"]
+    """Relative to the upper left tile."""
+    crop: Crop
+    pairs: _Pairs
+
+    @staticmethod
+    def of(everyone: _Projected, crop: Crop) -> "_Drawing":
+        """What may be drawn in a crop."""
+        grid, tiled = TileGrid(crop, TILE), _aligned(crop)
+        means2d, radii = _shift_into(tiled, everyone.means2d, everyone.radii)
+        means2d = means2d.contiguous()
+        if means2d.shape[1] == 0:
+            nothing = radii.new_zeros(0)
+            return _Drawing(everyone, means2d, crop, _Pairs(grid, nothing.long(), nothing))
+        _, ids, gaussians = isect_tiles(means2d, radii, everyone.depths, TILE, grid.cols, grid.rows)
+        return _Drawing(everyone, means2d, crop, _Pairs(grid, ids, gaussians))
+
+    @property
+    def z(self) -> Float[Tensor, "q"]:
+        """Camera z of each pair's Gaussian."""
+        return self.everyone.depths[0].index_select(0, self.pairs.gaussians)
+
+    def within(self, window: ZWindow, always: int = 0) -> "_Drawing":
+        """Without the pairs that lie outside of their tile's window.
+
+        Args:
+            always: the first so many Gaussians are not masked.
+        """
+        inside = window.on(self.pairs.grid).holds(self.pairs.tile, self.z)
+        if always:
+            inside |= self.pairs.gaussians < always
+        return replace(self, pairs=self.pairs[inside])
+
+    def draw(self, absgrad: bool = False) -> tuple[Float[Tensor, "h w 4"], Float[Tensor, "h w"]]:
+        """(features, transmittance) of the crop."""
+        everyone, crop = self.everyone, self.crop
+        tiled = _aligned(crop)
+        features, alphas = rasterize_to_pixels(
+            self.means2d,
+            everyone.conics,
+            everyone.features,
+            everyone.opacities,
+            tiled.width,
+            tiled.height,
+            TILE,
+            self.pairs.offsets(),
+            self.pairs.gaussians,
+            absgrad=absgrad,
+        )
+        rows, cols = Crop(crop.x - tiled.x, crop.y - tiled.y, crop.width, crop.height).slices
+        return features[0, rows, cols], 1.0 - alphas[0, rows, cols, 0]
+
+    def layer(self) -> Layer:
+        """What it looks like."""
+        features, transmittance = self.draw()
+        return Layer(features[..., :3], transmittance)
+
+    def weights(self) -> Float[Tensor, "q"]:
+        """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels in the crop.
+
+        Each pair is drawn as if it were a Gaussian of its own: the gradient of the picture's sum by its
+        colour, of which one channel will do, is its weight.
+        """
+        owner, everyone = self.pairs.gaussians, self.everyone
+        if len(owner) == 0:
+            return self.z
+        parts = (self.means2d, everyone.conics, everyone.opacities)
+        means2d, conics, opacities = (part.index_select(1, owner) for part in parts)
+        dark = means2d.new_zeros((1, len(owner), 1)).requires_grad_()
+        tiled, offsets = _aligned(self.crop), self.pairs.offsets()
+        each = torch.arange(len(owner), device=owner.device, dtype=owner.dtype)
+        with torch.enable_grad():
+            picture, _ = rasterize_to_pixels(
+                means2d, conics, dark, opacities, tiled.width, tiled.height, TILE, offsets, each
+            )
+            rows = slice(self.crop.y - tiled.y, None)
+            cols = slice(self.crop.x - tiled.x, None)
+            (found,) = torch.autograd.grad(picture[0, rows, cols].sum(), dark)
+        return found[0, :, 0]
 
 
 def _info(own: _Projected, view: View) -> dict[str, Any]:

@@ -86,13 +86,14 @@ def pack(gaussians: Gaussians) -> Float[Tensor, "p n"]:
 
 
 def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) -> Float[Tensor, "c"]:
-    """A view as `splat` takes it, in the dtype and on the device of `like`."""
-    viewmat, K = view.viewmat.to(like), view.K.to(like)
-    options = like.new_tensor([view.width, view.height, float(antialiased)])
-    degrees = like.new_tensor([float(degree < sh_degree) for degree in range(MAX_SH_DEGREE)])
+    """A view as `splat` takes it, in the dtype and on the device of `like`; one copy to the device."""
+    viewmat, K = view.viewmat, view.K
+    options = viewmat.new_tensor([view.width, view.height, float(antialiased)])
+    degrees = [float(degree < sh_degree) for degree in range(MAX_SH_DEGREE)]
     pinhole = (K[0, 0, None], K[1, 1, None], K[:2, 2])
     pose = (viewmat[:3, :3].reshape(-1), viewmat[:3, 3])
-    return torch.cat((*pose, *pinhole, options, view.center.to(like), like.new_tensor([view.near]), degrees))
+    rest = (options, view.center, viewmat.new_tensor([view.near, *degrees]))
+    return torch.cat((*pose, *pinhole, *rest)).to(like)
 
 
 def project_packed(

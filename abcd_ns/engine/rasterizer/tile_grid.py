@@ -45,6 +45,43 @@ class TileGrid:
     def pixels_per_tile(self) -> int:
         return self.side * self.side
 
+    @property
+    def tiles(self) -> int:
+        """How many there are."""
+        return self.rows * self.cols
+
+    def middles(
+        self, dtype: torch.dtype, device: torch.device | str
+    ) -> tuple[Float[Tensor, "c"], Float[Tensor, "r"]]:
+        """(x of each column's, y of each row's) middle, in pixels of the full image.
+
+        It does not depend on the crop, and may lie outside of it, or of the image, by up to half a tile.
+        """
+        numbers = ((self.first_col, self.cols), (self.first_row, self.rows))
+        x, y = (torch.arange(first, first + n, dtype=dtype, device=device) for first, n in numbers)
+        return x * self.side + self.side / 2, y * self.side + self.side / 2
+
+    def pixels(self, device: torch.device | str) -> Int[Tensor, "t"]:
+        """How many pixels of the crop each tile holds."""
+        spans = ((self.first_col, self.cols, self.crop.x, self.crop.width),)
+        spans += ((self.first_row, self.rows, self.crop.y, self.crop.height),)
+        counts = []
+        for first, n, start, size in spans:
+            low = torch.arange(first, first + n, device=device) * self.side
+            counts.append((low + self.side).clamp_max(start + size) - low.clamp_min(start))
+        return (counts[1][:, None] * counts[0]).flatten()
+
+    def holding(self, grid: "TileGrid", tiles: Int[Tensor, "q"]) -> Int[Tensor, "q"]:
+        """The tiles of this grid that hold these tiles of another one, of which they are parts.
+
+        Args:
+            grid: of a crop that lies within this crop.
+        """
+        rows = (grid.first_row + torch.div(tiles, grid.cols, rounding_mode="floor")) * grid.side
+        cols = (grid.first_col + tiles % grid.cols) * grid.side
+        rows, cols = (torch.div(x, self.side, rounding_mode="floor") for x in (rows, cols))
+        return (rows - self.first_row) * self.cols + cols - self.first_col
+
     def origins(
         self, tiles: Int[Tensor, "a"], dtype: torch.dtype
     ) -> tuple[Float[Tensor, "a"], Float[Tensor, "a"]]:
@@ -91,7 +128,7 @@ class TileSheet:
 
     @property
     def _sizes(self) -> list[int]:
-        return [grid.rows * grid.cols for grid in self.grids]
+        return [grid.tiles for grid in self.grids]
 
     def numbers(self, like: Tensor) -> Float[Tensor, "5 g"]:
         """Of each grid what splat_kernels.tile_rows takes."""

@@ -1,6 +1,5 @@
-"""The torch rasterizer: gsplat's drawing in plain torch, for any device, with a z window per pixel."""
+"""The torch rasterizer: gsplat's drawing in plain torch, for any device."""
 
-import math
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -9,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Cut, DepthWindow, Raster, Rasterizer, Shot, ZWindow
-from abcd_ns.engine.rasterizer.binning import Candidates, TileLists, find_candidates, window_planes
+from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot
+from abcd_ns.engine.rasterizer.binning import Candidates, find_candidates
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, CompilePolicy
-from abcd_ns.engine.rasterizer.compositing_function import Composite, Job
-from abcd_ns.engine.rasterizer.depth_window import depth_window
+from abcd_ns.engine.rasterizer.compositing_function import Composite, Job, pair_weights
 from abcd_ns.engine.rasterizer.projection import Splats, check_degree, pack, project_packed
 from abcd_ns.engine.rasterizer.splat_kernels import CONIC_XX, DEPTH, GRADED, OPACITY, RADIUS
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid, TileSheet
+from abcd_ns.engine.rasterizer.z_window import ZWindow, showing
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 TILE_SIDE = 4
@@ -49,24 +48,32 @@ class TorchRasterizer(Rasterizer):
         compile: whether float32 on the CPU runs on kernels built ahead of time (see kernels): "auto" if they
             are found, "always" building them now if need be, "never" not at all. Built and eager kernels
             agree to rounding only: use "never" where last bits must not depend on the machine.
-        tile_side: pixels along a tile's side; a divisor of 16. Speed only, but for depth windows.
+        tile_side: pixels along a tile's side; a divisor of 16. Speed only.
         chunk: Gaussians per kernel call and tile. Speed and memory only.
+        window_side: pixels along the sides of the tiles of its z windows; 0 takes `tile_side`.
 
     Raises:
-        ValueError: `tile_side` does not divide 16.
+        ValueError: `tile_side` does not divide 16, or `window_side` is no multiple of it.
     """
 
-    name = "torch-2"
-    supports_z_window = True
+    name = "torch-3"
 
     def __init__(
-        self, compile: CompilePolicy = "auto", *, tile_side: int = TILE_SIDE, chunk: int = CHUNK
+        self,
+        compile: CompilePolicy = "auto",
+        *,
+        tile_side: int = TILE_SIDE,
+        chunk: int = CHUNK,
+        window_side: int = 0,
     ) -> None:
         if tile_side < 1 or 16 % tile_side:
             raise ValueError(f"tile_side is {tile_side}; choose one of 1, 2, 4, 8, 16.")
+        if window_side % tile_side:
+            raise ValueError(f"window_side is {window_side}; choose a multiple of tile_side, {tile_side}.")
         self.kernels = ChunkKernels(compile, tile_side, chunk)
         self.tile_side = tile_side
         self.chunk = chunk
+        self.window_side = window_side or tile_side
         self._packed: tuple[weakref.ref[Gaussians], Tensor] | None = None
 
     def warm_up(self) -> None:
@@ -93,8 +100,6 @@ class TorchRasterizer(Rasterizer):
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
         check_degree(gaussians, sh_degree)
-        for shot in shots:
-            _check_window(shot.z_window, shot.crop)
         options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": self.kernels.built}
         packed = pack(gaussians)
         own = torch.stack([project_packed(packed, shot.view, **options).planes for shot in shots])
@@ -110,10 +115,11 @@ class TorchRasterizer(Rasterizer):
             grid_of = torch.cat((grid_of, *(grid_of.new_full((p.shape[1],), k) for k, p in frozen)))
         sheet = TileSheet(tuple(TileGrid(shot.crop, self.tile_side) for shot in shots))
         candidates = find_candidates(Splats(bounds), grid_of, sheet, built=self.kernels.built)
-        windowed, window = _windows(shots, sheet, grid_of, own.shape[0] * own.shape[2])
-        lists = candidates.lists(self.chunk, windowed, window)
-        job = self._job(lists, bounds, windowed, window, info["means2d"] if absgrad else None)
-        images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, lists.rows), job))
+        if any(shot.z_window is not None for shot in shots):
+            masked = _masked(shots, grid_of, own.shape[0] * own.shape[2])
+            candidates = candidates.within([shot.z_window for shot in shots], masked)
+        job = self._job(candidates, bounds, info["means2d"] if absgrad else None)
+        images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, candidates.rows), job))
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
     @torch.no_grad()
@@ -130,36 +136,34 @@ class TorchRasterizer(Rasterizer):
         antialiased: bool = False,
     ) -> Cut:
         """See Rasterizer.cut. Projected and binned once."""
-        for window in (front, inside, back):
-            _check_window(window, crop)
         splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
         candidates = self._candidates(splats, crop)
-        members = candidates.touching(window_planes(candidates.sheet, [inside]))
-        layers = (self._layer(splats, candidates, window) for window in (front, back))
+        members = candidates.within([inside]).members
+        layers = (self._layer(splats, candidates.within([window])) for window in (front, back))
         return Cut(*layers, splats[members], members)
 
     @torch.no_grad()
     def depth_window(
         self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
-    ) -> DepthWindow:
+    ) -> ZWindow:
         """See Rasterizer.depth_window."""
         splats = self.project(gaussians, view, antialiased=antialiased)
         candidates = self._candidates(splats, crop)
-        job = self._job(candidates.lists(self.chunk), splats.planes, None, None, None)
-        return depth_window(candidates, splats.planes, job, visible)
+        drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
+        weight = pair_weights(drawn, self._job(candidates, splats.planes))
+        grid, drawn_in = self.window_grid(crop), candidates.sheet.grids[0]
+        # Pairs come by depth, so that sorting by tile alone keeps them in order.
+        tile, order = grid.holding(drawn_in, candidates.pairs.tile).sort(stable=True)
+        return showing(grid, tile, candidates.z[order], weight[order], visible)
 
     def _candidates(self, splats: Splats, crop: Crop) -> Candidates:
         sheet = TileSheet((TileGrid(crop, self.tile_side),))
         grid_of = torch.zeros(len(splats), dtype=torch.long, device=splats.planes.device)
         return find_candidates(splats, grid_of, sheet, built=self.kernels.built)
 
-    def _layer(self, splats: Splats, candidates: Candidates, z_window: ZWindow) -> Layer:
-        window = window_planes(candidates.sheet, [z_window])
-        every = torch.ones(len(splats), dtype=torch.bool, device=splats.planes.device)
-        lists = candidates.lists(self.chunk, every, window)
+    def _layer(self, splats: Splats, candidates: Candidates) -> Layer:
         drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
-        job = self._job(lists, splats.planes, every, window, None)
-        (image,) = candidates.sheet.to_images(Composite.apply(drawn, job))
+        (image,) = candidates.sheet.to_images(Composite.apply(drawn, self._job(candidates, splats.planes)))
         return Layer(image[1:4].permute(1, 2, 0), image[0])
 
     def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
@@ -169,18 +173,9 @@ class TorchRasterizer(Rasterizer):
         return self._packed[1]
 
     def _job(
-        self,
-        lists: TileLists,
-        planes: Float[Tensor, "r n"],
-        windowed: Bool[Tensor, "n"] | None,
-        window: Float[Tensor, "2 p t"] | None,
-        target: Tensor | None,
+        self, candidates: Candidates, planes: Float[Tensor, "r n"], absgrad_target: Tensor | None = None
     ) -> Job:
-        count = planes.shape[1]
-        if windowed is None or window is None:
-            return Job(lists, count, self.kernels, None, planes.new_ones(len(lists.rows)), target)
-        always = (~windowed.index_select(0, lists.rows)).to(planes)
-        return Job(lists, count, self.kernels, window.index_select(2, lists.tiles), always, target)
+        return Job(candidates.lists(self.chunk), planes.shape[1], self.kernels, absgrad_target)
 
 
 def _side_by_side(planes: Float[Tensor, "v r n"]) -> Float[Tensor, "r vn"]:
@@ -188,32 +183,11 @@ def _side_by_side(planes: Float[Tensor, "v r n"]) -> Float[Tensor, "r vn"]:
     return planes.transpose(0, 1).reshape(planes.shape[1], -1)
 
 
-def _windows(
-    shots: Sequence[Shot], sheet: TileSheet, grid_of: Int[Tensor, "n"], own: int
-) -> tuple[Bool[Tensor, "n"] | None, Float[Tensor, "2 p t"] | None]:
-    """Which splats are masked, and the planes that mask them; the first `own` splats are not frozen."""
-    if all(shot.z_window is None for shot in shots):
-        return None, None
+def _masked(shots: Sequence[Shot], grid_of: Int[Tensor, "n"], own: int) -> Bool[Tensor, "n"]:
+    """Which splats the shots' windows apply to; the first `own` splats are not frozen."""
     is_frozen = torch.arange(grid_of.numel(), device=grid_of.device) >= own
-    masks_frozen = [shot.frozen is not None for shot in shots]
-    has_window = [shot.z_window is not None for shot in shots]
-    masks_frozen, has_window = torch.tensor([masks_frozen, has_window], device=grid_of.device)
-    windowed = has_window[grid_of] & (is_frozen == masks_frozen[grid_of])
-    return windowed, window_planes(sheet, [shot.z_window or _open_window(shot) for shot in shots])
-
-
-def _open_window(shot: Shot) -> ZWindow:
-    size = (shot.crop.height, shot.crop.width)
-    like = {"dtype": shot.view.viewmat.dtype, "device": shot.view.viewmat.device}
-    return ZWindow(torch.full(size, -math.inf, **like), torch.full(size, math.inf, **like))
-
-
-def _check_window(window: ZWindow | None, crop: Crop) -> None:
-    if window is not None and window.near.shape != (crop.height, crop.width):
-        shape = tuple(window.near.shape)
-        raise ValueError(
-            f"The z window is {shape}, but the crop is {(crop.height, crop.width)}; give it the crop's size."
-        )
+    masks_frozen = torch.tensor([shot.frozen is not None for shot in shots], device=grid_of.device)
+    return is_frozen == masks_frozen[grid_of]
 
 
 def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot]) -> dict[str, Any]:

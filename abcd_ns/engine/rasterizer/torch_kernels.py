@@ -18,7 +18,6 @@ from abcd_ns.engine.rasterizer.splat_kernels import (
     CONIC_XY,
     CONIC_YY,
     DEPTH,
-    GRADED,
     GREEN,
     MIN_ALPHA,
     OPACITY,
@@ -32,10 +31,6 @@ MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
 """The fragment after which T would be at most this, and all behind it, are not drawn."""
 STATE_PLANES = 5
-
-ALWAYS = GRADED
-"""Row of the parameter table after those that splat_kernels draws: 1 where the z window does not apply."""
-PARAMETERS = ALWAYS + 1
 
 MOMENTS = 6
 GRADIENTS = MOMENTS + 4
@@ -61,15 +56,12 @@ def _offsets(params: Params, origins: Float[Tensor, "2 a"], side: int) -> tuple[
     return dx, dy
 
 
-def _alphas(params: Params, dx: Tensor, dy: Tensor, window: Float[Tensor, "2 p a"]) -> Float[Tensor, "k p a"]:
+def _alphas(params: Params, dx: Tensor, dy: Tensor) -> Float[Tensor, "k p a"]:
     """min(0.999, opacity exp(-sigma)) of each fragment, 0 where it is not drawn."""
     half_xx, xy, half_yy = 0.5 * params[CONIC_XX], params[CONIC_XY], 0.5 * params[CONIC_YY]
     sigma = dx * (half_xx[:, None] * dx + xy[:, None] * dy) + half_yy[:, None] * dy * dy
     alphas = (params[OPACITY][:, None] * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
-    z = params[DEPTH][:, None]
-    inside = (params[ALWAYS][:, None] > 0) | ((z >= window[0]) & (z < window[1]))
-    drawn = inside & (sigma >= 0) & (alphas >= MIN_ALPHA)
-    return torch.where(drawn, alphas, 0.0)
+    return torch.where((sigma >= 0) & (alphas >= MIN_ALPHA), alphas, 0.0)
 
 
 def _advance(T: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -84,10 +76,9 @@ def forward_chunk(
     params: Params,
     origins: Float[Tensor, "2 a"],
     state: Float[Tensor, "5 p a"],
-    window: Float[Tensor, "2 p a"],
 ) -> tuple[Float[Tensor, "5 p a"]]:
     """Composite one chunk behind what `state` holds."""
-    alphas = _alphas(params, *_offsets(params, origins, side), window)
+    alphas = _alphas(params, *_offsets(params, origins, side))
     T, red, green, blue, depth = state.unbind(0)
     for k in range(params.shape[1]):
         T, weight, _ = _advance(T, alphas[k])
@@ -104,7 +95,6 @@ def backward_chunk(
     origins: Float[Tensor, "2 a"],
     state: Float[Tensor, "5 p a"],
     upstream: Float[Tensor, "5 p a"],
-    window: Float[Tensor, "2 p a"],
 ) -> tuple[Float[Tensor, "g k a"]]:
     """Gradients of one chunk's Gaussians, summed over each tile's pixels.
 
@@ -119,7 +109,7 @@ def backward_chunk(
         upstream: dL/d(red, green, blue, depth), then `total`.
     """
     dx, dy = _offsets(params, origins, side)
-    alphas = _alphas(params, dx, dy, window)
+    alphas = _alphas(params, dx, dy)
     T, total = state[0], upstream[4]
     done = (state[1:] * upstream[:4]).sum(dim=0)
     weights, sigma_grads = [], []

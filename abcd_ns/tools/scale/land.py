@@ -15,6 +15,7 @@ from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.intervals import ray_directions
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.spherical_harmonics import SH_C0
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 HEIGHT = 1.1
@@ -99,7 +100,8 @@ class Land:
 
     def photo(self, view: View, crop: Crop) -> Float[Tensor, "h w 3"]:
         """What `view` sees; black beyond the land's border."""
-        direction, center = ray_directions(view, crop), view.center
+        direction = ray_directions(view, TileGrid(crop, 1)).view(3, crop.height, crop.width)
+        center = view.center
         depth = -center[2] / direction[2]
         x, y = center[0] + depth * direction[0], center[1] + depth * direction[1]
         rows = self.tiles // self.columns

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.intervals import ray_directions
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.types import View
 
 WAVES = 5
@@ -66,7 +67,7 @@ class World:
         """Of each pixel's ray, row by row: where it ends, whether it meets anything there, and the colour."""
         origin = view.center.double()
         exact = view.to(torch.float64)
-        directions = ray_directions(exact, exact.full).reshape(3, -1).T
+        directions = ray_directions(exact, TileGrid(exact.full, 1)).T
         t = torch.stack([surface.meet(origin, directions) for surface in self.surfaces])
         nearest, which = t.min(dim=0)
         hit = nearest < FAR / 2
