@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import torch
 import tyro
@@ -28,7 +29,7 @@ from abcd_ns.engine.loss import mean_psnr
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.param_swap import nothing_live
 from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.rasterizer import make_rasterizer
+from abcd_ns.engine.rasterizer import Rasterizer, make_rasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
@@ -36,6 +37,7 @@ from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.plugin.config import AbcdDataManagerConfig
+from abcd_ns.plugin.data.dataset import AbcdDataset
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
 from abcd_ns.plugin.views import views_of
 
@@ -71,10 +73,12 @@ class Args:
 
 @dataclass(frozen=True)
 class Capture:
-    """What the runs train on."""
+    """What runs train on and are judged by."""
 
     views: list[View]
     photo: PhotoReader
+    held_out: list[View]
+    held_out_photo: PhotoReader
     gaussians: Gaussians
 
 
@@ -92,36 +96,62 @@ class StageClock:
         self.seconds[name] += time.perf_counter() - start
 
 
-def read(args: Args) -> Capture:
+class Source(Protocol):
+    """Where a capture is read from."""
+
+    data: Path
+    downscale: int
+
+
+def read(source: Source) -> Capture:
     """The capture in RAM."""
-    parser = AbcdDataParserConfig(downscale_factor=args.downscale)
-    manager = AbcdDataManagerConfig(data=args.data, dataparser=parser).setup(device="cpu", test_mode="val")
-    dataset = manager.train_dataset
-    points = dataset.metadata["points3D_xyz"].float()
-    views = views_of(dataset.cameras)
-    near = near_plane(points, views)
-    views = [replace(view, near=near) for view in views]
+    parser = AbcdDataParserConfig(downscale_factor=source.downscale)
+    manager = AbcdDataManagerConfig(data=source.data, dataparser=parser).setup(device="cpu", test_mode="val")
+    points = manager.train_dataset.metadata["points3D_xyz"].float()
+    near = near_plane(points, views_of(manager.train_dataset.cameras))
+    sides = (_views_and_photos(dataset, near) for dataset in (manager.train_dataset, manager.eval_dataset))
+    start = gaussians_from_points(points, manager.train_dataset.metadata["points3D_rgb"])
+    return Capture(*next(sides), *next(sides), start)
+
+
+def _views_and_photos(dataset: AbcdDataset, near: float) -> tuple[list[View], PhotoReader]:
+    views = [replace(view, near=near) for view in views_of(dataset.cameras)]
     photos = [dataset.photos.crop(view.index, view.full).float() / 255 for view in views]
-    start = gaussians_from_points(points, dataset.metadata["points3D_rgb"])
-    return Capture(views, lambda view, crop: photos[view][crop.slices], start)
+    return views, lambda view, crop: photos[view][crop.slices]
+
+
+def begin(
+    capture: Capture,
+    blocks: int,
+    folder: Path,
+    *,
+    seed: int,
+    processes: int,
+    steps: int | None = None,
+    seconds: float | None = None,
+    rasterizer: Rasterizer | None = None,
+) -> Coordinator:
+    """A coordinator at the beginning of a run, its store and layers in `folder`."""
+    tree = build_kd(capture.gaussians.means, blocks)
+    store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
+    keep = None if blocks == 1 else len(capture.gaussians) // blocks
+    store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=seed))
+    return Coordinator(
+        TrainingConfig(seed=seed, processes=processes),
+        Budget(steps=steps, seconds=seconds),
+        StoredScene(tree, store),
+        capture.views,
+        LayerCache(folder / "layers"),
+        rasterizer or make_rasterizer("torch", "cpu"),
+        *nothing_live(3),
+        target=lambda sample: (capture.photo(sample.view.index, sample.crop), None),
+    )
 
 
 def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
     """Train; the stages of the second half."""
-    tree = build_kd(capture.gaussians.means, blocks)
-    store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-    keep = None if blocks == 1 else len(capture.gaussians) // blocks
-    store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=args.seed))
-    coordinator = Coordinator(
-        TrainingConfig(seed=args.seed, processes=args.processes),
-        Budget(seconds=args.seconds),
-        StoredScene(tree, store),
-        capture.views,
-        LayerCache(folder / "layers"),
-        make_rasterizer("torch", "cpu"),
-        *nothing_live(3),
-        target=lambda sample: (capture.photo(sample.view.index, sample.crop), None),
-    )
+    options = {"seconds": args.seconds, "seed": args.seed, "processes": args.processes}
+    coordinator = begin(capture, blocks, folder, **options)
     clock, layers = StageClock(), 0.0
 
     def note(event: object) -> None:
@@ -138,7 +168,7 @@ def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
     clock.seconds["layers"] = layers - began
     clock.seconds["plan and attach"] -= layers - began
     coordinator.cache.close()
-    store.close()
+    coordinator.scene.store.close()
     return clock
 
 

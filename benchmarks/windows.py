@@ -1,0 +1,170 @@
+"""What it costs to give z windows by tiles of 16 px, as gsplat has them, and not of 4 px as on the CPU.
+
+    python -m benchmarks.windows --data DIR --downscale 1 --blocks 8 --steps 200 --seeds 0 1 --out FILE
+
+Trains the same scene with windows of each side, by the torch rasterizer and for equally many steps; compares
+
+- PSNR of held-out views, merged;
+- the ordering gap: PSNR between merged and composited pictures of these views;
+- frozen fragments that a step draws beside the block's own, as a share of all: a larger tile has a wider
+  window, as it holds every depth at which the block shows anywhere in it;
+- milliseconds for each view drawn to train, layers left out.
+"""
+
+import json
+import tempfile
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+import tyro
+
+from abcd_ns.engine.batch import Sample
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.param_swap import live_gaussians
+from abcd_ns.engine.rasterizer import TorchRasterizer
+from abcd_ns.engine.rasterizer.binning import bin_splats
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
+from abcd_ns.engine.scene import MemoryScene
+from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.plugin.machine import describe_machine, describe_versions
+from benchmarks.visit import Capture, begin, read
+
+COUNTED = 10
+"""Fragments are counted in one of so many steps."""
+
+
+@dataclass
+class Args:
+    """What to compare."""
+
+    data: Path
+    """The scene, as for `ns-train abcd --data`."""
+    downscale: int = 1
+    """Divides the photos' width and height."""
+    blocks: int = 8
+    """Of the scene."""
+    steps: int = 200
+    """Of each run."""
+    seeds: tuple[int, ...] = (0, 1)
+    """A pair of runs for each."""
+    sides: tuple[int, ...] = (4, 16)
+    """Of the windows' tiles, px; multiples of 4."""
+    out: Path | None = None
+    """Where to write the results, JSON."""
+
+
+@dataclass
+class Counts:
+    """Fragments drawn by steps, and how long steps took."""
+
+    own: int = 0
+    frozen: int = 0
+    views: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run."""
+
+    side: int
+    seed: int
+    psnr: float
+    gap: float
+    frozen_share: float
+    """Of the fragments that a step draws."""
+    ms_per_view: float
+    gaussians: int
+    steps: int = field(default=0)
+
+
+def count(rasterizer: TorchRasterizer, own: Gaussians, samples: tuple[Sample, ...], counts: Counts) -> None:
+    """Add up the fragments that a step is about to draw."""
+    for sample in samples:
+        grid = TileGrid(sample.crop, rasterizer.tile_side)
+        counts.own += bin_splats(rasterizer.project(own, sample.view), grid, rasterizer.chunk).fragments
+        if sample.near is not None:
+            counts.frozen += bin_splats(sample.near, grid, rasterizer.chunk, window=sample.window).fragments
+
+
+def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
+    """Train and look at held-out views."""
+    rasterizer, counts = TorchRasterizer(window_side=side), Counts()
+    with tempfile.TemporaryDirectory() as folder:
+        options = {"steps": args.steps, "seed": seed, "processes": 1, "rasterizer": rasterizer}
+        coordinator = begin(capture, args.blocks, Path(folder), **options)
+        train(coordinator, capture, rasterizer, counts)
+        scene = coordinator.scene
+        parts = [scene.gaussians(block) for block in range(scene.tree.num_blocks)]
+        gaussians, tree = Gaussians.cat(parts), scene.tree
+        coordinator.cache.close()
+        scene.store.close()
+    painter = Painter(
+        MemoryScene(tree, gaussians), capture.held_out, rasterizer, ownership="fragments", pass_gaussians=0
+    )
+    errors, gaps = [], []
+    for view in capture.held_out:
+        with torch.no_grad():
+            merged = rasterizer(gaussians, view, sh_degree=3).color.clamp(0, 1)
+        composited = painter.picture(view, PaintSettings(3)).color.clamp(0, 1)
+        errors.append(_psnr(merged, capture.held_out_photo(view.index, view.full)))
+        gaps.append(_psnr(merged, composited))
+    drawn = max(counts.own + counts.frozen, 1)
+    return Row(
+        side=side,
+        seed=seed,
+        psnr=sum(errors) / len(errors),
+        gap=sum(gaps) / len(gaps),
+        frozen_share=counts.frozen / drawn,
+        ms_per_view=1e3 * counts.seconds / max(counts.views, 1),
+        gaussians=len(gaussians),
+        steps=coordinator.state.step,
+    )
+
+
+def train(coordinator: Coordinator, capture: Capture, rasterizer: TorchRasterizer, counts: Counts) -> None:
+    """All steps; those in the midst of a visit are timed, and some of them counted."""
+    while not coordinator.finished:
+        active = coordinator.state.active
+        amid = active is not None and not active.is_whole and active.done < active.steps - 1
+        if amid and coordinator.state.step % COUNTED == 0:
+            samples = coordinator.next_batch().samples
+            count(rasterizer, live_gaussians(coordinator.params).detach(), samples, counts)
+        began = time.perf_counter()
+        train_step(coordinator, capture.photo)
+        if amid:
+            counts.seconds += time.perf_counter() - began
+            counts.views += coordinator.batch
+
+
+def _psnr(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float(-10 * (a - b).square().mean().clamp_min(1e-20).log10())
+
+
+def main(args: Args) -> None:
+    """Run all pairs, print the table, write the file."""
+    capture, rows = read(args), []
+    TorchRasterizer().warm_up()
+    for k, seed in enumerate(args.seeds):
+        for side in args.sides if k % 2 == 0 else args.sides[::-1]:  # the machine's speed drifts
+            rows.append(run(capture, side, seed, args))
+            print(rows[-1], flush=True)
+    print("| side | seed | PSNR | gap | frozen | ms a view | Gaussians |\n| ---: " + "| ---: " * 6 + "|")
+    for row in sorted(rows, key=lambda row: (row.side, row.seed)):
+        print(
+            f"| {row.side} | {row.seed} | {row.psnr:.2f} | {row.gap:.1f} | {row.frozen_share:.1%} "
+            f"| {row.ms_per_view:.1f} | {row.gaussians:,} |"
+        )
+    if args.out is not None:
+        told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
+        asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks}
+        found = {**told, **asked, "steps": args.steps, "runs": [asdict(row) for row in rows]}
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
