@@ -18,8 +18,9 @@ class Clocks:
 
     steps: int = 0
     """Views that were drawn to train the block."""
-    adam_steps: int = 0
-    """Adam's own step count, which corrects its bias."""
+    adam_views: int = 0
+    """Views' worth of decay that is in Adam's moments, which corrects their bias: a step of n views lets them
+    forget as n steps of one would."""
     visits: int = 0
     """Visits that have ended."""
     resets: int = 0
@@ -83,7 +84,7 @@ class BlockState:
 
     def forgetful(self) -> "BlockState":
         """As if no optimizer had ever seen it: zero moments and no statistics. The other clocks stay."""
-        return replace(BlockState.fresh(self.gaussians), clocks=replace(self.clocks, adam_steps=0))
+        return replace(BlockState.fresh(self.gaussians), clocks=replace(self.clocks, adam_views=0))
 
     def to(self, device: torch.device | str) -> "BlockState":
         """On another device."""

@@ -161,6 +161,7 @@ class Coordinator(StepDrawing):
         self.state.step += 1
         active.done += 1
         sound = self.health.end_step()
+        self._clocks = replace(self._clocks, adam_views=self._clocks.adam_views + self.batch)
         if not active.is_whole:
             self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)
             self._refine(rendered.infos if sound else (), taken)
@@ -267,7 +268,7 @@ class Coordinator(StepDrawing):
         rest = at_rest(*which).to(self.device)
         if active.done == 0 and not self.config.keep_moments:
             rest = rest.forgetful()
-        attach(rest, self.params, self.optimizers)
+        attach(rest, self.params, self.optimizers, batch=self.batch)
         self.health.begin_visit(active, self.state.health)
         self._growth, self._clocks = dict(rest.growth), rest.clocks
         if active.done == 0 and not active.is_whole:

@@ -240,14 +240,16 @@ class ExactCoordinator(Coordinator):
     def _step(
         self, block: int, state: BlockState, gradients: Gradients, rows: Int64[Tensor, "m"], taken: int
     ) -> BlockState:
-        attach(state.to(self.device), self.params, self.optimizers)
+        attach(state.to(self.device), self.params, self.optimizers, batch=taken)
         for name in PARAM_NAMES:
             self.params[name].grad = gradients.params[name][rows].to(self.device)
         if self.config.density.strategy == "mcmc":
             self.density.regularisation(self.params, self.count()).backward()
         for optimizer in self.optimizers.values():
             optimizer.step()
-        clocks = replace(state.clocks, steps=state.clocks.steps + taken)
+        clocks = replace(
+            state.clocks, steps=state.clocks.steps + taken, adam_views=state.clocks.adam_views + taken
+        )
         growth = self.density.after_step(
             self.params,
             self.optimizers,

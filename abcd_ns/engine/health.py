@@ -169,7 +169,7 @@ class Health:
         record.damping = max(record.damping / 2, LEAST_DAMPING)
         self._announce(VisitUndone(active.number, active.geometry.block, rise[0], rise[1]))
         before = at_rest(self._scene, active.geometry.block).to(state.gaussians.device)
-        clocks = replace(state.clocks, adam_steps=before.clocks.adam_steps)
+        clocks = replace(state.clocks, adam_views=before.clocks.adam_views)
         return replace(before, clocks=clocks)
 
     # -- numbers -------------------------------------------------------------------------------------

@@ -1,9 +1,9 @@
 """Puts a block into live parameters and Adam optimizers, and takes it out again, moments included."""
 
 from collections.abc import Mapping, MutableMapping
-from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
@@ -25,11 +25,18 @@ LEARNING_RATES = {
 """Splatfacto's. The means' decays with the progress of the run, see TrainingConfig."""
 
 
-def attach(state: BlockState, params: Params, optimizers: Optimizers) -> None:
+STEP_PARTS = 128
+"""Adam's step count is a multiple of 1 over this, which float32 counts exactly to beyond 100,000."""
+
+
+def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: int = 1) -> None:
     """Make `state` the live block: new Parameters, with its moments as Adam's state.
 
     The Parameters that were live before lose their memory at once, even where something (a logged loss,
     say) still refers to them.
+
+    Args:
+        batch: views in each of the steps to come, see `Pace.set`.
     """
     for name, value in state.gaussians.items():
         parameter = Parameter(value.detach().clone())
@@ -37,7 +44,7 @@ def attach(state: BlockState, params: Params, optimizers: Optimizers) -> None:
         _release(group["params"][0], optimizers[name])
         group["params"] = [parameter]
         optimizers[name].state[parameter] = {
-            "step": torch.tensor(float(state.clocks.adam_steps)),
+            "step": adam_step(state.clocks, batch).to(value.device),  # fused Adam reads it there
             **{moment: getattr(getattr(state, moment), name).clone() for moment in MOMENTS},
         }
         params[name] = parameter
@@ -48,10 +55,9 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
 
     Args:
         growth: the strategy's statistics, each [n]; copied.
-        clocks: the block's clocks; `adam_steps` is read from the optimizers.
+        clocks: the block's clocks, up to date.
     """
     moments: dict[str, dict[str, Tensor]] = {moment: {} for moment in MOMENTS}
-    steps = clocks.adam_steps
     for name in PARAM_NAMES:
         adam = optimizers[name].state.get(params[name], {})
         for moment in MOMENTS:
@@ -59,14 +65,23 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
             moments[moment][name] = (
                 torch.zeros_like(params[name]) if value is None else value.detach().clone()
             )
-        steps = max(steps, int(adam.get("step", 0)))
     return BlockState(
         Gaussians(**{name: params[name].detach().clone() for name in PARAM_NAMES}),
         Gaussians(**{n: v.detach() for n, v in moments["exp_avg"].items()}),
         Gaussians(**{n: v.detach() for n, v in moments["exp_avg_sq"].items()}),
         {name: value.clone() for name, value in growth.items()},
-        replace(clocks, adam_steps=steps),
+        clocks,
     )
+
+
+def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:
+    """Steps of `batch` views that would have let the moments forget as much as they have.
+
+    Adam divides its moments by 1 - beta**step, with the beta of the present steps: so `step` counts these, and
+    may be a fraction. It is rounded, so that counting on from it is exact: a run that is resumed in the
+    middle of a visit counts the same numbers as one that was not.
+    """
+    return torch.tensor(round(clocks.adam_views * STEP_PARTS / batch) / STEP_PARTS, dtype=torch.float32)
 
 
 def live_gaussians(params: Params) -> Gaussians:

@@ -1,6 +1,7 @@
 """Blocks at rest, and swapping them into live parameters and Adam."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ def some_state(count: int, seed: int = 0) -> BlockState:
         random_gaussians(count, seed + 1),
         Gaussians(**{n: v**2 for n, v in random_gaussians(count, seed + 2).items()}),
         {"grad2d": torch.rand(count, generator=generator), "count": torch.rand(count, generator=generator)},
-        Clocks(steps=7, adam_steps=5, visits=2),
+        Clocks(steps=7, adam_views=5, visits=2),
     )
 
 
@@ -84,7 +85,8 @@ def test_a_block_that_rested_trains_as_if_it_had_not():
     take_steps(*stayed, 5)
     moved = live(state)
     take_steps(*moved, 2)
-    rest = detach(*moved, state.growth, state.clocks)
+    clocks = replace(state.clocks, adam_views=state.clocks.adam_views + 2)
+    rest = detach(*moved, state.growth, clocks)
     attach(some_state(4, seed=9), *moved)
     take_steps(*moved, 3)
     attach(rest, *moved)

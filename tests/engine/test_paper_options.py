@@ -42,7 +42,7 @@ def test_moments_are_forgotten_at_the_next_visit_only_when_asked(tmp_path, views
     coordinator.next_batch()
     block = coordinator.state.active.geometry.block
     stored = BlockState.from_tensors(*coordinator.scene.store.load(block))
-    assert stored.clocks.adam_steps == 3
+    assert stored.clocks.adam_views == 3
     adam = coordinator.optimizers["scales"].state[coordinator.params["scales"]]
     assert int(adam["step"]) == (3 if keep else 0)
     assert bool(adam["exp_avg"].any()) == keep

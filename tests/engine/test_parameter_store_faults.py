@@ -139,8 +139,8 @@ def test_opening_what_is_no_store_says_so(tmp_path, store):
     with pytest.raises(StoreError, match="already holds a store"):
         ParameterStore.create(store.folder, {})
     manifest = store.folder / "manifest.json"
-    manifest.write_bytes(manifest.read_bytes().replace(b'"version": 1', b'"version": 3'))
-    with pytest.raises(StoreError, match=r"format version 3.*version 1"):
+    manifest.write_bytes(manifest.read_bytes().replace(b'"version": 2', b'"version": 3'))
+    with pytest.raises(StoreError, match=r"format version 3.*version 2"):
         ParameterStore.open(store.folder)
 
 

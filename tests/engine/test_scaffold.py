@@ -81,7 +81,7 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
         trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)
         assert bool(waits.any())
         assert not bool((waits & trained).any())
-        assert state.clocks.adam_steps == 10
+        assert state.clocks.adam_views == 10 * WARM_UP_BATCH
         assert state.clocks.visits == 0
         assert state.clocks.steps == 0
     assert coordinator.count() == 120

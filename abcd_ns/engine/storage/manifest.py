@@ -10,7 +10,7 @@ from typing import Any
 from abcd_ns.errors import UserError
 
 FORMAT = "abcd-parameter-store"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 class StoreError(UserError):
