@@ -178,7 +178,7 @@ class Coordinator(StepDrawing):
         self._growth = self.density.after_step(self.params, self.optimizers, self._growth, infos, clock)
         if self.density.resets(clock):
             self._clocks = replace(self._clocks, resets=clock.steps // self.config.density.reset_every)
-        if infos and self.density.is_due(clock):
+        if self.density.refines(clock, infos):
             self._clocks = replace(self._clocks, refined=clock.steps)
             self._hold_back_giants()
 

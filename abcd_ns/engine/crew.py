@@ -128,7 +128,7 @@ class Crew:
         if self._parts is None:  # the last step's gradient was never asked for
             self.parts()
         fits, self._parts = len(live) <= self._limit, None
-        if fits:
+        if fits and self.pids:
             self._params.write(dict(live.items()))
         for helper in self._helpers:
             helper.begin(live.detach(), task, fits)

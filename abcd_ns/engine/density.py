@@ -154,8 +154,16 @@ class DensityControl:
             return clock.reached(every)
         return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= every
 
+    def refines(self, clock: DensityClock, infos: Infos) -> bool:
+        """Whether this step refines: it is due, and where gradients decide there are any.
+
+        Args:
+            infos: of the step's drawings, after backward.
+        """
+        return self.is_due(clock) and (self.config.strategy != "default" or bool(_with_gradient(infos)))
+
     def resets(self, clock: DensityClock) -> bool:
-        """Whether this step resets opacities (`default` strategy)."""
+        """Whether this step resets opacities (`default` strategy); that needs no gradients."""
         every = self.config.reset_every
         if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
             return False
@@ -171,8 +179,8 @@ class DensityControl:
         """
         if self.config.strategy != "default":
             return {}
-        with_gradient = [info for info in infos if info["means2d"].grad is not None]
-        if not with_gradient:
+        with_gradient = _with_gradient(infos)
+        if not with_gradient or len(means) == 0:
             return {}
         strategy = DefaultStrategy(refine_every=REFINE, reset_every=BEFORE_RESET, absgrad=self.absgrad)
         state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": 1.0}
@@ -217,8 +225,8 @@ class DensityControl:
         clock: DensityClock,
     ) -> dict[str, Tensor]:
         config = self.config
-        infos = tuple(info for info in infos if info["means2d"].grad is not None)
-        if clock.progress >= config.refine_stop or not infos:
+        infos = _with_gradient(infos)
+        if clock.progress >= config.refine_stop:
             return growth
         growth = added(growth, self.count(params["means"], infos))
         has_reset = 0 < config.reset_every < clock.steps
@@ -233,7 +241,7 @@ class DensityControl:
             absgrad=config.use_absgrad,
         )
         state: dict[str, Any] = {"scene_scale": 1.0, **growth}
-        if self.is_due(clock):
+        if self.refines(clock, infos):
             strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, clock.room)
             # Nothing is visible in this info, so the statistics are not gathered twice.
             unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
@@ -254,6 +262,10 @@ class DensityControl:
         step = REFINE if self.is_due(clock) else GATHER
         learning_rate = optimizers["means"].param_groups[0]["lr"]
         strategy.step_post_backward(params, optimizers, {"binoms": binomials()}, step, {}, lr=learning_rate)
+
+
+def _with_gradient(infos: Infos) -> Infos:
+    return tuple(info for info in infos if info["means2d"].grad is not None)
 
 
 def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:

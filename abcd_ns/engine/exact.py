@@ -34,6 +34,7 @@ from abcd_ns.engine.intervals import ray_interval
 from abcd_ns.engine.ordering import front_to_back
 from abcd_ns.engine.param_swap import attach, detach
 from abcd_ns.engine.rasterizer import Raster, Shot
+from abcd_ns.engine.rasterizer.image_size import image_size
 from abcd_ns.engine.scaffold import join, part
 from abcd_ns.engine.schedule import endless_order, exponential_decay, views_per_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer
@@ -263,13 +264,12 @@ class ExactCoordinator(Coordinator):
 
     def _info(self, gradients: Gradients, rows: Int64[Tensor, "m"]) -> dict[str, Any]:
         """As a rasterizer gives it, of one block's Gaussians and all views of the step."""
-        view = self._batch.samples[0].view
         means2d = torch.zeros_like(gradients.means2d[:, rows]).to(self.device)
         means2d.grad = gradients.means2d[:, rows].to(self.device)
         means2d.absgrad = gradients.absolute[:, rows].to(self.device)
         radii = gradients.radii[:, rows].to(self.device)
-        size = {"width": view.width, "height": view.height, "n_cameras": len(radii)}
-        return {"means2d": means2d, "radii": radii, "gaussian_ids": None, **size}
+        size = image_size([sample.view for sample in self._batch.samples], self.device)
+        return {"means2d": means2d, "radii": radii, "gaussian_ids": None, "n_cameras": len(radii), **size}
 
     def _clock_of(self, block: int, gaussians: int, steps: int, taken: int) -> DensityClock:
         limit, everything = self.config.density.limit, max(self.count(), 1)

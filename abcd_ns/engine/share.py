@@ -81,8 +81,10 @@ def share_of(
     losses, shown = [], []
     for sample, picture, own in zip(samples, rendered.pictures, rendered.transmittances, strict=True):
         photo, counts = target(sample)
-        pair = (picture, photo) if counts is None else (picture * counts, photo * counts)
-        losses.append(sample.loss(*pair, config))
+        if counts is not None:
+            counts = counts.to(picture.device)
+            picture, photo = picture * counts, photo * counts
+        losses.append(sample.loss(picture, photo, config))
         shown.append(share_of_picture(sample.layers and sample.layers.front, own))
     loss = torch.stack(losses).sum() / views
     numbers = torch.stack([each.detach() for each in losses]).tolist()

@@ -130,8 +130,11 @@ class StepDrawing(ABC):
         known = [(s.view.index, loss.detach()) for s, loss in zip(batch.samples, losses, strict=True)]
         if self._crew is not None:
             photometric, drawn = photometric + self._crew.loss(), self._crew.drawn()
-            self.health.see(torch.tensor([part.shown for part in drawn]).amax())
-            known += [(view, torch.tensor(loss)) for part in drawn for view, loss in part.losses]
+            shown = max(part.shown for part in drawn)
+            self.health.see(torch.tensor(shown, device=self.device))
+            known += [
+                (v, torch.tensor(loss, device=self.device)) for part in drawn for v, loss in part.losses
+            ]
         self.health.note(known)
         if self.config.density.strategy != "mcmc":
             return photometric

@@ -261,3 +261,23 @@ def test_shared_rows_change_in_number_within_their_room():
     assert float(room.rows("means", 10).sum()) == 12
     with pytest.raises(ValueError, match="11 rows"):
         room.rows("means", 11)
+
+
+@pytest.mark.parametrize("options", [{}, WARM], ids=["blocks", "warm-up"])
+def test_a_run_goes_on_where_there_can_be_no_processes(make, photos, monkeypatch, options):
+    """On a GPU, say: the visit under way is ended as it began, those that follow have no crew."""
+    straight, stopped = make("straight", **options), make("stopped", **options)
+    train(stopped, photos, steps=3)
+    assert stopped.state.active.crew == 2
+    left = stopped.state.active.steps - 3 if not options else 2
+    train(straight, photos, steps=3 + left)
+    stopped.save()
+    stopped.scene.store.close()
+    monkeypatch.setattr("abcd_ns.engine.step_drawing.can_fork", lambda _: False)
+    resumed = make("stopped", processes=1, resume=True, **options)
+    for _ in range(left):
+        train_step(resumed, photos)
+        assert resumed._crew is None or resumed._crew.pids == ()
+    assert equal(whole_scene(straight), whole_scene(resumed))
+    train(resumed, photos)
+    assert resumed.finished

@@ -192,3 +192,25 @@ def test_covariances_against_the_definition():
 def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given, expected):
     config = DensityConfig(refine_every=given, refine_stop=0.3)
     assert for_blocks(config, blocks) == replace(config, refine_every=expected)
+
+
+@pytest.mark.parametrize("resets", [None, 0])
+def test_a_reset_needs_no_gradients(resets):
+    """Those of a step may be unsound; the reset is counted, and so it must happen."""
+    gaussians = random_gaussians(8)
+    gaussians.opacities[:] = 3.0
+    params, optimizers = live(gaussians)
+    growth = {"grad2d": torch.ones(8), "count": torch.ones(8)}
+    control, due = DensityControl(DensityConfig(reset_every=500)), clock(steps=500, resets=resets)
+    assert control.resets(due)
+    found = control.after_step(params, optimizers, growth, (), due)
+    assert bool((torch.sigmoid(params["opacities"]) < 0.02).all())
+    assert {name: value.tolist() for name, value in found.items()} == {n: [1.0] * 8 for n in growth}
+
+
+def test_refining_needs_gradients():
+    control, due = DensityControl(DensityConfig()), clock()
+    assert control.refines(due, (fake_info(3, 1.0),))
+    assert not control.refines(due, ())
+    assert not control.refines(clock(steps=101), (fake_info(3, 1.0),))
+    assert DensityControl(DensityConfig("mcmc")).refines(due, ())

@@ -1,11 +1,16 @@
 """Exact joint training over blocks: gradients and steps are those of one drawing of everything."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite
+from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.exact import ExactCoordinator
+from abcd_ns.engine.scaffold import LIVE
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
@@ -154,3 +159,26 @@ def test_every_block_sees_every_step_and_so_refines_as_one(tmp_path, views, star
     for blocks in (1, 4):
         coordinator = exact(tmp_path / str(blocks), start, views, blocks=blocks)
         assert coordinator.density.config.refine_every == 100
+
+
+def test_views_of_a_step_may_differ_in_size(tmp_path):
+    """What density control counts is what it counts in one drawing of the whole batch."""
+    views = [*ring_of_views(2), *ring_of_views(2, width=90)]
+    views = [replace(view, index=index) for index, view in enumerate(views)]
+    photos, start = Photos(random_gaussians(150, seed=7, size=0.12), views), scene(torch.float32)
+    counted = []
+    for kind in (ExactCoordinator, Coordinator):
+        folder = tmp_path / kind.__name__
+        folder.mkdir()
+        options = {"blocks": 1, "batch": 4, "steps": 4, "density": GROWING, "background": "black"}
+        coordinator = make_coordinator(folder, start, views, kind=kind, **options)
+        train_step(coordinator, photos)
+        coordinator.save()
+        state = BlockState.from_tensors(
+            *coordinator.scene.store.load(0 if kind is ExactCoordinator else LIVE)
+        )
+        counted.append(state.growth)
+    exactly, jointly = counted
+    assert torch.equal(exactly["count"], jointly["count"])
+    assert torch.allclose(exactly["grad2d"], jointly["grad2d"], rtol=1e-4)
+    assert float(jointly["grad2d"].max()) > 0

@@ -14,6 +14,7 @@ from abcd_ns.engine.health import Health
 from abcd_ns.engine.health_record import BlockHealth, standing, summary
 from abcd_ns.engine.health_rules import is_worse, loss_rise, stand_ins, unsound
 from abcd_ns.engine.memory import OutOfRoomError, bytes_for, check_room
+from abcd_ns.engine.param_swap import attach
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import RunState
 from abcd_ns.engine.training_loop import train, train_step
@@ -330,3 +331,28 @@ def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
     train_step(coordinator, photos)
     coordinator.state.views[coordinator.state.active.geometry.block] = seen
     assert coordinator._density_clock(4).views == expected
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_a_block_that_is_emptied_in_its_visit_ends_it(tmp_path, views, photos, start, blocks, strategy):
+    """All its Gaussians may be pruned; the run goes on, and can be resumed."""
+    density = DensityConfig(strategy, refine_start=0.0)
+    options = {"blocks": blocks, "steps": 30, "density": density}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    train(coordinator, photos, steps=2)
+    nobody = coordinator._detached()[:0]
+    attach(nobody, coordinator.params, coordinator.optimizers, batch=coordinator.batch)
+    coordinator._growth = {}
+    batch = coordinator.next_batch()
+    wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
+    assert coordinator.loss(batch, coordinator.render(batch).pictures, wanted).requires_grad
+    train(coordinator, photos, steps=2)
+    assert coordinator.state.active is not None
+    coordinator.save()
+    coordinator.scene.store.close()
+    resumed = make_coordinator(tmp_path, start, views, resume=True, **options)
+    left = resumed.state.active.steps - resumed.state.active.done
+    train(resumed, photos, steps=left)
+    assert resumed.state.active is None
+    assert resumed.count() == coordinator.count()

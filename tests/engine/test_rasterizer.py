@@ -9,11 +9,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abcd_ns.engine.rasterizer import TorchRasterizer, ZWindow, make_rasterizer
+from abcd_ns.engine.density import DensityConfig, DensityControl
+from abcd_ns.engine.rasterizer import Shot, TorchRasterizer, ZWindow, make_rasterizer
 from abcd_ns.engine.rasterizer.binning import bin_splats
 from abcd_ns.engine.rasterizer.projection import project
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
-from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.engine.rasterizer_scenes import (
     as_leaves,
     gradients,
@@ -304,3 +305,23 @@ def test_clear_errors():
     with pytest.raises(ValueError, match="CUDA device"):
         make_rasterizer("gsplat", "cpu")
     assert make_rasterizer("auto", "cpu").name == TorchRasterizer.name
+
+
+def test_each_view_of_a_batch_counts_by_its_own_size():
+    """Density control finds for views of two sizes drawn together what it finds for each by itself."""
+    views = [small_view(*size, dtype=torch.float32) for size in ((37, 21), (80, 30), (37, 21))]
+    control, gaussians = DensityControl(DensityConfig()), random_gaussians(12, dtype=torch.float32)
+
+    def counted(batch: list[View], cameras: int) -> dict[str, torch.Tensor]:
+        leaves, shots = as_leaves(gaussians), [Shot(view, view.full) for view in batch]
+        rasters = EAGER.draw(leaves, shots, sh_degree=1, absgrad=True)
+        infos = tuple({id(r.info): {**r.info, "n_cameras": cameras} for r in rasters}.values())
+        control.before_backward(infos)
+        weights = [probe(*r.transmittance.shape, dtype=torch.float32) for r in rasters]
+        sum((stacked(r) * w).sum() for r, w in zip(rasters, weights, strict=True)).backward()
+        return control.count(gaussians.means, infos)
+
+    together, one_by_one = counted(views, 3), [counted([view], 3) for view in views]
+    for name, value in together.items():
+        torch.testing.assert_close(value, sum(each[name] for each in one_by_one), rtol=1e-4, atol=1e-4)
+    assert float(together["grad2d"].abs().max()) > 0

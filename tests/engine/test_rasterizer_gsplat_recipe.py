@@ -10,7 +10,8 @@ import pytest
 import torch
 from gsplat.cuda import _torch_impl
 
-from abcd_ns.engine.rasterizer import TorchRasterizer, ZWindow, gsplat_backend, self_check
+from abcd_ns.engine.density import DensityConfig, DensityControl
+from abcd_ns.engine.rasterizer import Shot, TorchRasterizer, ZWindow, gsplat_backend, self_check
 from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
 from tests.engine.rasterizer_scenes import (
@@ -223,3 +224,15 @@ def test_the_depth_window_of_no_gaussians_is_empty(backend):
     nobody = Gaussians.empty(1, dtype=torch.float64)
     window = backend.depth_window(nobody, VIEW, crop=Crop(16, 0, 32, 20), visible=0.06)
     assert bool((window.near == window.far).all())
+
+
+def test_a_loss_of_nothing_has_a_gradient(backend):
+    """A block whose last Gaussian was pruned is drawn until its visit ends."""
+    leaves = as_leaves(Gaussians.empty())
+    shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2
+    rasters = backend.draw(leaves, shots, sh_degree=3, absgrad=True)
+    control = DensityControl(DensityConfig())
+    control.before_backward(tuple(raster.info for raster in rasters))
+    sum(stacked(raster).sum() for raster in rasters).backward()
+    assert leaves.means.grad.shape == (0, 3)
+    assert control.count(leaves.means, tuple(raster.info for raster in rasters)) == {}

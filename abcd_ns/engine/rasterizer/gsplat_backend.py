@@ -342,10 +342,11 @@ def _info(own: _Projected, view: View) -> dict[str, Any]:
 
 
 def _nothing(gaussians: Gaussians, view: View, crop: Crop) -> Raster:
-    """An empty drawing; gsplat is not asked."""
+    """An empty drawing; gsplat is not asked. In the graph like any other, so that a loss has a gradient."""
     means, opacities = gaussians.means, gaussians.opacities[:, 0][None]
     empty = _Projected(
         opacities.int(), means[None, :, :2], opacities, means[None], opacities, means.new_zeros((1, 0, 4))
     )
-    color = means.new_zeros((crop.height, crop.width, 3))
-    return Raster(color, torch.ones_like(color[..., 0]), torch.zeros_like(color[..., 0]), _info(empty, view))
+    zero = empty.means2d.sum()
+    color = zero.expand(crop.height, crop.width, 3)
+    return Raster(color, 1.0 - color[..., 0], color[..., 0], _info(empty, view))

@@ -12,6 +12,7 @@ from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot
 from abcd_ns.engine.rasterizer.binning import Candidates, find_candidates
 from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.rasterizer.compositing_function import Composite, Job, pair_weights
+from abcd_ns.engine.rasterizer.image_size import image_size
 from abcd_ns.engine.rasterizer.projection import Splats, check_degree, pack, project_packed
 from abcd_ns.engine.rasterizer.splat_kernels import CONIC_XX, DEPTH, GRADED, OPACITY, RADIUS
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid, TileSheet
@@ -198,8 +199,7 @@ def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot]) -> dict[str, Any]:
         "depths": own[:, DEPTH],
         "conics": own[:, CONIC_XX:OPACITY].transpose(1, 2),
         "opacities": own[:, OPACITY],
-        "width": shots[0].view.width,
-        "height": shots[0].view.height,
+        **image_size([shot.view for shot in shots], own.device),
         "n_cameras": len(shots),
         "camera_ids": None,
         "gaussian_ids": None,
