@@ -92,6 +92,12 @@ def bytes_for(gaussians: int, sh_degree: int) -> int:
     return gaussians * (11 + 3 * (sh_degree + 1) ** 2) * FLOAT * LIVE_COPIES
 
 
+def drawing_bytes(sh_degree: int) -> int:
+    """What a Gaussian takes while it is drawn without gradients: its parameters, once more as the rasterizer
+    wants them, and what one view sees of it."""
+    return FLOAT * (2 * (11 + 3 * (sh_degree + 1) ** 2) + PROJECTED_FLOATS)
+
+
 def free_bytes(device: torch.device) -> int:
     """What `device` has left, memory that torch holds in reserve included."""
     if device.type != "cuda":

@@ -77,8 +77,8 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
 def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:
     """Steps of `batch` views that would have let the moments forget as much as they have.
 
-    Adam divides its moments by 1 - beta**step, with the beta of the present steps: so `step` counts these, and
-    may be a fraction. It is rounded, so that counting on from it is exact: a run that is resumed in the
+    Adam divides its moments by 1 - beta**step, with the beta of the present steps: so `step` counts these,
+    and may be a fraction. It is rounded, so that counting on from it is exact: a run that is resumed in the
     middle of a visit counts the same numbers as one that was not.
     """
     return torch.tensor(round(clocks.adam_views * STEP_PARTS / batch) / STEP_PARTS, dtype=torch.float32)

@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from itertools import accumulate, pairwise
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
@@ -42,7 +43,12 @@ class MemoryScene:
     def __init__(self, tree: BlockTree, gaussians: Gaussians) -> None:
         self.tree = tree
         owner = tree.assign(gaussians.means)
-        self._blocks = [gaussians[owner == block] for block in range(tree.num_blocks)]
+        if bool((owner.diff() < 0).any()):
+            gaussians = gaussians[owner.argsort(stable=True)]
+        sizes = owner.bincount(minlength=tree.num_blocks).tolist()
+        ends = list(accumulate(sizes, initial=0))
+        # Where they come block by block, as in a checkpoint, blocks share their memory.
+        self._blocks = [gaussians[start:end] for start, end in pairwise(ends)]
         self._bounds: dict[int, Box | None] = {}
 
     def gaussians(self, block: int) -> Gaussians:
@@ -96,6 +102,11 @@ class StoredScene:
     def lift(self) -> None:
         """No block is live any more."""
         self._live = None
+
+    @property
+    def is_live_as_a_whole(self) -> bool:
+        """Whether all blocks are live, and `count` is right in sum alone."""
+        return self._live is not None and self._live[0] is None
 
     def gaussians(self, block: int) -> Gaussians:
         if self._live is not None and self._live[0] is None:

@@ -18,15 +18,17 @@ from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Batch, Coordinator
 from abcd_ns.engine.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.loss import mean_psnr, photometric_loss, ssim_windows
-from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
+from abcd_ns.engine.memory import drawing_bytes, free_bytes
+from abcd_ns.engine.painter import Ownership, Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import live_gaussians
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import Raster, Rasterizer, make_rasterizer
-from abcd_ns.engine.scene import BlockScene, MemoryScene
+from abcd_ns.engine.scene import BlockScene, MemoryScene, StoredScene
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.datamanager import BATCH
 from abcd_ns.plugin.metrics import image_metrics
+from abcd_ns.plugin.room import FREE_SHARE
 from abcd_ns.plugin.views import view_of
 from abcd_ns.viewer.pictures import BlockPictures, Choice, Cropped, Show, asked_by_viewer, bounded
 
@@ -41,8 +43,9 @@ class AbcdModel(SplatfactoModel):
     """Draws batches for training and whole pictures for evaluation, viewer and export.
 
     While training, the registered parameters are the live block alone and the rest of the scene is reached
-    through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene.
-    `state_dict` gives the merged scene in either case.
+    through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene,
+    on the device or, where that has no room to draw it at once, on the CPU. `state_dict` gives the merged
+    scene in either case.
     """
 
     config: "AbcdModelConfig"
@@ -65,10 +68,12 @@ class AbcdModel(SplatfactoModel):
         self.choice = Choice()
         self._coordinator: Coordinator | None = None
         self._rasterizer: Rasterizer | None = None
+        self._loaded_is_too_large = False
+        self._parted: tuple[Parameter, BlockTree, MemoryScene] | None = None
 
     def follow(self, coordinator: Coordinator) -> None:
         """From now on the scene is the coordinator's, and the registered parameters its live block."""
-        self._coordinator = coordinator
+        self._coordinator, self._parted = coordinator, None
 
     def draws_with(self) -> Rasterizer:
         """The rasterizer, made on first use."""
@@ -87,7 +92,10 @@ class AbcdModel(SplatfactoModel):
         """The whole scene by blocks, the live one included."""
         if self._coordinator is not None:
             return self._coordinator.scene
-        return MemoryScene(self.tree, live_gaussians(self.gauss_params).detach())
+        means, tree = self.gauss_params["means"], self.tree
+        if self._parted is None or self._parted[0] is not means or self._parted[1] is not tree:
+            self._parted = means, tree, MemoryScene(tree, self.merged())
+        return self._parted[2]
 
     def merged(self) -> Gaussians:
         """The whole scene in one list, without a graph. Not a property: it may read everything from disk."""
@@ -117,13 +125,19 @@ class AbcdModel(SplatfactoModel):
         return state
 
     def load_state_dict(self, state: dict[str, Any], **kwargs: Any) -> None:
-        """As splatfacto's; torch.load alone would accept altered bytes.
+        """As splatfacto's, on the CPU where the scene is too large for the device; torch.load alone would
+        accept altered bytes.
 
         Raises:
             UserError: the Gaussians are not those that were saved.
         """
         expected = state.get("_extra_state", {}).get("checksum")
-        super().load_state_dict(state, **kwargs)
+        count = len(state["gauss_params.means"])
+        self._loaded_is_too_large = count > self._room()
+        home = torch.device("cpu") if self._loaded_is_too_large else self.device
+        for name, value in list(self.gauss_params.items()):
+            self.gauss_params[name] = Parameter(torch.empty((count, *value.shape[1:]), device=home))
+        super(SplatfactoModel, self).load_state_dict(state, **kwargs)  # splatfacto's takes all to the device
         if expected is not None and checksum(live_gaussians(self.gauss_params)) != expected:
             raise UserError(
                 "This checkpoint is damaged: the checksum of its Gaussians is wrong. Go on with the run by "
@@ -190,11 +204,11 @@ class AbcdModel(SplatfactoModel):
     def draw_merged(self, view: View) -> Raster:
         """All Gaussians at once, sorted by depth: what every ordinary viewer shows.
 
-        In training, where the scene is larger than a pass and units can be drawn one by one without changing
-        the picture, it is drawn so: the device need not hold it all.
+        Where the device should not hold them all they are drawn unit by unit, by fragments: these fold to the
+        same picture.
         """
-        if self._exceeds_a_pass() and self.config.ownership == "fragments":
-            return self._by_units(view).everything()
+        if self._is_too_large():
+            return self._by_units(view, "fragments").everything()
         gaussians = self._crop(self.merged().to(self.device))
         return self.draws_with()(
             gaussians,
@@ -206,37 +220,49 @@ class AbcdModel(SplatfactoModel):
     @torch.no_grad()
     def draw_composited(self, view: View) -> Layer:
         """Each block alone, then folded front to back: what block training composites."""
-        pictures = self._by_units(view, pass_gaussians=0)
+        pictures = self._by_units(view, self.config.ownership, pass_gaussians=0)
         return pictures.painter.picture(view, pictures.settings)
 
     def draw_for_viewer(self, view: View) -> Raster:
-        """What the viewer's user chose to see; never more than a pass of the scene on the device."""
+        """What the viewer's user chose to see."""
         choice, block = self.choice, self.choice.block
         if block is None and self._coordinator is not None:
             active = self._coordinator.state.active
             block = None if active is None or active.is_whole else active.geometry.block
         chosen = choice.show is not Show.EVERYTHING and block is not None and block < self.tree.num_blocks
-        if not chosen and not self._exceeds_a_pass():
+        if not chosen:
             return self.draw_merged(view)
-        return self._by_units(view).draw(choice.show, block if chosen else None)
+        return self._by_units(view, self.config.ownership).draw(choice.show, block)
 
-    def _by_units(self, view: View, pass_gaussians: int | None = None) -> BlockPictures:
-        scene = Cropped(self.scene(), self._crop)
+    def _by_units(self, view: View, ownership: Ownership, pass_gaussians: int | None = None) -> BlockPictures:
+        whole = self.scene()
+        if isinstance(whole, StoredScene) and whole.is_live_as_a_whole:
+            whole = MemoryScene(
+                whole.tree, self.merged()
+            )  # which block holds how many is not known otherwise
+        scene = Cropped(whole, self._crop)
+        most = min(default_pass(scene), self._room())
         painter = Painter(
             scene,
             [view],
             self.draws_with(),
-            ownership=self.config.ownership,
-            pass_gaussians=default_pass(scene) if pass_gaussians is None else pass_gaussians,
+            ownership=ownership,
+            pass_gaussians=most if pass_gaussians is None else pass_gaussians,
             device=self.device,
         )
         settings = PaintSettings(self.config.sh_degree, self.config.rasterize_mode == "antialiased")
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
         return BlockPictures(painter, view, settings, training.window_weight)
 
-    def _exceeds_a_pass(self) -> bool:
-        """Whether the device should not hold the whole scene; a loaded one it holds already."""
-        return self._coordinator is not None and self._coordinator.count() > default_pass(self.scene())
+    def _is_too_large(self) -> bool:
+        """Whether the device should not hold the whole scene at once."""
+        if self._coordinator is None:
+            return self._loaded_is_too_large
+        return self._coordinator.count() > min(default_pass(self.scene()), self._room())
+
+    def _room(self) -> int:
+        """Gaussians that the device could draw at once, beside what it holds."""
+        return int(FREE_SHARE * free_bytes(self.device)) // drawing_bytes(self.config.sh_degree)
 
     def _crop(self, gaussians: Gaussians) -> Gaussians:
         if self.crop_box is None:

@@ -122,7 +122,8 @@ class AbcdPanel(ViewerControl):
     def _lay_out(self) -> None:
         """Boxes and the list of blocks, once the cut of space is known."""
         tree, scene = self._model.tree, self._model.scene()
-        bounds = bulk(torch.cat([scene.gaussians(block).means for block in range(tree.num_blocks)]).cpu())
+        means = [scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)]  # one may be live
+        bounds = bulk(torch.cat(means))
         self._scenery.set_boxes(boxes_of(tree, bounds))
         self._first_look = first_look(bounds, self._views())
         self._controls.set_blocks(tree.num_blocks)

@@ -1,12 +1,14 @@
 """A backend proves itself on a tiny scene before it is trusted with hours of training."""
 
+from dataclasses import dataclass, replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.rasterizer.base import Raster, Rasterizer
+from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
-from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 
 TOLERANCE = 2e-3
 """Largest difference allowed, relative to the largest value; float32 kernels with fast exponentials stay
@@ -37,6 +39,43 @@ def check_scene(device: torch.device | str) -> tuple[Gaussians, View]:
     return gaussians.to(device=device, dtype=torch.float32), View(viewmat, K, WIDTH, HEIGHT).to(device)
 
 
+@dataclass(frozen=True)
+class Case:
+    """Something that training asks of a rasterizer."""
+
+    name: str
+    crop: Crop | None = None
+    frozen: int = 0
+    """So many of the Gaussians are frozen."""
+    sizes: tuple[float, ...] = (1.0,)
+    """Views are drawn together, each with an image so many times as large as the scene's."""
+    antialiased: bool = False
+    sh_degree: int = 3
+
+    def shots(self, rasterizer: Rasterizer, frozen: Gaussians, view: View) -> list[Shot]:
+        """What is to be drawn."""
+        views = [_resized(view, size) for size in self.sizes]
+        options = {"sh_degree": self.sh_degree, "antialiased": self.antialiased}
+        seen = [rasterizer.project(frozen, each, **options) if self.frozen else None for each in views]
+        pairs = zip(views, seen, strict=True)
+        return [Shot(each, self.crop or each.full, splats) for each, splats in pairs]
+
+
+CASES = (
+    Case("a whole view"),
+    Case("an antialiased view", antialiased=True),
+    Case("a crop", crop=Crop(9, 5, 23, 13), sh_degree=1),
+    Case("a view with frozen splats", frozen=9),
+    Case("a crop with frozen splats", crop=Crop(18, 3, 17, 20), frozen=9, antialiased=True),
+    Case("two views of different sizes", sizes=(1.0, 1.4), sh_degree=2),
+)
+
+
+def _resized(view: View, times: float) -> View:
+    scale = view.K.new_tensor([[times], [times], [1.0]])
+    return replace(view, K=view.K * scale, width=round(times * view.width), height=round(times * view.height))
+
+
 def _loss(raster: Raster) -> Float[Tensor, ""]:
     """Depends on every output of every pixel, differently."""
     planes = torch.cat((raster.color, raster.transmittance[..., None], 0.2 * raster.depth[..., None]), dim=-1)
@@ -46,20 +85,35 @@ def _loss(raster: Raster) -> Float[Tensor, ""]:
     return (planes * weights).sum()
 
 
-def _values_and_gradients(rasterizer: Rasterizer, device: torch.device | str) -> dict[str, Tensor]:
+def values_and_gradients(
+    rasterizer: Rasterizer, device: torch.device | str, case: Case, shift: float = 0.0
+) -> dict[str, Tensor]:
+    """All that a rasterizer finds in a case, by name; float64 on the CPU.
+
+    Args:
+        shift: added to the logits of all opacities.
+    """
     gaussians, view = check_scene(device)
-    leaves = {name: value.requires_grad_() for name, value in gaussians.items()}
-    raster = rasterizer(Gaussians(**leaves), view, sh_degree=3)
-    raster.info["means2d"].retain_grad()
-    _loss(raster).backward()
-    results = {"color": raster.color, "transmittance": raster.transmittance, "depth": raster.depth}
-    results |= {f"gradient of {name}": leaves[name].grad for name in PARAM_NAMES}
-    results["gradient of means2d"] = raster.info["means2d"].grad
-    return {name: value.detach().cpu().double() for name, value in results.items()}
+    gaussians = replace(gaussians, opacities=gaussians.opacities + shift)
+    own, frozen = gaussians[: COUNT - case.frozen], gaussians[COUNT - case.frozen :]
+    leaves = {name: value.clone().requires_grad_() for name, value in own.items()}
+    shots = case.shots(rasterizer, frozen, view)
+    options = {"sh_degree": case.sh_degree, "antialiased": case.antialiased, "absgrad": True}
+    rasters = rasterizer.draw(Gaussians(**leaves), shots, **options)
+    means2d = [info["means2d"] for info in {id(raster.info): raster.info for raster in rasters}.values()]
+    for each in means2d:
+        each.retain_grad()
+    sum(map(_loss, rasters)).backward()
+    planes = ("color", "transmittance", "depth")
+    results = {name: [getattr(raster, name).flatten() for raster in rasters] for name in planes}
+    results |= {f"gradient of {name}": [leaves[name].grad] for name in PARAM_NAMES}
+    results["gradient of means2d"] = [each.grad for each in means2d]
+    results["absolute gradient of means2d"] = [getattr(m, "absgrad", torch.zeros_like(m)) for m in means2d]
+    return {name: torch.cat(value).detach().cpu().double() for name, value in results.items()}
 
 
 def self_check(rasterizer: Rasterizer, device: torch.device | str) -> float:
-    """Compare a rasterizer with the torch backend, forward and gradient, on a tiny fixed scene.
+    """Compare a rasterizer with the torch backend, forward and gradient, on a tiny fixed scene, in all CASES.
 
     A backend whose picture is right and whose gradient is wrong trains to a much worse model without any
     error, as a port of gsplat to other hardware once did; hence this check at every start.
@@ -70,16 +124,23 @@ def self_check(rasterizer: Rasterizer, device: torch.device | str) -> float:
     Raises:
         RuntimeError: a value or gradient differs by more than rounding.
     """
-    expected = _values_and_gradients(TorchRasterizer("never"), "cpu")
-    found = _values_and_gradients(rasterizer, device)
     largest = 0.0
-    for name, reference in expected.items():
-        scale = reference.abs().max().clamp_min(1e-12)
-        error = float((found[name] - reference).abs().max() / scale)
-        if not error <= TOLERANCE:  # NaN fails too
-            raise RuntimeError(
-                f'The rasterizer "{rasterizer.name}" on {device} is off in {name} by {error:.2g} of the '
-                f'largest value, so its kernels cannot be trusted there. Set the rasterizer to "torch".'
-            )
-        largest = max(largest, error)
+    for case in CASES:
+        expected = values_and_gradients(TorchRasterizer("never"), "cpu", case)
+        for name, error in errors(values_and_gradients(rasterizer, device, case), expected).items():
+            if not error <= TOLERANCE:  # NaN fails too
+                raise RuntimeError(
+                    f'The rasterizer "{rasterizer.name}" on {device} is off in {name} of {case.name} by '
+                    f"{error:.2g} of the largest value, so its kernels cannot be trusted there. Set the "
+                    'rasterizer to "torch".'
+                )
+            largest = max(largest, error)
     return largest
+
+
+def errors(found: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float]:
+    """The largest difference of each kind, as a share of the largest expected value of its kind."""
+    return {
+        name: float((found[name] - value).abs().max() / value.abs().max().clamp_min(1e-12))
+        for name, value in expected.items()
+    }
