@@ -2,8 +2,8 @@
 
 In any run: gradients, moments and values that are no numbers. Where blocks are trained within layers, since
 there others have to live with the result: giants, Gaussians that nothing can show, and visits that left their
-pictures worse than they found them. A run in which nothing goes wrong is the same, bit for bit, with or
-without all this: healthy tensors are read, never written.
+pictures worse than they found them. A run in which nothing goes wrong is the same with or without all this,
+on a CPU bit for bit: healthy tensors are read, never written.
 """
 
 import math
