@@ -163,8 +163,8 @@ class AbcdModel(SplatfactoModel):
         return self._whole_outputs(self.view(camera))
 
     def view(self, camera: Cameras) -> View:
-        """The camera as the engine draws it: on the model's device, from the scene's near plane on."""
-        return replace(view_of(camera.to(self.device)), near=self.near)
+        """The camera as the engine draws it: from the scene's near plane on, and on the CPU."""
+        return replace(view_of(camera.to("cpu")), near=self.near)
 
     def _batch_outputs(self, batch: Batch) -> dict[str, Any]:
         if self._coordinator is None:

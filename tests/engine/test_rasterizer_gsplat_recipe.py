@@ -5,6 +5,7 @@ are compared under tests/gpu.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -77,6 +78,10 @@ def fake_compositing(
     return image[..., :-1], 1 - image[..., -1:]
 
 
+def add_absolute(total, grad):
+    total += grad.abs().sum(dim=(0, 1))
+
+
 def fake_tile(means2d, absolute, conics, colors, opacities, ids, x, y, size):
     centers = torch.stack(torch.meshgrid(torch.arange(size), torch.arange(size), indexing="xy"), dim=-1) + 0.5
     color, T, live = (
@@ -87,7 +92,7 @@ def fake_tile(means2d, absolute, conics, colors, opacities, ids, x, y, size):
     for i in ids.tolist():
         mean = means2d[0, i].expand(size, size, 2)
         if mean.requires_grad:
-            mean.register_hook(lambda grad, i=i: absolute[0, i].add_(grad.abs().sum(dim=(0, 1))))
+            mean.register_hook(partial(add_absolute, absolute[0, i]))
         dx, dy = (mean - torch.tensor([x, y]) - centers).unbind(-1)
         a, b, c = conics[0, i]
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy

@@ -55,6 +55,10 @@ class Broken(TorchRasterizer):
             return dataclasses.replace(shot, crop=Crop(crop.x - 1, crop.y, crop.width, crop.height))
         if self.fault == "frozen ignored":
             return dataclasses.replace(shot, frozen=None)
+        if self.fault == "window ignored":
+            return dataclasses.replace(shot, z_window=None)
+        if self.fault == "window of own" and shot.frozen is not None:
+            return dataclasses.replace(shot, z_window=None)
         if self.fault == "camera of the first":
             return dataclasses.replace(shot, view=dataclasses.replace(shot.view, K=first.view.K))
         return shot
@@ -88,6 +92,8 @@ def test_a_sound_backend_passes():
         ("frozen ignored", "color", "a view with frozen splats"),
         ("a frozen splat missing", "color", "a view with frozen splats"),
         ("camera of the first", "color", "two views of different sizes"),
+        ("window ignored", "color", "a z window"),
+        ("window of own", "color", "a crop with frozen splats in a z window"),
     ],
 )
 def test_a_fault_is_refused(fault, what, case):
@@ -108,8 +114,9 @@ def test_the_scene_would_show_faults():
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 @pytest.mark.parametrize("shift", [-3e-5, 3e-5])
-def test_no_case_hangs_on_rounding(case, shift):
+@pytest.mark.parametrize("window_side", [4, 16])
+def test_no_case_hangs_on_rounding(case, shift, window_side):
     """No fragment is so near to a threshold of drawing that other kernels' rounding would change sides."""
-    draw = TorchRasterizer("never")
+    draw = TorchRasterizer("never", window_side=window_side)
     found, expected = (values_and_gradients(draw, "cpu", case, s) for s in (shift, 0.0))
     assert max(errors(found, expected).values()) < TOLERANCE / 4

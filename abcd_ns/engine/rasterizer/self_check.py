@@ -8,6 +8,7 @@ from torch import Tensor
 
 from abcd_ns.engine.rasterizer.base import Raster, Rasterizer, Shot
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
+from abcd_ns.engine.rasterizer.z_window import ZWindow
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 
 TOLERANCE = 2e-3
@@ -50,6 +51,8 @@ class Case:
     sizes: tuple[float, ...] = (1.0,)
     """Views are drawn together, each with an image so many times as large as the scene's."""
     antialiased: bool = False
+    windowed: bool = False
+    """Each tile has a z window, some of them empty."""
     sh_degree: int = 3
 
     def shots(self, rasterizer: Rasterizer, frozen: Gaussians, view: View) -> list[Shot]:
@@ -57,8 +60,9 @@ class Case:
         views = [_resized(view, size) for size in self.sizes]
         options = {"sh_degree": self.sh_degree, "antialiased": self.antialiased}
         seen = [rasterizer.project(frozen, each, **options) if self.frozen else None for each in views]
-        pairs = zip(views, seen, strict=True)
-        return [Shot(each, self.crop or each.full, splats) for each, splats in pairs]
+        crops = [self.crop or each.full for each in views]
+        windows = [_window(rasterizer, crop, view.K.device) if self.windowed else None for crop in crops]
+        return [Shot(*shot) for shot in zip(views, crops, seen, windows, strict=True)]
 
 
 CASES = (
@@ -68,7 +72,17 @@ CASES = (
     Case("a view with frozen splats", frozen=9),
     Case("a crop with frozen splats", crop=Crop(18, 3, 17, 20), frozen=9, antialiased=True),
     Case("two views of different sizes", sizes=(1.0, 1.4), sh_degree=2),
+    Case("a z window", windowed=True),
+    Case("a crop with frozen splats in a z window", crop=Crop(18, 3, 17, 20), frozen=9, windowed=True),
 )
+
+
+def _window(rasterizer: Rasterizer, crop: Crop, device: torch.device) -> ZWindow:
+    """Windows that differ from tile to tile."""
+    grid = rasterizer.window_grid(crop)
+    tile = torch.arange(grid.tiles, device=device, dtype=torch.float32)
+    near = 3.6 + torch.sin(2.3 * tile)
+    return ZWindow(grid, near, near + 1.1 + torch.sin(1.7 * tile + 1))
 
 
 def _resized(view: View, times: float) -> View:
@@ -124,9 +138,9 @@ def self_check(rasterizer: Rasterizer, device: torch.device | str) -> float:
     Raises:
         RuntimeError: a value or gradient differs by more than rounding.
     """
-    largest = 0.0
+    largest, reference = 0.0, TorchRasterizer("never", window_side=rasterizer.window_side)
     for case in CASES:
-        expected = values_and_gradients(TorchRasterizer("never"), "cpu", case)
+        expected = values_and_gradients(reference, "cpu", case)
         for name, error in errors(values_and_gradients(rasterizer, device, case), expected).items():
             if not error <= TOLERANCE:  # NaN fails too
                 raise RuntimeError(
