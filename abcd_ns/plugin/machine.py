@@ -91,6 +91,16 @@ def peak_rss_bytes() -> int:
     return peak if sys.platform == "darwin" else peak * 1024  # bytes on macOS, KiB elsewhere
 
 
+def peak_device_bytes() -> tuple[int | None, int | None]:
+    """The most GPU memory that torch has held in tensors so far, and the most that it has taken for them from
+    the device; None without a CUDA device."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return None, None
+    return torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved()
+
+
 def disk_bytes(folder: Path) -> int:
     """What the files under `folder` take on disk; 0 where there is no such folder."""
     # st_blocks counts 512 bytes each, whatever the block size; sparse files take less than st_size.

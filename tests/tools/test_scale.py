@@ -1,12 +1,14 @@
 """`abcd scale`: the land is what it claims to be, and a measurement can be made and read back."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.machine import describe_machine, describe_versions
-from abcd_ns.tools.runs.records import decode, encode, read_json
+from abcd_ns.tools.runs.records import decode, encode, read_json, read_record
 from abcd_ns.tools.scale.arm import Arm, ArmJob, run
 from abcd_ns.tools.scale.chart import draw
 from abcd_ns.tools.scale.command import scale
@@ -117,7 +119,7 @@ def test_results_are_written_in_words_and_drawn(tmp_path):
     [
         ({"blocks": (2, 6)}, "powers of 2"),
         ({"blocks": (4, 4)}, "different"),
-        ({"blocks": (1,)}, "from 2 on"),
+        ({"blocks": (0,)}, "from 1 on"),
         ({"gaussians": 0}, "--gaussians"),
         ({"visits": 0}, "--visits"),
         ({"blocks": (2**18,), "gaussians": 10**6}, "GiB free"),
@@ -133,6 +135,28 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="not empty"):
         scale(tmp_path, blocks=(2, 4))
+
+
+def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are_not_tried(
+    tmp_path, monkeypatch
+):
+    """No GPU here: the processes' ends are made up."""
+    tried = []
+
+    def made_up_end(job: ArmJob, _: Path) -> Arm | str:
+        tried.append((job.tiles, job.monolithic))
+        assert job.device_limit_bytes == 512 * MIB
+        if job.monolithic and job.tiles > 2:
+            return "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
+        return made_up(job.tiles, 500, job.monolithic, device=100)
+
+    monkeypatch.setattr("abcd_ns.tools.scale.command.measure", made_up_end)
+    assert scale(tmp_path, blocks=(2, 4, 8), gaussians=10, device_limit_mb=512) == 0
+    assert tried == [(2, False), (4, False), (8, False), (2, True), (4, True)]
+    found = read_record(tmp_path / "scale.json", ScaleResults, SCHEMA)
+    assert (found.one_block_too_large, found.failures, len(found.arms)) == (4, (), 4)
+    assert "As one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
+    assert "--device-limit-mb 512" in found.command
 
 
 @pytest.mark.cli

@@ -77,6 +77,9 @@ class Run:
     views: tuple[ViewScore, ...]
     versions: Versions
     """Of the run itself, which may be older than the file it is listed in."""
+    peak_reserved_bytes: int | None = None
+    """The most that torch took from the GPU for what it held, likewise; None in results of versions that
+    did not ask."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,13 @@ from torch import Tensor
 
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.config import AbcdTrainerConfig
-from abcd_ns.plugin.machine import describe_versions, disk_bytes, peak_rss_bytes, without_home
+from abcd_ns.plugin.machine import (
+    describe_versions,
+    disk_bytes,
+    peak_device_bytes,
+    peak_rss_bytes,
+    without_home,
+)
 from abcd_ns.plugin.metrics import lpips_missing
 from abcd_ns.plugin.pipeline import CACHE, STORE
 from abcd_ns.tools.runs.configs import trainer_config
@@ -89,11 +95,12 @@ def save_png(path: Path, picture: Tensor) -> None:
 
 
 def _memory() -> dict[str, int | str | None]:
-    cuda = torch.cuda.is_available()
+    allocated, reserved = peak_device_bytes()
     return {
         "peak_rss_bytes": peak_rss_bytes(),
-        "peak_device_bytes": torch.cuda.max_memory_allocated() if cuda else None,
-        "peak_device_note": None if cuda else "no CUDA device",
+        "peak_device_bytes": allocated,
+        "peak_device_note": "no CUDA device" if allocated is None else None,
+        "peak_reserved_bytes": reserved,
     }
 
 

@@ -20,7 +20,7 @@ from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.storage import LayerCache, ParameterStore
 from abcd_ns.engine.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.plugin.machine import disk_bytes, peak_rss_bytes
+from abcd_ns.plugin.machine import disk_bytes, peak_device_bytes, peak_rss_bytes
 from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
 from abcd_ns.tools.scale.land import Land
 
@@ -41,6 +41,8 @@ class ArmJob:
     ram_budget_bytes: int
     """For blocks that were read; layers and photos have their own."""
     seed: int
+    device_limit_bytes: int = 0
+    """GPU memory that may be taken, as if the card had no more; 0 for all of it."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,16 @@ class Arm:
     steps: int
     psnr: float
     """On the crops trained on, mean of the last visit's steps, dB."""
+    peak_reserved_bytes: int | None = None
+    """What torch took from the GPU for `peak_device_bytes`; None in results of versions that did not ask."""
 
 
 def run(job: ArmJob, folder: Path) -> Arm:
     """Make the scene on disk, train some visits, and say what they took."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if job.device_limit_bytes and device.type == "cuda":
+        share = job.device_limit_bytes / torch.cuda.get_device_properties(device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(share, 1.0), torch.cuda.current_device())
     rasterizer = make_rasterizer("auto", device)
     rasterizer.warm_up()
     base, began = peak_rss_bytes(), time.perf_counter()
@@ -83,6 +90,7 @@ def run(job: ArmJob, folder: Path) -> Arm:
     wanted = MONOLITHIC_STEPS if job.monolithic else None
     while len(watch.visits) < job.visits if wanted is None else coordinator.state.step < wanted:
         train_step(coordinator, lambda view, crop: land.photo(cameras[view], crop))
+    allocated, reserved = peak_device_bytes()
     visits = watch.visits[1:] or watch.visits  # the first one's time holds the planning of the sweep
     return Arm(
         tiles=job.tiles,
@@ -90,7 +98,8 @@ def run(job: ArmJob, folder: Path) -> Arm:
         monolithic=job.monolithic,
         base_rss_bytes=base,
         peak_rss_bytes=peak_rss_bytes(),
-        peak_device_bytes=torch.cuda.max_memory_allocated() if device.type == "cuda" else None,
+        peak_device_bytes=allocated,
+        peak_reserved_bytes=reserved,
         store_bytes=disk_bytes(folder / "store"),
         make_seconds=made - began,
         plan_seconds=watch.first_step - made,

@@ -49,8 +49,9 @@ def _draw_memory(axes: Axes, results: ScaleResults, has_gpu: bool) -> None:
         if has_gpu:
             device = [(arm.peak_device_bytes or 0) / MIB for arm in arms]
             axes.plot(x, device, linestyle="--", **style)
+            ended = ", then out of memory" if monolithic and results.one_block_too_large else ""
             axes.annotate(
-                f"{label}, GPU",
+                f"{label}, GPU{ended}",
                 (last.gaussians, device[-1]),
                 xytext=(0, -12),
                 textcoords="offset points",

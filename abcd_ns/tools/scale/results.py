@@ -37,6 +37,8 @@ class ScaleResults:
     growth: Growth | None
     """Of ABCD; None with fewer than two sizes."""
     failures: tuple[str, ...]
+    one_block_too_large: int | None = None
+    """Tiles of the smallest scene that ran out of GPU memory as one block; larger ones were not tried so."""
 
     def of(self, monolithic: bool) -> list[Arm]:
         """ABCD's measurements or those of one block, the smallest scene first."""
@@ -87,6 +89,8 @@ def notes_of(results: ScaleResults) -> list[str]:
         notes.append(
             f"From {first} to {last} blocks of ABCD, peak RAM grows by {ram:.1%}{more}; allowed: {GOAL:.0%}."
         )
+    if results.one_block_too_large:
+        notes.append(f"As one block, {results.one_block_too_large} tiles ran out of GPU memory.")
     notes += [f"Failed: {failure}" for failure in results.failures]
     return [*notes, f"Command: `{results.command}`, {results.date[:10]}."]
 
