@@ -4,7 +4,8 @@
 
 The runs follow each other, by the engine alone. Stages are summed over the second half of each run and
 divided by the views that were drawn to train in it, helpers' views included; where the training process
-waits for its helpers, that is part of the loss and of backward.
+waits for its helpers, that is part of the loss and of backward. On a CUDA device each stage ends when the
+device has done its work, which makes steps slower than they are: their sum is no training time.
 """
 
 import os
@@ -12,14 +13,15 @@ import platform
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 import tyro
+from torch.profiler import ProfilerActivity
 
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
@@ -50,6 +52,7 @@ STAGES = (
     "backward",
     "optimizers",
     "density and settling",
+    "commit",
 )
 
 
@@ -83,17 +86,26 @@ class Capture:
 
 
 class StageClock:
-    """Seconds by stage."""
+    """Seconds by stage; those of a stage within another one are its own alone."""
 
     def __init__(self) -> None:
         self.seconds: Counter[str] = Counter()
         self.views = 0
+        self._within = 0.0
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
+        outer, self._within, start = self._within, 0.0, time.perf_counter()
         yield
-        self.seconds[name] += time.perf_counter() - start
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        took = time.perf_counter() - start
+        self.seconds[name] += took - self._within
+        self._within = outer + took
+
+    def ms_per_view(self) -> dict[str, float]:
+        """By stage."""
+        return {stage: 1e3 * self.seconds[stage] / self.views for stage in STAGES}
 
 
 class Source(Protocol):
@@ -131,7 +143,8 @@ def begin(
     seconds: float | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> Coordinator:
-    """A coordinator at the beginning of a run, its store and layers in `folder`."""
+    """A coordinator at the beginning of a run, on CUDA where there is any, its store and layers in `folder`."""
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     tree = build_kd(capture.gaussians.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     keep = None if blocks == 1 else len(capture.gaussians) // blocks
@@ -142,16 +155,28 @@ def begin(
         StoredScene(tree, store),
         capture.views,
         LayerCache(folder / "layers"),
-        rasterizer or make_rasterizer("torch", "cpu"),
-        *nothing_live(3),
+        rasterizer or make_rasterizer("auto", device),
+        *nothing_live(3, device),
+        device=device,
         target=lambda sample: (capture.photo(sample.view.index, sample.crop), None),
     )
 
 
-def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
-    """Train; the stages of the second half."""
+def run(
+    capture: Capture,
+    blocks: int,
+    args: Args,
+    folder: Path,
+    afterwards: Callable[[Coordinator], None] = lambda _: None,
+) -> StageClock:
+    """Train; the stages of the second half.
+
+    Args:
+        afterwards: given the coordinator when the clock has stopped.
+    """
     options = {"seconds": args.seconds, "seed": args.seed, "processes": args.processes}
     coordinator = begin(capture, blocks, folder, **options)
+    store = coordinator.scene.store
     clock, layers = StageClock(), 0.0
 
     def note(event: object) -> None:
@@ -159,7 +184,12 @@ def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
         if isinstance(event, VisitEnded):
             layers += event.layer_seconds
 
+    def commit(*blocks: Any, **options: Any) -> int:
+        with clock.stage("commit"):
+            return to_disk(*blocks, **options)
+
     coordinator.announce.subscribe(note)
+    to_disk, store.commit = store.commit, commit
     began = 0.0
     while not coordinator.finished:
         if coordinator.progress < 0.5:
@@ -167,8 +197,9 @@ def run(capture: Capture, blocks: int, args: Args, folder: Path) -> StageClock:
         step(coordinator, capture.photo, clock)
     clock.seconds["layers"] = layers - began
     clock.seconds["plan and attach"] -= layers - began
+    afterwards(coordinator)
     coordinator.cache.close()
-    coordinator.scene.store.close()
+    store.close()
     return clock
 
 
@@ -178,7 +209,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
         batch = coordinator.next_batch()
     crew = coordinator.state.active.crew
     with clock.stage("photos"):
-        photos = [photo(sample.view.index, sample.crop) for sample in batch.samples]
+        photos = [photo(sample.view.index, sample.crop).to(coordinator.device) for sample in batch.samples]
     with clock.stage("render"):
         rendered = coordinator.render(batch)
     with clock.stage("loss"):
@@ -196,6 +227,31 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
     clock.views += len(batch.samples) * crew
 
 
+def profile(coordinator: Coordinator, photo: PhotoReader, steps: int, top: int = 30) -> list[dict[str, Any]]:
+    """What torch's profiler sees in some more steps: the operations and kernels that took most time.
+
+    Returns:
+        A row for each: name, calls a step, device_ms and host_ms a step, of it alone; the most on the device
+        first, or on the host where there is none. CUDA's own calls (launches, copies, waits) are all there.
+    """
+    activities = [ProfilerActivity.CPU]
+    activities += [ProfilerActivity.CUDA] if torch.cuda.is_available() else []
+    with torch.profiler.profile(activities=activities) as profiler:
+        for _ in range(steps):
+            step(coordinator, photo, StageClock())
+    rows = [
+        {
+            "name": event.key,
+            "calls": event.count / steps,
+            "device_ms": event.self_device_time_total / 1e3 / steps,
+            "host_ms": event.self_cpu_time_total / 1e3 / steps,
+        }
+        for event in profiler.key_averages()
+    ]
+    rows.sort(key=lambda row: (row["device_ms"], row["host_ms"]), reverse=True)
+    return rows[:top] + [row for row in rows[top:] if row["name"].startswith("cuda")]
+
+
 def main(args: Args) -> None:
     """Run both and print the table."""
     capture = read(args)
@@ -209,7 +265,7 @@ def main(args: Args) -> None:
     for stage in STAGES:
         print(
             f"| {stage} | "
-            + " | ".join(f"{1e3 * c.seconds[stage] / c.views:.2f}" for c in (one, several))
+            + " | ".join(f"{clock.ms_per_view()[stage]:.2f}" for clock in (one, several))
             + " |"
         )
     totals = (sum(clock.seconds.values()) / clock.views for clock in (one, several))

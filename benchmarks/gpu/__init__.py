@@ -1,0 +1,1 @@
+"""What a CUDA device makes of all this; see __main__.py."""

@@ -1,0 +1,142 @@
+"""All that is to be measured once there is a CUDA device, in parts, within 40 minutes.
+
+    python -m benchmarks.gpu --data DIR --out OUT
+
+Each part has a share of the time, runs in a process of its own, and is killed with all it started when its
+time is over. OUT gets a JSON file for each part and charts. A part whose file is there and whole is not run
+again; one that failed or was killed is, and goes on from the runs that it had finished.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from shutil import rmtree
+from typing import Any, Literal
+
+import torch
+import tyro
+from rich.console import Console
+
+from abcd_ns.errors import UserError
+from abcd_ns.tools.runs.records import encode, read_json, write_json
+from abcd_ns.tools.runs.runner import last_line
+from benchmarks.gpu.charts import draw, show
+from benchmarks.gpu.parts import NEED_DATA, PARTS, ROOT, Task
+
+OUT = Path("docs/results/gpu")
+WORKER = (sys.executable, "-m", "benchmarks.gpu.parts")
+
+
+@dataclass
+class Args:
+    """What to do."""
+
+    data: Path | None = None
+    """The scene, as for `ns-train abcd --data`, at full size."""
+    out: Path | None = None
+    """Gets a JSON file a part, and charts; OUT/work is scratch. Default: docs/results/gpu, or a temporary folder
+    for a dry run."""
+    parts: tuple[Literal["build", "tests", "compare", "compare-steps", "extent", "visit"], ...] = tuple(PARTS)
+    """Of these, in this order."""
+    minutes: float = 40.0
+    """For all of them; what a part leaves goes to those after it."""
+    again: bool = False
+    """Run these parts whether or not their files are there, from nothing."""
+    draw: bool = False
+    """Only draw the charts and print the tables of what is there."""
+    dry_run: bool = False
+    """Try the machinery where there is no CUDA device: tiny, on the CPU. Its numbers mean nothing."""
+    seed: int = 0
+    """Of every run."""
+
+
+def main(args: Args) -> int:
+    """Run what is missing; 1 if a part failed, 2 without a CUDA device."""
+    if not (torch.cuda.is_available() or args.dry_run or args.draw):
+        print("There is no CUDA device here; --dry-run tries the machinery without one.")
+        return 2
+    out = args.out or (Path(tempfile.mkdtemp(prefix="gpu-dry-run-")) if args.dry_run else OUT)
+    parts = [] if args.draw else [part for part in PARTS if part in args.parts]
+    if args.data is None and NEED_DATA & set(parts):
+        raise UserError(f"Give the scene with --data DIR, or --parts without {', '.join(sorted(NEED_DATA))}.")
+    ends = time.monotonic() + 60 * args.minutes
+    for number, part in enumerate(parts):
+        path = out / f"{part}.json"
+        if not args.again and path.exists() and not read_json(path)["error"]:
+            print(f"{part}: {path} is there; --again runs it again", flush=True)
+            continue
+        shares = [PARTS[later][0] for later in parts[number:]]
+        record = run_part(part, args, out, (ends - time.monotonic()) * shares[0] / sum(shares))
+        print(
+            f"{part}: {record['seconds']:.0f} s{', ' + record['error'] if record['error'] else ''}",
+            flush=True,
+        )
+    records = [read_json(out / f"{part}.json") for part in PARTS if (out / f"{part}.json").exists()]
+    for drawn in draw(records, out):
+        print(drawn)
+    show(records, Console())
+    return int(any(record["error"] for record in records if record["part"] in parts))
+
+
+def run_part(
+    part: str, args: Args, out: Path, seconds: float, worker: Sequence[str] = WORKER
+) -> dict[str, Any]:
+    """Run a part for `seconds` at most; its record, which is also in OUT/PART.json.
+
+    Args:
+        worker: command that is given the path of the task.
+    """
+    path, work = out / f"{part}.json", out.resolve() / "work" / part
+    if args.again:
+        rmtree(work, ignore_errors=True)
+    path.unlink(missing_ok=True)
+    work.mkdir(parents=True, exist_ok=True)
+    data = args.data and str(args.data.resolve())
+    task = out.resolve() / "work" / f"{part}-task.json"
+    write_json(task, encode(Task(part, str(out.resolve()), str(work), data, args.seed, args.dry_run)))
+    began = time.monotonic()
+    error = run_bounded([*worker, str(task)], seconds, task.with_name(f"{part}-log.txt"))
+    record = read_json(path) if path.exists() else {"part": part, "dry_run": args.dry_run, "found": {}}
+    record |= {"error": error, "seconds": round(time.monotonic() - began, 1)}
+    record["date"] = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    write_json(path, record)
+    return record
+
+
+def run_bounded(command: Sequence[str], seconds: float, log: Path) -> str | None:
+    """Run a command for `seconds` at most; why it came to nothing, or None. What it started ends with it."""
+    with open(log, "wb") as said:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=subprocess.STDOUT,
+            cwd=ROOT,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            start_new_session=True,
+        )
+        try:
+            code = process.wait(timeout=max(seconds, 0))
+        except subprocess.TimeoutExpired:
+            return f"killed after {seconds:.0f} s, the time it had"
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    return None if code == 0 else last_line(log) or f"exit code {code}"
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(tyro.cli(Args)))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

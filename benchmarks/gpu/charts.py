@@ -1,0 +1,139 @@
+"""The parts' records as charts, in the style of all others, and as short tables."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from abcd_ns.tools.runs.records import decode
+from abcd_ns.tools.runs.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
+from abcd_ns.tools.runs.tables import GIB, NOTHING, print_rows
+from abcd_ns.tools.scale.chart import draw as draw_scale
+from abcd_ns.tools.scale.results import ScaleResults, notes_of, rows_of
+
+Record = dict[str, Any]
+SHADES = ("#0072B2", "#56A0D3", "#003A5D")
+"""Of `abcd` with different numbers of blocks."""
+STAGES = ("#0072B2", "#56A0D3", "#D55E00", "#007A5A", "#8A6A00", "#8A5A83", "#B3306B", "#888888", "#444444")
+
+
+def draw(records: Sequence[Record], out: Path) -> list[Path]:
+    """Draw what there is to draw; the paths of the charts, png and svg."""
+    drawn: list[Path] = []
+    for record in records:
+        part, found = record["part"], record["found"]
+        if part.startswith("compare") and found.get("runs"):
+            drawn += _draw_comparison(part, found, out)
+        elif part == "extent" and found:
+            drawn += draw_scale(decode(ScaleResults, found["scale"], "extent.json"), out)
+        elif part == "visit" and found.get("by_blocks"):
+            drawn += _draw_visit(found, out)
+    return drawn
+
+
+def show(records: Sequence[Record], console: Console) -> None:
+    """A table for each part, below it what went wrong."""
+    for record in records:
+        rows, notes = _rows(record["part"], record["found"])
+        trouble = [f"{record['part']}: {record['error']}"] if record["error"] else []
+        dry = ["a dry run: these numbers mean nothing"] if record["dry_run"] else []
+        print_rows(rows, [*dry, *notes, *trouble], console)
+
+
+def _rows(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
+    """A part's table, titles first, and notes."""
+    if not found:
+        return [[part]], []
+    if part.startswith("compare"):
+        return _rows_of_comparison(part, found)
+    if part == "extent":
+        results = decode(ScaleResults, found["scale"], "extent.json")
+        return rows_of(results), notes_of(results)
+    if part == "visit":
+        columns = found["by_blocks"]
+        titles = ["visit, ms a view", *(f"{column['blocks']} blocks" for column in columns)]
+        stages = columns[0]["ms_per_view"] if columns else {}
+        rows = [[stage, *(f"{column['ms_per_view'][stage]:.2f}" for column in columns)] for stage in stages]
+        return [titles, *rows], []
+    if part == "tests":
+        counts = ("passed", "failed", "skipped")
+        why = [f"{test}: {reason}" for test, reason in found["why_failed"].items()]
+        return [["tests", *counts], ["", *(str(found[count]) for count in counts)]], why
+    flat = {**found["hardware"], **{name: value for name, value in found.items() if name != "hardware"}}
+    return [["build", ""], *([name, str(value)] for name, value in flat.items())], []
+
+
+def _rows_of_comparison(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
+    titles = [part, "PSNR (dB)", "SSIM", "Gaussians", "steps", "seconds", "GPU (GiB)", "reserved (GiB)"]
+    rows = []
+    for run in found["runs"]:
+        memory = [run["peak_device_bytes"], run["peak_reserved_bytes"]]
+        rows.append(
+            [
+                run["arm"],
+                f"{run['psnr_merged']:.2f}",
+                NOTHING if run["ssim_merged"] is None else f"{run['ssim_merged']:.3f}",
+                f"{run['gaussians']:,}",
+                f"{run['steps']:,}",
+                f"{run['train_seconds']:.0f}",
+                *(NOTHING if size is None else f"{size / GIB:.2f}" for size in memory),
+            ]
+        )
+    notes = [f"{left['method']} is left out: {left['reason']}" for left in found["left_out"]]
+    return [titles, *rows], notes + [f"{fail['arm']} failed: {fail['reason']}" for fail in found["failures"]]
+
+
+@in_style
+def _draw_comparison(part: str, found: Record, out: Path) -> list[Path]:
+    """Held-out PSNR over training time, and what each arm took of the GPU."""
+    shades, runs = iter(SHADES), found["runs"]
+    colors = {
+        r["arm"]: next(shades) if r["arm"].startswith("abcd blocks") else COLORS[r["method"]] for r in runs
+    }
+    figure = Figure(figsize=(9.0, 3.5), layout="constrained")
+    curves, memory = figure.subplots(1, 2, width_ratios=(1.6, 1))
+    ends = {}
+    for run in runs:
+        line = [(point["seconds"], point["psnr"]) for point in run["curve"]]
+        marker = MARKERS[run["method"]]
+        curves.plot(*zip(*line, strict=True), color=colors[run["arm"]], marker=marker, markersize=4)
+        ends[run["arm"]] = line[-1]
+    settings = found["settings"]
+    budget = f"{settings['steps']:,} steps" if settings["seconds"] is None else f"{settings['seconds']:g} s"
+    curves.set_title(f"{settings['data']}, {budget} a run", loc="left")
+    curves.set(xlabel="training time (s)", ylabel="held-out PSNR (dB)", xlim=(0, None))
+    lay_grid(curves)
+    label_ends(curves, ends, 1.04 * max(seconds for seconds, _ in ends.values()), colors)
+    _bars(memory, [run["arm"] for run in runs], runs, colors)
+    return save(figure, out, part)
+
+
+def _bars(axes: Axes, names: list[str], runs: Sequence[Record], colors: dict[str, str]) -> None:
+    """Peak GPU memory: dark what tensors held, pale what torch had taken for them."""
+    for alpha, key in ((0.35, "peak_reserved_bytes"), (1.0, "peak_device_bytes")):
+        sizes = [(run[key] or 0) / GIB for run in runs]
+        axes.barh(names, sizes, color=[colors[name] for name in names], alpha=alpha)
+    axes.invert_yaxis()
+    axes.set_xlabel("peak GPU memory (GiB); pale: reserved")
+    lay_grid(axes)
+
+
+@in_style
+def _draw_visit(found: Record, out: Path) -> list[Path]:
+    """The stages of a view's share of a visit, end to end, a bar for each number of blocks."""
+    figure = Figure(figsize=(7.2, 1.4 + 0.4 * len(found["by_blocks"])), layout="constrained")
+    axes = figure.add_subplot()
+    names = [f"{column['blocks']} blocks" for column in found["by_blocks"]]
+    left = [0.0] * len(names)
+    for color, stage in zip(STAGES, found["by_blocks"][0]["ms_per_view"], strict=True):
+        spans = [column["ms_per_view"][stage] for column in found["by_blocks"]]
+        axes.barh(names, spans, left=left, color=color, label=stage, height=0.6)
+        left = [start + span for start, span in zip(left, spans, strict=True)]
+    axes.invert_yaxis()
+    axes.set_xlabel("ms a view, each stage until the device is done")
+    axes.set_title(found["scene"], loc="left")
+    figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=7)
+    return save(figure, out, "visit")

@@ -1,0 +1,208 @@
+"""The parts of the GPU benchmark, each in a process of its own: `python -m benchmarks.gpu.parts TASK.json`.
+
+A part is a generator: each record it yields holds all that it has found so far, and is written at once, so that
+a part that is killed leaves what it had.
+"""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import torch
+from rich.console import Console
+
+from abcd_ns.engine.rasterizer import make_rasterizer, self_check
+from abcd_ns.plugin.machine import describe_machine, describe_versions
+from abcd_ns.tools.compare.command import without_impossible
+from abcd_ns.tools.compare.protocol import Options, make_plan
+from abcd_ns.tools.doctor.hardware import look_at_hardware
+from abcd_ns.tools.runs.job import Change, Job, Settings, Variant
+from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
+from abcd_ns.tools.runs.run import Run
+from abcd_ns.tools.runs.runner import claim, run_jobs
+from abcd_ns.tools.scale import command as scale
+from abcd_ns.tools.scale.arm import ArmJob
+from benchmarks import visit
+
+ROOT = Path(__file__).resolve().parents[2]
+MIB = 2**20
+Found = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is done; one for a GPU, and one that tries the machinery on a CPU."""
+
+    methods: tuple[str, ...] = ("splatfacto", "abcd-monolithic", "abcd-ablated")
+    blocks: tuple[int, ...] = (1, 8, 27)
+    """Of `abcd`, a run each; the others with any have 8."""
+    seconds: float = 60.0
+    """Of training, in the comparison at equal time."""
+    steps: int = 1000
+    """In the one at equal steps."""
+    tiles: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
+    gaussians: int = 100_000
+    """In each tile."""
+    device_limit_mb: int = 4096
+    """GPU memory while the extent grows: a large card would need a larger land than there is time to make."""
+    visit_blocks: tuple[int, ...] = (1, 8)
+    visit_seconds: float = 30.0
+    profiled_steps: int = 20
+
+
+TINY = Size(("splatfacto",), (2,), 2.0, 4, (1, 2), 200, 0, (2,), 2.0, 2)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a part is given."""
+
+    part: str
+    out: str
+    """Gets PART.json."""
+    work: str
+    """Scratch of this part alone; what is finished there is not done again."""
+    data: str | None
+    seed: int
+    tiny: bool
+
+    @property
+    def size(self) -> Size:
+        return TINY if self.tiny else Size()
+
+
+def build(_: Task) -> Iterator[Found]:
+    """gsplat's extension, compiled if need be; whether the rasterizer computes what it should."""
+    found: Found = {"hardware": asdict(look_at_hardware())}
+    yield found
+    device, began = "cuda" if torch.cuda.is_available() else "cpu", time.perf_counter()
+    rasterizer = make_rasterizer("auto", device)
+    found |= {"rasterizer": rasterizer.name, "ready_seconds": time.perf_counter() - began}
+    yield found | {"self_check": self_check(rasterizer, device)}
+
+
+def tests(task: Task) -> Iterator[Found]:
+    """`pytest -m gpu`, counted."""
+    report = Path(task.work) / "junit.xml"
+    words = ["-m", "pytest", "-m", "gpu", "-p", "no:cacheprovider", f"--junitxml={report}", "tests/gpu"]
+    subprocess.run([sys.executable, *words], cwd=ROOT, check=False)
+    yield count_tests(report)
+
+
+def count_tests(report: Path) -> Found:
+    """Numbers of tests by their end in a junit file of pytest's; why some failed, were skipped."""
+    cases = list(ElementTree.parse(report).getroot().iter("testcase"))
+    ends = {"failed": ("failure", "error"), "skipped": ("skipped",)}
+    found: Found = {}
+    for end, tags in ends.items():
+        those = {case.get("name"): node for case in cases for tag in tags for node in case.findall(tag)}
+        found[end] = len(those)
+        found[f"why_{end}"] = {n: (node.get("message") or "").split("\n")[0] for n, node in those.items()}
+    return {"passed": len(cases) - found["failed"] - found["skipped"], **found}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The runs at one budget: `abcd compare`'s, and `abcd`'s with several numbers of blocks."""
+
+    settings: Settings
+    jobs: tuple[Job, ...]
+    out: Path
+    kind = "GPU comparison"
+
+
+def compare(task: Task, by_steps: bool) -> Iterator[Found]:
+    """Every method on the scene, under the protocol of `abcd compare`, at equal time or at equal steps."""
+    size, console = task.size, Console()
+    budget = {"steps": size.steps} if by_steps else {"seconds": size.seconds}
+    given = Options(
+        task.data, size.methods, (task.seed,), blocks=8, evals=6, pictures=0, out=task.work, **budget
+    )
+    plan, left_out = without_impossible(make_plan(given))
+    several = [Variant((Change("blocks", str(count)),)) for count in size.blocks]
+    jobs = (*plan.jobs, *(Job("abcd", task.seed, plan.settings, variant) for variant in several))
+    comparison = Comparison(plan.settings, jobs, plan.out)
+    claim(plan.out, comparison, describe_machine(), overwrite=False)
+    found: Found = {
+        "settings": asdict(plan.settings) | {"data": plan.settings.scene},
+        "runs": [],
+        "failures": [],
+    }
+    found["left_out"] = [asdict(left) for left in left_out]
+    for job in jobs:
+        (outcome,) = run_jobs(replace(comparison, jobs=(job,)), console)
+        what = "runs" if isinstance(outcome, Run) else "failures"
+        found[what].append(
+            {"arm": f"{job.method} {job.variant.name}".removesuffix(" default"), **encode(outcome)}
+        )
+        for place in job.folder(plan.out).iterdir():
+            if place.is_dir():  # blocks at rest, layers, checkpoints: gigabytes, and scored by now
+                shutil.rmtree(place)
+        yield found
+
+
+def extent(task: Task) -> Iterator[Found]:
+    """`abcd scale`, small scenes first, by blocks and as one."""
+    size = task.size
+    jobs = tuple(
+        ArmJob(
+            tiles, size.gaussians, whole, 0 if whole else 3, 16 * MIB, task.seed, size.device_limit_mb * MIB
+        )
+        for tiles in size.tiles
+        for whole in (False, True)
+    )
+    for results in scale.measured(scale.Plan(Path(task.work), jobs), Console()):
+        yield {"scale": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
+
+
+def visits(task: Task) -> Iterator[Found]:
+    """Where a visit's time goes, by stage and by kernel."""
+    size = task.size
+    args = visit.Args(Path(task.data), seconds=size.visit_seconds, seed=task.seed)
+    capture = visit.read(args)
+    found: Found = {"scene": args.data.name, "seconds": args.seconds, "by_blocks": []}
+    for blocks in size.visit_blocks:
+        rows: list[Found] = []
+
+        def look(coordinator, rows=rows) -> None:
+            rows += visit.profile(coordinator, capture.photo, size.profiled_steps)
+
+        with tempfile.TemporaryDirectory(dir=task.work) as folder:
+            clock = visit.run(capture, blocks, args, Path(folder), look)
+        stages = {"views": clock.views, "ms_per_view": clock.ms_per_view(), "profile": rows}
+        found["by_blocks"].append({"blocks": blocks, **stages})
+        yield found
+
+
+PARTS: dict[str, tuple[float, Callable[[Task], Iterator[Found]]]] = {
+    "build": (4, build),
+    "tests": (4, tests),
+    "compare": (11, partial(compare, by_steps=False)),
+    "compare-steps": (10, partial(compare, by_steps=True)),
+    "extent": (7, extent),
+    "visit": (4, visits),
+}
+"""Each part's share of the minutes, and what it does."""
+NEED_DATA = {"compare", "compare-steps", "visit"}
+
+
+def main() -> None:
+    """Do the task in the file that is the only argument."""
+    (path,) = map(Path, sys.argv[1:])
+    task = decode(Task, read_json(path), str(path))
+    about = {"part": task.part, "dry_run": task.tiny, "machine": asdict(describe_machine())}
+    about["versions"] = asdict(describe_versions())
+    for found in PARTS[task.part][1](task):
+        write_json(Path(task.out) / f"{task.part}.json", {**about, "error": "unfinished", "found": found})
+
+
+if __name__ == "__main__":
+    main()
