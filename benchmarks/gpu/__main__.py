@@ -42,8 +42,8 @@ class Args:
     data: Path | None = None
     """The scene, as for `ns-train abcd --data`, at full size."""
     out: Path | None = None
-    """Gets a JSON file a part, and charts; OUT/work is scratch. Default: docs/results/gpu, or a temporary folder
-    for a dry run."""
+    """Gets a JSON file a part, and charts; OUT/work is scratch. Default: docs/results/gpu; of a dry run, a
+    temporary folder."""
     parts: tuple[Literal["build", "tests", "compare", "compare-steps", "extent", "visit"], ...] = tuple(PARTS)
     """Of these, in this order."""
     minutes: float = 40.0

@@ -117,7 +117,7 @@ def _bars(axes: Axes, names: list[str], runs: Sequence[Record], colors: dict[str
         sizes = [(run[key] or 0) / GIB for run in runs]
         axes.barh(names, sizes, color=[colors[name] for name in names], alpha=alpha)
     axes.invert_yaxis()
-    axes.set_xlabel("peak GPU memory (GiB); pale: reserved")
+    axes.set(xlabel="peak GPU memory (GiB)\npale: reserved", xlim=(0, None))
     lay_grid(axes)
 
 

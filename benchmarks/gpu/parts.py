@@ -1,7 +1,7 @@
 """The parts of the GPU benchmark, each in a process of its own: `python -m benchmarks.gpu.parts TASK.json`.
 
-A part is a generator: each record it yields holds all that it has found so far, and is written at once, so that
-a part that is killed leaves what it had.
+A part is a generator: each record it yields holds all that it has found so far and is written at once, so
+that a part that is killed leaves what it had.
 """
 
 import shutil
@@ -58,7 +58,7 @@ class Size:
     profiled_steps: int = 20
 
 
-TINY = Size(("splatfacto",), (2,), 2.0, 4, (1, 2), 200, 0, (2,), 2.0, 2)
+TINY = Size(("splatfacto",), (2,), 2.0, 4, (2,), 200, 0, (2,), 2.0, 2)
 
 
 @dataclass(frozen=True)

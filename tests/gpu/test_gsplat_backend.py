@@ -1,9 +1,16 @@
-"""gsplat's CUDA kernels against the torch backend: forward, gradient, crops, frozen Gaussians, absgrad."""
+"""gsplat's CUDA kernels against the torch backend: pictures, gradients, crops, frozen Gaussians, z windows.
+
+Cameras are on the CPU, as everywhere in the engine.
+"""
 
 import pytest
 import torch
 
-from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer
+from abcd_ns.engine.compositing import fold, sandwich
+from abcd_ns.engine.intervals import cell_windows
+from abcd_ns.engine.ordering import front_to_back
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.rasterizer import Shot, TorchRasterizer, ZWindow
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.engine.rasterizer_scenes import (
     as_leaves,
@@ -15,34 +22,32 @@ from tests.engine.rasterizer_scenes import (
     stacked,
 )
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device"),
-]
+pytestmark = pytest.mark.gpu
 WIDTH, HEIGHT = 150, 100
 CROPS = [None, Crop(16, 32, 64, 48), Crop(37, 5, 70, 61)]
 
 
-@pytest.fixture(scope="module")
-def gsplat_rasterizer():
-    return make_rasterizer("gsplat", "cuda")  # runs the self-check
+@pytest.fixture
+def scene(device):
+    """Makes a scene of n Gaussians on the device."""
 
+    def make(n: int, seed: int = 0) -> Gaussians:
+        return random_gaussians(n, seed, dtype=torch.float32).to(device)
 
-def scene(n: int, seed: int = 0) -> Gaussians:
-    return random_gaussians(n, seed, dtype=torch.float32).to("cuda")
+    return make
 
 
 def view() -> View:
-    return small_view(WIDTH, HEIGHT, dtype=torch.float32).to("cuda")
+    return small_view(WIDTH, HEIGHT, dtype=torch.float32)
 
 
 @pytest.mark.parametrize("crop", CROPS)
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("with_frozen", [False, True])
-def test_equals_the_torch_backend(gsplat_rasterizer, crop, antialiased, with_frozen):
+def test_equals_the_torch_backend(rasterizer, scene, crop, antialiased, with_frozen):
     frozen = scene(100, seed=3) if with_frozen else None
     options = {"sh_degree": 3, "crop": crop, "antialiased": antialiased, "frozen": frozen}
-    image, grads = gradients(lambda g: gsplat_rasterizer(g, view(), **options), scene(300))
+    image, grads = gradients(lambda g: rasterizer(g, view(), **options), scene(300))
     torch_rasterizer = TorchRasterizer("never")
     expected, expected_grads = gradients(lambda g: torch_rasterizer(g, view(), **options), scene(300))
     # A fragment at the 1/255 threshold may fall on either side: rounding differs, so a few pixels may too.
@@ -54,22 +59,22 @@ def test_equals_the_torch_backend(gsplat_rasterizer, crop, antialiased, with_fro
 
 
 @pytest.mark.parametrize("crop", CROPS[1:])
-def test_crop_is_the_crop_of_the_full_image(gsplat_rasterizer, crop):
+def test_crop_is_the_crop_of_the_full_image(rasterizer, scene, crop):
     gaussians = scene(500)
-    full, part = (gsplat_rasterizer(gaussians, view(), sh_degree=3, crop=c) for c in (None, crop))
+    full, part = (rasterizer(gaussians, view(), sh_degree=3, crop=c) for c in (None, crop))
     torch.testing.assert_close(stacked(part), stacked(full)[crop.slices], rtol=1e-4, atol=1e-4)
     assert torch.equal(part.info["radii"], full.info["radii"])
 
 
 @pytest.mark.parametrize("crop", CROPS)
-def test_absgrad_and_means2d_gradient(gsplat_rasterizer, crop):
+def test_absgrad_and_means2d_gradient(rasterizer, scene, crop):
     infos = []
-    for rasterizer in (gsplat_rasterizer, TorchRasterizer("never")):
-        raster = rasterizer(
+    for backend in (rasterizer, TorchRasterizer("never")):
+        raster = backend(
             as_leaves(scene(200)), view(), sh_degree=1, crop=crop, frozen=scene(50, seed=3), absgrad=True
         )
         raster.info["means2d"].retain_grad()
-        weights = probe(*raster.transmittance.shape, dtype=torch.float32).to("cuda")
+        weights = probe(*raster.transmittance.shape, dtype=torch.float32).to(raster.color.device)
         (stacked(raster) * weights).sum().backward()
         infos.append(raster.info["means2d"])
     assert infos[0].absgrad.shape == infos[1].absgrad.shape == (1, 200, 2)
@@ -77,9 +82,12 @@ def test_absgrad_and_means2d_gradient(gsplat_rasterizer, crop):
     assert relative_error(infos[0].grad, infos[1].grad) < 1e-2
 
 
-def test_graph_is_freed_without_a_backward_pass(gsplat_rasterizer):
+def test_graph_is_freed_without_a_backward_pass(rasterizer, scene, device):
+    if device.type != "cuda":
+        pytest.skip("only CUDA says how much memory is held")
+
     def draw():
-        return gsplat_rasterizer(as_leaves(scene(2000)), view(), sh_degree=3, crop=CROPS[1], absgrad=True)
+        return rasterizer(as_leaves(scene(2000)), view(), sh_degree=3, crop=CROPS[1], absgrad=True)
 
     draw()
     torch.cuda.synchronize()
@@ -89,14 +97,72 @@ def test_graph_is_freed_without_a_backward_pass(gsplat_rasterizer):
     assert torch.cuda.memory_allocated() <= before
 
 
-def test_nothing_to_draw(gsplat_rasterizer):
-    raster = gsplat_rasterizer(Gaussians.empty(device="cuda"), view(), sh_degree=3)
+def test_nothing_to_draw(rasterizer, device):
+    raster = rasterizer(Gaussians.empty(device=device), view(), sh_degree=3)
     assert (raster.transmittance == 1).all()
 
 
-def test_nothing_in_the_crop(gsplat_rasterizer):
+def test_nothing_in_the_crop(rasterizer, scene):
     behind = scene(5)
     behind = Gaussians(means=behind.means - 100, **{n: v for n, v in behind.items() if n != "means"})
-    raster = gsplat_rasterizer(as_leaves(behind), view(), sh_degree=3, crop=CROPS[1])
+    raster = rasterizer(as_leaves(behind), view(), sh_degree=3, crop=CROPS[1])
     stacked(raster).sum().backward()
     assert (raster.transmittance == 1).all()
+
+
+def thin(gaussians: Gaussians) -> Gaussians:
+    """So faint that drawing stops nowhere: parts of a picture then add up to the whole."""
+    gaussians.opacities[:] -= 4.0
+    return gaussians
+
+
+@pytest.mark.parametrize("crop", CROPS)
+def test_the_cells_layers_fold_to_the_merged_picture(rasterizer, scene, crop, device):
+    gaussians, crop = thin(scene(400)), crop or view().full
+    tree = build_kd(gaussians.means.cpu(), 8)
+    order = front_to_back(tree, view().center.double())
+    nodes = [tree.node_of(block) for block in order]
+    windows = cell_windows(tree, view(), rasterizer.window_grid(crop), nodes, device)
+    shots = [Shot(view(), crop, None, window) for window in windows]
+    parts = [raster.layer for raster in rasterizer.draw(gaussians, shots, sh_degree=3)]
+    whole = rasterizer(gaussians, view(), sh_degree=3, crop=crop).layer
+    assert sum(bool((part.transmittance < 0.99).any()) for part in parts) > 1
+    folded = fold(parts)
+    torch.testing.assert_close(folded.color, whole.color, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(folded.transmittance, whole.transmittance, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("crop", CROPS)
+def test_a_depth_window_is_the_torch_backends(rasterizer, scene, crop):
+    gaussians, options = scene(100), {"crop": crop or view().full, "visible": 0.02}
+    found = rasterizer.depth_window(gaussians, view(), **options)
+    expected = TorchRasterizer("never", tile_side=16).depth_window(gaussians, view(), **options)
+    assert found.grid == expected.grid
+    for side in ("near", "far"):
+        alike = torch.isclose(getattr(found, side), getattr(expected, side), rtol=1e-3)
+        # A weight at the threshold may fall on either side of it.
+        assert alike.float().mean() > 0.95, side
+
+
+@pytest.mark.parametrize("crop", CROPS)
+def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(rasterizer, scene, crop, device):
+    everyone, crop = thin(scene(300)), crop or view().full
+    active, frozen = everyone[torch.arange(100)], everyone[torch.arange(100, 300)]
+    window = rasterizer.depth_window(active, view(), crop=crop, visible=0.0)
+    every = ZWindow.everything(window.grid, device, torch.float32)
+    asked = {"front": every.before(window), "inside": window, "back": every.behind(window)}
+    cuts = []
+    for backend in (rasterizer, TorchRasterizer("never", tile_side=16)):
+        cut = backend.cut(frozen, view(), **asked, crop=crop, sh_degree=3)
+        (middle,) = backend.draw(active, [Shot(view(), crop, cut.inside, window)], sh_degree=3)
+        found = sandwich(cut.front, middle.layer, cut.back, torch.zeros(3, device=device))
+        whole = backend(everyone, view(), sh_degree=3, crop=crop)
+        torch.testing.assert_close(found, whole.color, rtol=1e-4, atol=1e-4)
+        cuts.append(cut)
+    for name in ("front", "back"):
+        found, expected = (getattr(cut, name).transmittance for cut in cuts)
+        assert (found - expected).abs().mean() < 1e-4, name
+        assert bool((expected < 0.99).any()), name
+    # Which Gaussians have a fragment in the window may differ where one has a single faint one.
+    found, expected = (set(cut.members.tolist()) for cut in cuts)
+    assert len(found ^ expected) <= 0.02 * len(frozen)

@@ -11,6 +11,7 @@ from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.param_swap import nothing_live
 from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
@@ -96,6 +97,8 @@ def make_coordinator(
     ram_bytes: int = 2 << 30,
     at_hand_bytes: int = AT_HAND_BYTES,
     target: Callable | None = None,
+    rasterizer: Rasterizer | None = None,
+    device: torch.device | str = "cpu",
     **training,
 ) -> Coordinator:
     """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is.
@@ -116,8 +119,9 @@ def make_coordinator(
         StoredScene(tree, store, ram_bytes),
         views,
         LayerCache(None, bits=bits) if cache is None else cache,
-        TorchRasterizer(compile="never"),
-        *nothing_live(gaussians.sh_degree),
+        rasterizer or TorchRasterizer(compile="never"),
+        *nothing_live(gaussians.sh_degree, device),
+        device=device,
         at_hand_bytes=at_hand_bytes,
         target=target,
     )
@@ -127,6 +131,6 @@ def make_coordinator(
 
 
 def whole_scene(coordinator: Coordinator) -> Gaussians:
-    """All blocks in one list, in the order of the blocks."""
+    """All blocks in one list, in the order of the blocks, on the CPU."""
     scene = coordinator.scene
-    return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)])
+    return Gaussians.cat([scene.gaussians(block).to("cpu") for block in range(scene.tree.num_blocks)])

@@ -1,0 +1,163 @@
+"""`python -m benchmarks.gpu` as far as it goes without a GPU: bounds, what is kept of a part, charts."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from abcd_ns.errors import UserError
+from abcd_ns.tools.runs.records import encode, read_json, write_json
+from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part
+from benchmarks.gpu.charts import draw
+from benchmarks.gpu.parts import count_tests
+from tests.reference.colmap_scene import write_scene
+from tests.tools.compare.records import made_up_run
+
+GIB = 2**30
+WHOLE = {
+    "part": "build",
+    "dry_run": True,
+    "error": None,
+    "seconds": 1.0,
+    "found": {"hardware": {"gpu": "made up"}},
+}
+PARTIAL = """
+import json, pathlib, sys, time
+task = json.loads(pathlib.Path(sys.argv[1]).read_text())
+record = {"part": task["part"], "dry_run": True, "error": "unfinished", "found": {"runs": [1]}}
+pathlib.Path(task["out"], task["part"] + ".json").write_text(json.dumps(record))
+"""
+
+
+def is_alive(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/stat")
+    return status.exists() and status.read_text().split()[2] != "Z"
+
+
+def worker(folder: Path, ends: str) -> tuple[str, str]:
+    """A command that finds something, writes it, and then does `ends`."""
+    (folder / "worker.py").write_text(PARTIAL + ends)
+    return sys.executable, str(folder / "worker.py")
+
+
+def test_what_passes_its_time_ends_with_all_that_it_started(tmp_path):
+    note = tmp_path / "pid"
+    command = ["sh", "-c", f"sleep 600 & echo $! > {note}.new; mv {note}.new {note}; wait"]
+    assert run_bounded(command, 3.0, tmp_path / "log") == "killed after 3 s, the time it had"
+    pid = int(note.read_text())
+    for _ in range(100):
+        if not is_alive(pid):
+            break
+        time.sleep(0.1)
+    assert not is_alive(pid)
+
+
+def test_why_a_command_failed_is_the_last_line_of_its_log(tmp_path):
+    assert run_bounded(["sh", "-c", "echo no card; exit 3"], 60, tmp_path / "log") == "no card"
+    assert run_bounded(["sh", "-c", "exit 3"], 60, tmp_path / "log") == "exit code 3"
+    assert run_bounded(["true"], 60, tmp_path / "log") is None
+
+
+@pytest.mark.parametrize(
+    ("ends", "seconds", "error"),
+    [
+        ("time.sleep(600)", 3.0, "killed after 3 s, the time it had"),
+        ("sys.exit('it broke')", 60.0, "it broke"),
+        ("", 60.0, None),
+    ],
+)
+def test_what_a_part_had_found_is_kept_however_it_ends(tmp_path, ends, seconds, error):
+    record = run_part("compare", Args(dry_run=True), tmp_path, seconds, worker(tmp_path, ends))
+    assert (record["error"], record["found"]) == (error, {"runs": [1]})
+    assert read_json(tmp_path / "compare.json") == record
+
+
+def test_a_part_that_finds_nothing_leaves_its_error(tmp_path):
+    record = run_part("build", Args(dry_run=True), tmp_path, 60, ["sh", "-c", "echo no compiler; exit 1"])
+    assert (record["error"], record["found"]) == ("no compiler", {})
+
+
+def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkeypatch, capsys):
+    ran = []
+
+    def note(part, args, out, seconds):
+        ran.append((part, round(seconds)))
+        write_json(out / f"{part}.json", WHOLE | {"part": part, "found": {}})
+        return WHOLE
+
+    monkeypatch.setattr("benchmarks.gpu.__main__.run_part", note)
+    args = {"out": tmp_path, "dry_run": True, "minutes": 8}
+    write_json(tmp_path / "build.json", WHOLE | {"error": "killed"})
+    assert main(Args(parts=("tests", "build"), **args)) == 0
+    assert ran == [("build", 240), ("tests", 480)]  # equal shares; what one leaves goes to the next
+    assert main(Args(parts=("build",), **args)) == 0
+    assert len(ran) == 2
+    assert "is there; --again" in capsys.readouterr().out
+    assert main(Args(parts=("build",), again=True, **args)) == 0
+    assert len(ran) == 3
+
+
+def test_without_a_cuda_device_it_says_so(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(Args(out=tmp_path / "out")) == 2
+    assert "There is no CUDA device" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_comparison_without_a_scene_is_refused(tmp_path):
+    with pytest.raises(UserError, match="--data"):
+        main(Args(out=tmp_path / "out", dry_run=True))
+
+
+def test_tests_are_counted_by_their_end(tmp_path):
+    (tmp_path / "junit.xml").write_text(
+        "<testsuites><testsuite><testcase name='a'/><testcase name='b'/>"
+        "<testcase name='c'><failure message='too far&#10;more'/></testcase>"
+        "<testcase name='d'><skipped message='no device'/></testcase></testsuite></testsuites>"
+    )
+    found = count_tests(tmp_path / "junit.xml")
+    assert (found["passed"], found["failed"], found["skipped"]) == (2, 1, 1)
+    assert found["why_failed"] == {"c": "too far"}
+
+
+def test_every_record_is_drawn(tmp_path):
+    memory = {"peak_device_bytes": 2 * GIB, "peak_reserved_bytes": 3 * GIB, "peak_device_note": None}
+    runs = [
+        {"arm": arm, **encode(made_up_run(arm.split()[0], psnr=20.0 + k, **memory))}
+        for k, arm in enumerate(("splatfacto", "abcd-monolithic", "abcd blocks=1", "abcd blocks=8"))
+    ]
+    found = {"settings": {"data": "made-up", "seconds": 60.0, "steps": None}, "runs": runs}
+    stages = {"views": 9, "ms_per_view": {"layers": 1.0, "backward": 2.0}, "profile": []}
+    records = [
+        WHOLE,
+        WHOLE | {"part": "compare", "found": found},
+        WHOLE | {"part": "visit", "found": {"scene": "made-up", "by_blocks": [{"blocks": 1, **stages}]}},
+    ]
+    paths = draw(records, tmp_path)
+    assert {path.name for path in paths} == {"compare.png", "compare.svg", "visit.png", "visit.svg"}
+    assert "abcd blocks=8  23.00" in (tmp_path / "compare.svg").read_text()
+
+
+@pytest.mark.cli
+def test_a_dry_run_goes_through(tmp_path, capsys):
+    assert main(Args(out=tmp_path, parts=("build", "extent"), dry_run=True)) == 0
+    assert read_json(tmp_path / "build.json")["found"]["self_check"] < 1e-3
+    assert len(read_json(tmp_path / "extent.json")["found"]["scale"]["arms"]) == 2
+    assert "ABCD, 2 blocks" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_all_parts_of_a_dry_run_go_through(tmp_path, capsys):
+    out, ours = tmp_path / "out", os.environ.get("ABCD_TEST_DEVICE")
+    assert main(Args(data=write_scene(tmp_path / "scene"), out=out, dry_run=True)) == 0
+    assert ours or read_json(out / "tests.json")["found"]["skipped"] > 0
+    for part in ("compare", "compare-steps"):
+        found = read_json(out / f"{part}.json")["found"]
+        assert [run["arm"] for run in found["runs"]] == ["abcd blocks=2"]
+        assert found["left_out"][0]["method"] == "splatfacto"
+        assert not list((out / "work" / part).rglob("nerfstudio_models"))
+    assert read_json(out / "visit.json")["found"]["by_blocks"][0]["profile"]
+    assert "a dry run: these numbers mean nothing" in capsys.readouterr().out

@@ -1,0 +1,29 @@
+"""Where the tests of this folder run, and what draws there.
+
+With ABCD_TEST_DEVICE=cpu they run without CUDA, against the torch rasterizer with gsplat's tiles: that tries
+the tests, not the kernels.
+"""
+
+import os
+
+import pytest
+import torch
+
+from abcd_ns.engine.rasterizer import Rasterizer, TorchRasterizer, make_rasterizer
+
+
+@pytest.fixture(scope="session")
+def device() -> torch.device:
+    """The CUDA device, or what ABCD_TEST_DEVICE names."""
+    found = torch.device(os.environ.get("ABCD_TEST_DEVICE", "cuda"))
+    if found.type == "cuda" and not torch.cuda.is_available():
+        pytest.skip("there is no CUDA device")
+    return found
+
+
+@pytest.fixture(scope="session")
+def rasterizer(device) -> Rasterizer:
+    """The one under test; gsplat's is checked against the torch backend as it is made."""
+    if device.type == "cuda":
+        return make_rasterizer("gsplat", device)
+    return TorchRasterizer("never", tile_side=16)

@@ -1,0 +1,108 @@
+"""The coordinator on a CUDA device: it trains, goes on where it stopped, and gives back what it took.
+
+Nothing is compared bit for bit: gsplat's backward pass adds up in no fixed order.
+"""
+
+import math
+
+import pytest
+import torch
+
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import StepTaken, VisitEnded
+from abcd_ns.engine.rasterizer import TorchRasterizer
+from abcd_ns.engine.training_loop import train, train_step
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+pytestmark = pytest.mark.gpu
+STEPS = 20
+GROWING = {"refine_start": 0.0, "warmup_passes": 1, "refine_every": 5, "densify_grad_thresh": 2e-4}
+
+
+@pytest.fixture(scope="module")
+def views():
+    return ring_of_views(5, width=96, height=72)
+
+
+@pytest.fixture(scope="module")
+def photos(views):
+    return Photos(random_gaussians(150, seed=7, size=0.12), views)
+
+
+@pytest.fixture
+def begin(rasterizer, device, views):
+    """Makes a coordinator on the device, in a folder of its own."""
+
+    def make(folder, **options):
+        folder.mkdir(exist_ok=True)
+        start = random_gaussians(300, seed=1, size=0.12)
+        given = {"steps": STEPS, "background": "black", "rasterizer": rasterizer, "device": device}
+        return make_coordinator(folder, start, views, **{**given, **options})
+
+    return make
+
+
+def pictures(coordinator, views):
+    """All views of the whole scene, drawn on the CPU."""
+    scene = whole_scene(coordinator)
+    with torch.no_grad():
+        return [
+            TorchRasterizer("never")(scene, v, sh_degree=scene.sh_degree).color.clamp(0, 1) for v in views
+        ]
+
+
+def mean_error(coordinator, views, photos) -> float:
+    drawn = pictures(coordinator, views)
+    errors = [(p - photos.images[v.index]).square().mean() for p, v in zip(drawn, views, strict=True)]
+    return float(sum(errors)) / len(errors)
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_steps_on_the_device_make_the_photos_more_alike(tmp_path, begin, views, photos, blocks, strategy):
+    density = DensityConfig(strategy=strategy, **GROWING)
+    coordinator = begin(tmp_path, blocks=blocks, density=density, ownership="fragments")
+    seen = []
+    coordinator.announce.subscribe(lambda event: seen.append(event) if isinstance(event, StepTaken) else None)
+    before = mean_error(coordinator, views, photos)
+    train(coordinator, photos)
+    assert len(seen) == STEPS
+    assert all(math.isfinite(event.psnr) for event in seen)
+    assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
+    assert mean_error(coordinator, views, photos) < 0.9 * before
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_a_run_that_goes_on_comes_to_the_same_picture(tmp_path, begin, views, photos, blocks):
+    options = {"blocks": blocks, "density": DensityConfig(strategy="off")}
+    whole = begin(tmp_path / "whole", **options)
+    train(whole, photos)
+    stopped = begin(tmp_path / "stopped", **options)
+    train(stopped, photos, steps=STEPS // 2 + 1)
+    stopped.save()
+    stopped.scene.store.close()
+    went_on = begin(tmp_path / "stopped", resume=True, **options)
+    assert went_on.state.step == STEPS // 2 + 1
+    train(went_on, photos)
+    for one, other in zip(pictures(whole, views), pictures(went_on, views), strict=True):
+        assert float((one - other).abs().mean()) < 3e-3
+
+
+def test_memory_is_after_a_visit_what_it_was_before(tmp_path, begin, photos, device):
+    """Else a scene could not be larger than the device. Blocks are alike in size."""
+    if device.type != "cuda":
+        pytest.skip("only CUDA says how much memory is held")
+    coordinator = begin(tmp_path, blocks=4, steps=200, density=DensityConfig(strategy="off"))
+    ended, held = [], []
+    coordinator.announce.subscribe(
+        lambda event: ended.append(event) if isinstance(event, VisitEnded) else None
+    )
+    while len(held) < 6:
+        train_step(coordinator, photos)
+        if len(ended) > len(held):
+            for optimizer in coordinator.optimizers.values():
+                optimizer.zero_grad(set_to_none=True)
+            torch.cuda.synchronize()
+            held.append(torch.cuda.memory_allocated())
+    # The first visit leaves what is kept for good: cameras, caches.
+    assert max(held[1:]) <= held[1] + 2**18, held
