@@ -13,6 +13,7 @@ from abcd_ns.tools.runs.records import encode, read_json, write_json
 from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part
 from benchmarks.gpu.charts import draw
 from benchmarks.gpu.parts import count_tests
+from benchmarks.visit import STAGES
 from tests.reference.colmap_scene import write_scene
 from tests.tools.compare.records import made_up_run
 
@@ -83,7 +84,7 @@ def test_a_part_that_finds_nothing_leaves_its_error(tmp_path):
 def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkeypatch, capsys):
     ran = []
 
-    def note(part, args, out, seconds):
+    def note(part, _, out, seconds):
         ran.append((part, round(seconds)))
         write_json(out / f"{part}.json", WHOLE | {"part": part, "found": {}})
         return WHOLE
@@ -130,7 +131,7 @@ def test_every_record_is_drawn(tmp_path):
         for k, arm in enumerate(("splatfacto", "abcd-monolithic", "abcd blocks=1", "abcd blocks=8"))
     ]
     found = {"settings": {"data": "made-up", "seconds": 60.0, "steps": None}, "runs": runs}
-    stages = {"views": 9, "ms_per_view": {"layers": 1.0, "backward": 2.0}, "profile": []}
+    stages = {"views": 9, "ms_per_view": dict.fromkeys(STAGES, 1.5), "profile": []}
     records = [
         WHOLE,
         WHOLE | {"part": "compare", "found": found},
