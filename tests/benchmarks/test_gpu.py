@@ -139,7 +139,7 @@ def test_every_record_is_drawn(tmp_path):
     ]
     paths = draw(records, tmp_path)
     assert {path.name for path in paths} == {"compare.png", "compare.svg", "visit.png", "visit.svg"}
-    assert "abcd blocks=8  23.00" in (tmp_path / "compare.svg").read_text()
+    assert "abcd blocks=8  22.85" in (tmp_path / "compare.svg").read_text()
 
 
 @pytest.mark.cli
