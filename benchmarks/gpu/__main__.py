@@ -135,6 +135,7 @@ def run_bounded(command: Sequence[str], seconds: float, log: Path) -> str | None
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was started ends too
     try:
         sys.exit(main(tyro.cli(Args)))
     except UserError as error:
