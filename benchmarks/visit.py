@@ -143,7 +143,7 @@ def begin(
     seconds: float | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> Coordinator:
-    """A coordinator at the beginning of a run, on CUDA where there is any, its store and layers in `folder`."""
+    """A coordinator at the beginning of a run, on CUDA where there is any; store and layers in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     tree = build_kd(capture.gaussians.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
