@@ -10,6 +10,7 @@ from torch import Tensor
 
 from abcd_ns.engine.compositing import sandwich
 from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.cutouts import random_part
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Parts
 from abcd_ns.engine.rasterizer import Raster, Shot, ZWindow
@@ -27,6 +28,8 @@ class Sample:
     near: Splats | None
     window: ZWindow | None
     background: Float[Tensor, "3"]
+    share: float = 1.0
+    """Of the pixels that might have been drawn in this step, those that are: the crop's."""
 
     @property
     def shot(self) -> Shot:
@@ -44,8 +47,9 @@ class Sample:
     def loss(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig
     ) -> Float[Tensor, ""]:
-        """Photometric, as this crop's part of the loss of the whole image."""
-        return photometric_loss(
+        """Photometric, as this crop's part of the loss of the whole image; where it was drawn by lot, so that
+        the expectation is the part of all that might have been (see `random_part`)."""
+        found = photometric_loss(
             picture,
             photo,
             full_pixels=self.view.full.pixels,
@@ -53,6 +57,7 @@ class Sample:
             ssim_lambda=config.ssim_lambda,
             pixel_loss=config.pixel_loss,
         )
+        return found / self.share
 
 
 @dataclass(frozen=True)
@@ -80,3 +85,8 @@ def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "
         drawn = random.Random(f"background {config.seed} {step} {place}").getrandbits(62)
         return torch.rand(3, generator=torch.Generator().manual_seed(drawn))
     return torch.full((3,), float(config.background == "white"))
+
+
+def part_to_draw(config: TrainingConfig, crop: Crop, step: int, place: int) -> Crop:
+    """What the sample at `place` of a step's batch is drawn of a crop; depends on nothing else."""
+    return random_part(crop, config.crop_pixels, random.Random(f"part {config.seed} {step} {place}"))

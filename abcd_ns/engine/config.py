@@ -37,6 +37,13 @@ class TrainingConfig:
     batch: int = 0
     """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and 4 elsewhere: with
     small blocks a step's overhead would outweigh its work. The warm-up draws 2 at most."""
+    batch_limit: int = 0
+    """Views in a step at most where `batch` is 0; 0 is none. `ns-train abcd` sets it by the device's
+    memory."""
+    crop_pixels: int = 0
+    """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
+    another one each time, and weighs it by how much of the crop it leaves out. 0 is no limit; `ns-train abcd`
+    sets it by the device's memory where not even one whole view fits."""
     batch_power: float = 0.75
     """Learning rates grow with this power of the views in a step: 0.5 suits gradients that are noise, 1 such
     as agree. A scene's views show different Gaussians, but a block's all show the same ones."""

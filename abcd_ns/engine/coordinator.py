@@ -109,8 +109,8 @@ class Coordinator(StepDrawing):
     def batch(self) -> int:
         """Views in a step of the visit that is under way."""
         if self.state.active is not None and self.state.active.is_whole:
-            return views_per_warm_up_step(self.config.batch)
-        return views_per_step(self.config.batch, self.scene.tree.num_blocks)
+            return views_per_warm_up_step(self.config.batch, self.config.batch_limit)
+        return views_per_step(self.config.batch, self.scene.tree.num_blocks, self.config.batch_limit)
 
     def _density_control(self) -> DensityControl:
         return DensityControl(for_blocks(self.config.density, self.scene.tree.num_blocks))
@@ -288,7 +288,8 @@ class Coordinator(StepDrawing):
     def _measure_influence(self, active: ActiveVisit) -> None:
         """Find out how much the doubtful views show of the block by now."""
         for view in active.looked_at:
-            sample, live = self._sample(view, 0, self.state.step), live_gaussians(self.params)
+            crop, live = active.geometry.crops[view], live_gaussians(self.params)
+            sample = self._sample_of(view, crop, 0, self.state.step)
             before = sample.layers and sample.layers.front.transmittance
             self.state.influence[active.geometry.block][view] = share_shown(
                 live, self._rasterizer, sample.shot, before, antialiased=self.config.antialiased

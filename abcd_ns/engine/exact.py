@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from abcd_ns.engine.batch import Batch, Rendered, Sample, background
+from abcd_ns.engine.batch import Batch, Rendered, Sample, background, part_to_draw
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
 from abcd_ns.engine.coordinator import Coordinator
@@ -97,7 +97,7 @@ class ExactCoordinator(Coordinator):
         return DensityControl(for_blocks(self.config.density, 1))
 
     def next_batch(self) -> Batch:
-        """Set the learning rate and say what to train on next: whole views."""
+        """Set the learning rate and say what to train on next: whole views, or random parts."""
         self.stopwatch.start()
         self._pace.set(self.batch, exponential_decay(self.progress, 1.0, self.config.means_lr_decay))
         step, rows = self.state.step, tuple(sorted(self.views))
@@ -105,7 +105,9 @@ class ExactCoordinator(Coordinator):
         for place in range(self.batch):
             view = self.views[endless_order(rows, step * self.batch + place, self.config.seed)]
             behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
-            samples.append(Sample(view, view.full, None, None, None, behind))
+            crop = part_to_draw(self.config, view.full, step, place)
+            share = crop.pixels / view.full.pixels
+            samples.append(Sample(view, crop, None, None, None, behind, share))
         return Batch(step, tuple(samples))
 
     def render(self, batch: Batch) -> Rendered:

@@ -94,7 +94,7 @@ class Region:
         return Region(self.own.to(device), self.clear.to(device))
 
     def __getitem__(self, crop: Crop) -> "Region":
-        """The crop of a whole view's."""
+        """Some of its pixels, counted from its own upper left corner."""
         return Region(self.own[crop.slices], self.clear[crop.slices])
 
 
@@ -167,7 +167,8 @@ class IndependentCoordinator(Coordinator):
         """As Coordinator's, of the pixels that say something about the block."""
         shown, wanted = [], []
         for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
-            region = self._regions[sample.view.index]
+            index = sample.view.index
+            region = self._regions[index][sample.crop.within(self._crops[index])]
             counts = (region.own | region.clear)[..., None].to(picture)
             target = torch.where(region.clear[..., None], sample.background.to(photo), photo)
             shown.append(picture * counts)

@@ -13,7 +13,7 @@ import torch
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.painter import LEAST_PASS
 from abcd_ns.engine.schedule import views_per_step, views_per_warm_up_step
-from abcd_ns.engine.visit import AT_HAND_BYTES, PARTS_BYTES
+from abcd_ns.engine.visit import AT_HAND_BYTES, BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.errors import UserError
 
 FLOAT = 4
@@ -22,22 +22,30 @@ PROJECTED_FLOATS = 50
 """Of a Gaussian in one view: its splat (11 numbers), copies sorted by tile, the gradients of all these."""
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
+DRAWN_FLOATS = 24
+"""Of a pixel that is drawn into layers: colour, transmittance, depth and the last of its Gaussians, of two
+layers at once, and these on their way into the cache."""
 LIVE_COPIES = 5
 """Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
 
 
 @dataclass(frozen=True)
 class DeviceNeeds:
-    """What training takes on the device, bytes.
+    """What training takes on the device, bytes: the larger of what a step and what drawing layers takes.
 
     Args:
         pixels: of the largest image.
         batch: views in a step.
+        crop_pixels: of a view that a step trains on at most; 0 is no limit.
+        levels: layers of one view that are held, at most, while the blocks around a visited one are folded:
+            as many as the tree of blocks is deep, and one. 0 where a block is the whole scene.
     """
 
     pixels: int
     batch: int
     sh_degree: int = 3
+    crop_pixels: int = 0
+    levels: int = 2
 
     @property
     def parameter_bytes(self) -> int:
@@ -51,11 +59,27 @@ class DeviceNeeds:
         return 7 * self.parameter_bytes + self.batch * PROJECTED_FLOATS * FLOAT
 
     @property
-    def fixed_bytes(self) -> int:
-        """Whatever the block: layers at hand, layers while they are folded, the least pass of frozen
-        Gaussians, and the step's crops."""
+    def step_bytes(self) -> int:
+        """Of a step's pictures."""
+        drawn = min(self.crop_pixels or self.pixels, self.pixels)
+        return self.batch * drawn * PIXEL_FLOATS * FLOAT
+
+    @property
+    def drawing_bytes(self) -> int:
+        """Of whole views while F and B are drawn, which is before the first step: layers while they are
+        folded, a view that is being drawn, and the least pass of frozen Gaussians. A larger pass takes no
+        more than gradients and refining of a block of half its size do, which have not begun."""
+        if self.levels == 0:
+            return 0
+        parts = max(PARTS_BYTES, self.levels * BYTES_PER_PIXEL * self.pixels)
         frozen = LEAST_PASS * (self.parameter_bytes + PROJECTED_FLOATS * FLOAT)
-        return AT_HAND_BYTES + PARTS_BYTES + frozen + self.batch * self.pixels * PIXEL_FLOATS * FLOAT
+        return parts + self.pixels * DRAWN_FLOATS * FLOAT + frozen
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Whatever the block: layers at hand, and what else is held in a step or while layers are drawn."""
+        at_hand = AT_HAND_BYTES if self.levels else 0
+        return at_hand + max(self.step_bytes, self.drawing_bytes)
 
     def bytes_for(self, gaussians: int) -> int:
         """The peak of a visit to a block of so many Gaussians."""
@@ -73,9 +97,19 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
         block: Gaussians of the largest block, one of several.
         pixels: of the largest image.
     """
-    batches = views_per_step(config.batch, blocks=2), views_per_warm_up_step(config.batch)
-    visit, warm_up = (DeviceNeeds(pixels, batch, config.sh_degree) for batch in batches)
-    return config.scaffold_gaussians or warm_up.block_limit(visit.bytes_for(block))
+    batches = (
+        views_per_step(config.batch, 2, config.batch_limit),
+        views_per_warm_up_step(config.batch, config.batch_limit),
+    )
+    visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, config.crop_pixels) for n in batches)
+    # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
+    room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
+    return config.scaffold_gaussians or room // warm_up.gaussian_bytes
+
+
+def levels_of(blocks: int) -> int:
+    """`DeviceNeeds.levels` of a balanced tree of so many blocks."""
+    return 0 if blocks == 1 else math.ceil(math.log2(blocks)) + 1
 
 
 def fewest_blocks(gaussians: int, limit: int, full: float) -> int:

@@ -64,7 +64,8 @@ class Planner:
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
         if self._config.scaffold_passes:
             uses = self._config.scaffold_passes * len(crops)
-            taken = min(taken, math.ceil(uses / views_per_warm_up_step(self._config.batch)))
+            views = views_per_warm_up_step(self._config.batch, self._config.batch_limit)
+            taken = min(taken, math.ceil(uses / views))
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
     def next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
@@ -130,7 +131,7 @@ class Planner:
             remaining = None if self._budget.steps is None else self._budget.steps - state.step
             passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
             used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
-            batch = views_per_step(config.batch, self._scene.tree.num_blocks)
+            batch = views_per_step(config.batch, self._scene.tree.num_blocks, config.batch_limit)
             steps = (passes / batch, remaining, config.seed, config.visit_steps)
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:

@@ -63,14 +63,18 @@ def plan_sweep(
     return tuple(VisitPlan(block, share) for block, share in zip(order, shares, strict=True) if share > 0)
 
 
-def views_per_step(batch: int, blocks: int) -> int:
-    """`TrainingConfig.batch`, its 0 resolved."""
-    return batch or (1 if blocks == 1 else DEFAULT_BATCH)
+def views_per_step(batch: int, blocks: int, limit: int = 0) -> int:
+    """`TrainingConfig.batch`, its 0 resolved.
+
+    Args:
+        limit: `TrainingConfig.batch_limit`.
+    """
+    return batch or (1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH))
 
 
-def views_per_warm_up_step(batch: int) -> int:
+def views_per_warm_up_step(batch: int, limit: int = 0) -> int:
     """How many views a step of the warm-up draws, which only scenes of several blocks have."""
-    return min(views_per_step(batch, blocks=2), WARM_UP_BATCH)
+    return min(views_per_step(batch, 2, limit), WARM_UP_BATCH)
 
 
 def views_per_visit(seen: int, most_seen: int, limit: int) -> int:

@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.batch import Batch, Rendered, Sample, background
+from abcd_ns.engine.batch import Batch, Rendered, Sample, background, part_to_draw
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.crew import Crew
 from abcd_ns.engine.density import DensityControl
@@ -22,7 +23,7 @@ from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.schedule import size_of_crew
 from abcd_ns.engine.share import DrawShare, Share, Target, Task, share_of
 from abcd_ns.engine.storage import LayerCache
-from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitLayers
 
 
@@ -76,10 +77,17 @@ class StepDrawing(ABC):
     # -- a step --------------------------------------------------------------------------------------
 
     def _sample(self, view: int, place: int, step: int) -> Sample:
-        around = self._layers.around(view) if self._layers else None
+        """What is drawn at one place of a step: all that a view shows of the block, or a part."""
+        whole = self._active.geometry.crops[view]
+        crop = part_to_draw(self.config, whole, step, place)
+        sample = self._sample_of(view, crop, place, step)
+        return replace(sample, share=crop.pixels / whole.pixels)
+
+    def _sample_of(self, view: int, crop: Crop, place: int, step: int) -> Sample:
+        around = self._layers.around(view, crop) if self._layers else None
         return Sample(
             view=self.views[view],
-            crop=self._active.geometry.crops[view],
+            crop=crop,
             layers=around and around.layers,
             near=around and around.near,
             window=around and around.window,

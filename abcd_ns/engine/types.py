@@ -100,6 +100,10 @@ class Crop:
     def pixels(self) -> int:
         return self.width * self.height
 
+    def within(self, outer: "Crop") -> "Crop":
+        """The same pixels, counted from the upper left corner of `outer`."""
+        return Crop(self.x - outer.x, self.y - outer.y, self.width, self.height)
+
 
 @dataclass(frozen=True)
 class View:
@@ -139,3 +143,7 @@ class Layer:
     """Premultiplied linear colour; may exceed 1."""
     transmittance: Float[Tensor, "h w"]
     """The share of light from behind that passes: 1 - alpha."""
+
+    def __getitem__(self, part: Crop) -> "Layer":
+        """Some of its pixels, counted from its own upper left corner; shares memory."""
+        return Layer(self.color[part.slices], self.transmittance[part.slices])

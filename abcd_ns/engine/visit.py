@@ -12,6 +12,7 @@ from abcd_ns.engine.painter import Loaded, Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
+from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 from abcd_ns.engine.visibility import footprint
@@ -90,6 +91,14 @@ class Surroundings:
         held += [] if self.near is None else [self.near.planes]
         return sum(tensor.nbytes for tensor in held)
 
+    def part(self, whole: Crop, crop: Crop) -> "Surroundings":
+        """What is seen in a part of the crop `whole` that this is of; shares memory."""
+        if crop == whole:
+            return self
+        inside = crop.within(whole)
+        layers = Parts(self.layers.front[inside], self.layers.back[inside])
+        return Surroundings(layers, self.near, _part_of_window(self.window, crop))
+
 
 class VisitLayers:
     """F and B for the views of one visit, drawn once and kept at hand or in the layer cache.
@@ -133,7 +142,7 @@ class VisitLayers:
         """Draw what is missing for these views; yields each view when it is ready."""
         missing = []
         for view in dict.fromkeys(views):
-            found = self._found(view)
+            found = self._found(view, self._geometry.crops[view])
             if found is None:
                 missing.append(view)
             else:
@@ -151,10 +160,10 @@ class VisitLayers:
         room = PARTS_BYTES
         for view in views:
             crop = self._geometry.crops[view]
-            room -= levels * BYTES_PER_PIXEL * crop.width * crop.height
+            room -= levels * BYTES_PER_PIXEL * crop.pixels
             if group and room < 0:
                 yield group
-                group, room = [], PARTS_BYTES
+                group, room = [], PARTS_BYTES - levels * BYTES_PER_PIXEL * crop.pixels
             group.append(view)
         if group:
             yield group
@@ -174,17 +183,19 @@ class VisitLayers:
                 if unit == self._units[-1]:
                     yield view, self._keep(view, parts.pop(view))
 
-    def around(self, view: int) -> Surroundings:
-        """What `view` sees around the active block.
+    def around(self, view: int, crop: Crop | None = None) -> Surroundings:
+        """What `view` sees around the active block, in a part of the visit's crop or in all of it.
 
         Raises:
             StaleLayerError: a frozen block has changed since the visit began.
         """
         if self._frozen_versions() != self._versions:
             raise StaleLayerError(f"a frozen block changed during the visit of block {self._geometry.block}")
-        found = self._found(view)
+        whole = self._geometry.crops[view]
+        found = self._found(view, crop or whole)
         if found is None:  # never drawn, or the disposable cache has lost it
-            ((_, found),) = self.draw([view])
+            ((_, drawn),) = self.draw([view])
+            found = drawn.part(whole, crop or whole)
         return found
 
     @property
@@ -197,14 +208,19 @@ class VisitLayers:
         if self._uses_cache:
             self._cache.drop(self._prefix)
 
-    def _found(self, view: int) -> Surroundings | None:
+    def _found(self, view: int, crop: Crop) -> Surroundings | None:
+        whole = self._geometry.crops[view]
         if view in self._at_hand:
-            return self._at_hand[view]
-        layers = self._cached(view)
+            return self._at_hand[view].part(whole, crop)
+        layers = self._cached(view, crop.within(whole))
         if layers is None:
             return None
         near = self._near.get(view)
-        return Surroundings(layers, near and Splats(near.planes.to(self._painter.device)), self._window(view))
+        return Surroundings(
+            layers,
+            near and Splats(near.planes.to(self._painter.device)),
+            _part_of_window(self._window(view), crop),
+        )
 
     def _frozen_versions(self) -> dict[int, int]:
         scene = self._painter.scene
@@ -255,17 +271,17 @@ class VisitLayers:
             self._uses_cache = True
         return around
 
-    def _cached(self, view: int) -> Parts | None:
+    def _cached(self, view: int, part: Crop) -> Parts | None:
         if not self._units:
-            crop, matrix = self._geometry.crops[view], self._views[view].viewmat
-            nothing = empty_layer(crop.height, crop.width, self._painter.device, matrix.dtype)
+            matrix = self._views[view].viewmat
+            nothing = empty_layer(part.height, part.width, self._painter.device, matrix.dtype)
             return Parts(nothing, nothing)
         if self._own is not None and view not in self._near:
             return None  # after a resume: what is near was never written down
         found = [self._cache.get(self._key(view, side)) for side in SIDES]
         if any(layer is None for layer in found):
             return None
-        return Parts(*(self._on_device(layer) for layer in found))
+        return Parts(*(self._on_device(layer[part]) for layer in found))
 
     def _on_device(self, layer: Layer) -> Layer:
         dtype, device = next(iter(self._views.values())).viewmat.dtype, self._painter.device
@@ -290,3 +306,8 @@ class VisitLayers:
     @property
     def _prefix(self) -> str:
         return f"block-{self._geometry.block}"
+
+
+def _part_of_window(window: ZWindow | None, crop: Crop) -> ZWindow | None:
+    """The window of a part of the crop that it is of."""
+    return window and window.on(TileGrid(crop, window.grid.side))

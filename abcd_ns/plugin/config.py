@@ -18,11 +18,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.datamanager import AbcdDataManager
-from abcd_ns.plugin.dataparser import AbcdDataParserConfig
+from abcd_ns.plugin.dataparser import AbcdDataParser, AbcdDataParserConfig
 from abcd_ns.plugin.input_errors import exit_on_user_error
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.pipeline import AbcdPipeline
-from abcd_ns.plugin.room import check_room, device_budget
+from abcd_ns.plugin.room import Demand, device_budget, find_room
 from abcd_ns.plugin.trainer import AbcdTrainer
 from abcd_ns.viewer.rules import THIS_MACHINE, WILDCARDS
 
@@ -102,6 +102,8 @@ def check_training(training: TrainingConfig) -> None:
         raise UserError(
             f"--pipeline.training.scaffold-gaussians must be 0 or more, not {training.scaffold_gaussians}."
         )
+    if training.crop_pixels < 0:
+        raise UserError(f"--pipeline.training.crop-pixels must be 0 or more, not {training.crop_pixels}.")
     if not 0 <= training.batch_power <= 1:
         raise UserError(f"--pipeline.training.batch-power must be from 0 to 1, not {training.batch_power}.")
     if not training.influence_share > 0:
@@ -231,5 +233,16 @@ class AbcdTrainerConfig(TrainerConfig):
             parser = parser.setup()
             parser.check()
             if self.pipeline.blocks == 0:
-                budget = device_budget(self.pipeline.device_budget_gb, self.machine.device_type)
-                check_room(budget, parser.largest_image, self.pipeline.training)
+                self._check_room(parser)
+
+    def _check_room(self, parser: AbcdDataParser) -> None:
+        """See that some block fits on the device."""
+        pipeline, model = self.pipeline, self.pipeline.model
+        demand = Demand(
+            parser.largest_image,
+            model.num_random if model.random_init else parser.points or model.num_random,
+            pipeline.training,
+            most=pipeline.training.density.limit,
+            factor=parser.factor,
+        )
+        find_room(device_budget(pipeline.device_budget_gb, self.machine.device_type), demand)

@@ -32,10 +32,12 @@ class AbcdDataParserConfig(DataParserConfig):
     data: Path = Path()
     """A folder with sparse/0, colmap/sparse/0 or sparse (COLMAP, .bin or .txt) and images, or with
     transforms.json; or a transforms.json file itself. Where both are, COLMAP's model is taken."""
-    downscale_factor: int = 1
-    """Divides the photos' width and height. images_N is read where it fits the model; otherwise photos are
-    reduced in memory by area averaging, to sizes rounded down, and nothing is written. Intrinsics follow
-    the sizes: fx x new width / old width, fy x new height / old height."""
+    downscale_factor: int | None = None
+    """Divides the photos' width and height. None takes the smallest of 1, 2, 4, ... with which no photo is
+    wider or higher than 1,600 px, as splatfacto's data parsers do; 1 keeps photos as they are. images_N is
+    read where it fits the model; otherwise photos are reduced in memory by area averaging, to sizes rounded
+    down, and nothing is written. Intrinsics follow the sizes: fx x new width / old width, fy x new height /
+    old height."""
     scale_factor: float = 1.0
     """Multiplies the scene's size, after auto_scale_poses."""
     scene_scale: float = 1.0
@@ -99,6 +101,16 @@ class AbcdDataParser(DataParser):
     def largest_image(self) -> int:
         """Pixels of the largest photo as it is trained on."""
         return max(width * height for width, height in (source.size for source in self.prepared().sources))
+
+    @property
+    def factor(self) -> int:
+        """By which the photos' width and height are divided."""
+        return self.prepared().factor
+
+    @property
+    def points(self) -> int:
+        """How many the scene has; 0 where Gaussians begin at random."""
+        return len(self.prepared().points_in_model)
 
     def prepared(self) -> Prepared:
         """The whole scene, read and checked at the first call.

@@ -33,7 +33,7 @@ from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
 from abcd_ns.plugin.ram_budget import budget_bytes, share_out
-from abcd_ns.plugin.room import Room, device_budget, find_room
+from abcd_ns.plugin.room import FITTED, Demand, Room, device_budget, find_room
 from abcd_ns.plugin.run_folder import CACHE as CACHE
 from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, open_cache, take_over
 from abcd_ns.plugin.run_folder import STORE as STORE
@@ -136,10 +136,10 @@ class AbcdPipeline(VanillaPipeline):
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
-        limit, sole = self._limits(store, resumed)
-        training = replace(config.training, block_limit=limit, sole_limit=sole, processes=self._processes())
+        training = replace(config.training, **self._fitted(store, resumed), processes=self._processes())
         if resumed:
-            cut_at_rest(scene, RunState.from_json(store.state), limit, sole)
+            state = RunState.from_json(store.state)
+            cut_at_rest(scene, state, training.block_limit, training.sole_limit)
         coordinator = coordinator_for(training)(
             training,
             Budget(trainer.total_steps, config.max_seconds),
@@ -169,24 +169,26 @@ class AbcdPipeline(VanillaPipeline):
         photo = self.model.photo_on(self.datamanager.photo(*shot), sample.background)
         return photo, self.datamanager.mask(*shot)
 
-    def _limits(self, store: ParameterStore, resumed: bool) -> tuple[int, int]:
-        """Gaussians in a block, and in a sole one, at most: as the run began, unless it goes on with a budget
-        of its own."""
+    def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
+        """The options that were fitted to the device: as the run began, unless it goes on with a budget of
+        its own."""
         if resumed and self.config.blocks == 0 and self.config.device_budget_gb > 0:
-            room = self._room(1)
-            return room.limit, room.sole
-        return store.header.get("block_limit", 0), store.header.get("sole_limit", 0)
+            blocks = BlockTree.from_json(store.header["tree"]).num_blocks
+            return self._room(sum(map(store.counts, range(blocks))), blocks).options
+        return {name: store.header.get(name, 0) for name in FITTED}
 
-    def _room(self, points: int) -> Room:
-        """How many blocks for a scene that begins with so many points."""
+    def _room(self, points: int, blocks: int = 1) -> Room:
+        """How many blocks for a scene that goes on with so many Gaussians in so many blocks."""
         config = self.config
-        return find_room(
-            device_budget(config.device_budget_gb, self.device),
-            pixels=self._pixels,
-            points=points,
+        demand = Demand(
+            self._pixels,
+            points,
+            config.training,
             most=config.training.density.limit,
-            training=config.training,
+            factor=self.datamanager.dataparser.factor,
+            blocks=blocks,
         )
+        return find_room(device_budget(config.device_budget_gb, self.device), demand)
 
     @property
     def _pixels(self) -> int:
@@ -195,16 +197,12 @@ class AbcdPipeline(VanillaPipeline):
         return int((cameras.width * cameras.height).max())
 
     def _first_cut(self, points: int) -> tuple[int, dict[str, int]]:
-        """The number of blocks to begin with, and the limits of their Gaussians, by option; 0 for none."""
-        training = self.config.training
+        """The number of blocks to begin with, and the options that are fitted to the device, by name."""
         if self.config.blocks > 0:
-            return self.config.blocks, {
-                "block_limit": training.block_limit,
-                "sole_limit": training.sole_limit,
-            }
+            return self.config.blocks, {name: getattr(self.config.training, name) for name in FITTED}
         room = self._room(points)
         CONSOLE.print(room.in_words(), highlight=False, soft_wrap=True)
-        return room.blocks, {"block_limit": room.limit, "sole_limit": room.sole}
+        return room.blocks, room.options
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""
@@ -230,15 +228,15 @@ class AbcdPipeline(VanillaPipeline):
                 highlight=False,
             )
         del everything
-        blocks, limits = self._first_cut(len(gaussians))
+        blocks, fitted = self._first_cut(len(gaussians))
         tree = cut_space(gaussians, blocks, self.config.partition)
-        store = new_store(folder, {"tree": tree.to_json(), **limits, **made_for.header()})
+        store = new_store(folder, {"tree": tree.to_json(), **fitted, **made_for.header()})
         if training.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))
             return store, False
         warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.exact
-        largest = limits["block_limit"] or -(-len(gaussians) // tree.num_blocks)
-        keep = scaffold_size(training, largest, self._pixels) if warms_up else None
+        largest = fitted["block_limit"] or -(-len(gaussians) // tree.num_blocks)
+        keep = scaffold_size(replace(training, **fitted), largest, self._pixels) if warms_up else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
 

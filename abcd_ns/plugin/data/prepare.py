@@ -23,6 +23,10 @@ from abcd_ns.plugin.late_bar import LateBar
 if TYPE_CHECKING:
     from abcd_ns.plugin.dataparser import AbcdDataParserConfig
 
+MAX_AUTO_SIDE = 1600
+"""Pixels along a photo's longer side, at most, where nothing is said: nerfstudio's MAX_AUTO_RESOLUTION."""
+DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
+"""The option by which something is said."""
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 
 
@@ -34,6 +38,8 @@ class Prepared:
     sources: list[PhotoSource]
     lenses: list[Lens]
     """Final cameras: reduced, undistorted."""
+    factor: int
+    """By which the photos' width and height were to be divided."""
     similarity: Similarity
     """From the scene's world to that of training."""
     points: dict[str, Tensor]
@@ -79,13 +85,12 @@ def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
     Raises:
         InputError: the input cannot be used; all bad files are listed.
     """
-    factor = int(config.downscale_factor)
-    if factor != config.downscale_factor or factor < 1:
-        raise InputError(
-            f"--downscale-factor is {config.downscale_factor}; it must be a whole number from 1."
-        )
+    wanted = config.downscale_factor
+    if wanted is not None and (int(wanted) != wanted or wanted < 1):
+        raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
     try:
         scene = read_scene(config.data)
+        factor = automatic_factor(scene) if wanted is None else int(wanted)
         files, notes = _check_layout_and_photos(scene, factor, needs_photos)
     except OSError as error:
         where = error.filename or config.data
@@ -99,8 +104,28 @@ def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
     both = scene.split_lists.in_both if scene.split_lists else 0
     if both:
         more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
-    notes = (*scene.notes, *notes, *more)
-    return Prepared(scene, sources, lenses, similarity, points, in_model, notes)
+    reduced = [_reduction(scene, sources, factor)] if wanted is None and factor > 1 and needs_photos else []
+    notes = (*scene.notes, *reduced, *notes, *more)
+    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes)
+
+
+def automatic_factor(scene: Scene) -> int:
+    """What photos are divided by where nothing is said: the smallest power of two that leaves no side longer
+    than MAX_AUTO_SIDE, as nerfstudio's parsers have it, but by the largest photo and not by the first."""
+    longest, factor = max((max(frame.lens.size) for frame in scene.frames), default=0), 1
+    while longest / factor > MAX_AUTO_SIDE:
+        factor *= 2
+    return factor
+
+
+def _reduction(scene: Scene, sources: list[PhotoSource], factor: int) -> str:
+    """What was chosen for the user."""
+    full = max((frame.lens.size for frame in scene.frames), key=max)
+    longest = max(max(source.reduced) for source in sources)
+    return (
+        f"Photos of up to {full[0]} x {full[1]} px are reduced {factor} times, to {longest} px at most, as "
+        f"splatfacto does; {DOWNSCALE} 1 keeps their size."
+    )
 
 
 def check_masks(sources: list[PhotoSource]) -> None:

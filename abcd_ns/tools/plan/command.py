@@ -19,7 +19,7 @@ from torch import Tensor
 
 from abcd_ns import methods
 from abcd_ns.engine.initialize import gaussians_from_points
-from abcd_ns.engine.memory import DeviceNeeds
+from abcd_ns.engine.memory import DeviceNeeds, levels_of
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.schedule import views_per_step
@@ -28,7 +28,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.plugin.config import AbcdDataManagerConfig
 from abcd_ns.plugin.data.photos import default_budget
 from abcd_ns.plugin.dataparser import AbcdDataParserConfig
-from abcd_ns.plugin.room import GB, Room, device_budget, find_room
+from abcd_ns.plugin.room import GB, Demand, Room, device_budget, find_room
 from abcd_ns.plugin.views import views_of
 from abcd_ns.tools.plan.forecast import (
     Forecast,
@@ -48,7 +48,7 @@ FEW_VIEWS = 3
 @tyro.conf.configure(tyro.conf.FlagCreatePairsOff)
 def plan(
     data: Annotated[Path, tyro.conf.arg(metavar="PATH")],
-    downscale: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
+    downscale: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0,
     max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
@@ -62,7 +62,8 @@ def plan(
 
     Args:
         data: the scene, as for `ns-train abcd --data`.
-        downscale: divides the photos' width and height.
+        downscale: divides the photos' width and height; left out, photos are reduced to 1600 px at most, as
+            in training.
         blocks: number of blocks; 0 takes as few as the device's budget allows.
         device_budget_gb: memory of the device that training may take; 0 takes what is free.
         max_gaussians: limit on Gaussians in the whole scene; 0 is none, and five for each point are expected.
@@ -78,10 +79,10 @@ def plan(
         if value < 0:
             raise UserError(f"{option} is {value}; it must be 0 or more.")
     for option, value in (("--downscale", downscale), ("--steps", steps)):
-        if value < 1:
+        if value is not None and value < 1:
             raise UserError(f"{option} is {value}; it must be at least 1.")
     console = Console()
-    options = (downscale, blocks, device_budget_gb, max_gaussians, steps)
+    options = (blocks, device_budget_gb, max_gaussians, steps)
     found = forecast(read(data, downscale, console), Wanted(*options), console)
     print_forecast(found, console)
     return 1 if found.warnings else 0
@@ -91,7 +92,6 @@ def plan(
 class Wanted:
     """The options of `plan`."""
 
-    downscale: int = 1
     blocks: int = 0
     device_budget_gb: float = 0.0
     max_gaussians: int = 0
@@ -105,9 +105,11 @@ class Capture:
     points: Float[Tensor, "n 3"]
     colors: UInt8[Tensor, "n 3"]
     views: list[View]
+    factor: int = 1
+    """By which the photos were reduced."""
 
 
-def read(data: Path, downscale: int, console: Console) -> Capture:
+def read(data: Path, downscale: int | None, console: Console) -> Capture:
     """The training views and the points, as training has them; photos are looked at, not decoded.
 
     Raises:
@@ -117,12 +119,13 @@ def read(data: Path, downscale: int, console: Console) -> Capture:
     config = AbcdDataManagerConfig(data=data, dataparser=parser)
 
     def work() -> Capture:
-        dataset = config.setup(device="cpu", test_mode="val").train_dataset
+        manager = config.setup(device="cpu", test_mode="val")
+        dataset = manager.train_dataset
         points = dataset.metadata["points3D_xyz"].float()
         views = views_of(dataset.cameras)
         near = near_plane(points, views)
         colors = dataset.metadata["points3D_rgb"]
-        return Capture(points, colors, [replace(view, near=near) for view in views])
+        return Capture(points, colors, [replace(v, near=near) for v in views], manager.dataparser.factor)
 
     return _said(console, "Reading the capture", work)
 
@@ -137,19 +140,16 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     training = methods.abcd.config.pipeline.training
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pixels = max(view.full.pixels for view in views)
-    room = find_room(
-        device_budget(wanted.device_budget_gb, device),
-        pixels=pixels,
-        points=len(points),
-        most=wanted.max_gaussians or None,
-        training=training,
-    )
+    demand = Demand(pixels, len(points), training, most=wanted.max_gaussians or None, factor=capture.factor)
+    room = find_room(device_budget(wanted.device_budget_gb, device), demand)
     room = replace(room, blocks=wanted.blocks or room.blocks)
+    training = replace(training, **room.options)
     tree = build_kd(points, room.blocks)
     owner = tree.assign(points)
     seen = _said(console, "Looking which view sees which block", lambda: views_of_blocks(tree, points, views))
-    batch = views_per_step(training.batch, room.blocks)
-    needs = DeviceNeeds(pixels, batch, training.sh_degree)
+    batch = views_per_step(training.batch, room.blocks, training.batch_limit)
+    levels = levels_of(room.blocks_at_the_end)
+    needs = DeviceNeeds(pixels, batch, training.sh_degree, training.crop_pixels, levels)
     fullest = owner == owner.bincount(minlength=room.blocks).argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from abcd_ns.engine.batch import part_to_draw
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.loss import photometric_loss, ssim_windows
@@ -84,7 +85,7 @@ def device_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
     trained = largest * needs.gaussian_bytes
     return (
         Share(f"a block of {largest:,} Gaussians in training", trained),
-        Share("layers, a pass of frozen Gaussians, the step's crops", needs.fixed_bytes),
+        Share("a step's pictures, or layers while they are drawn", needs.fixed_bytes),
     )
 
 
@@ -115,9 +116,12 @@ def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig
     rasterizer.warm_up()
     leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in gaussians.items()})
     best = float("inf")
-    for _ in range(TIMED_STEPS):
+    for step in range(TIMED_STEPS):
         began = time.perf_counter()
-        shots = [Shot(view, view.full) for view in views[:batch]]
+        shots = [
+            Shot(view, part_to_draw(training, view.full, step, place))
+            for place, view in enumerate(views[:batch])
+        ]
         rasters = rasterizer.draw(leaves, shots, sh_degree=training.sh_degree)
         losses = [
             photometric_loss(
