@@ -120,7 +120,7 @@ class AbcdDataParser(DataParser):
         """
         if self._prepared is None:
             self._prepared = prepare(self.config, needs_photos=self.downscale_factor is None)
-            for note in self._prepared.notes:
+            for note in (*self._prepared.chosen, *self._prepared.notes):
                 self.tell(note)
         return self._prepared
 

@@ -205,7 +205,7 @@ def _refusal(budget: int, demand: Demand) -> str:
         ways.append(f"smaller photos by {DOWNSCALE} {times * demand.factor}")
     ways.append(f"more memory by {BUDGET_FLAG} {least:.2f}, if the device has it")
     return (
-        f"Training on photos of {demand.pixels / 1e6:.1f} megapixels takes {least:.2f} GB of the device, and "
+        f"Training on photos of {demand.pixels / 1e6:.2g} megapixels takes {least:.2f} GB of the device, and "
         f"{budget / GB:.2f} GB may be taken: give {', or '.join(ways)}."
     )
 

@@ -1,5 +1,6 @@
 """`abcd plan`: its figures add up, and what would not fit is said."""
 
+import dataclasses
 import math
 
 import pytest
@@ -46,7 +47,7 @@ def test_a_forecast_adds_up():
     assert found.seconds_per_step > 0
     low, high = found.hours
     assert low < high == pytest.approx(low * 1000 / 400)
-    needs = DeviceNeeds(48 * 36, 4)
+    needs = DeviceNeeds(48 * 36, 4, levels=3)
     assert sum(share.nbytes for share in found.device) == needs.bytes_for(250)
     assert not found.warnings
 
@@ -61,8 +62,19 @@ def test_a_device_budget_decides_how_many_blocks():
     assert sum(share.nbytes for share in many.device) <= 3 * GB
 
 
+def test_large_photos_are_planned_for_as_they_are_trained_on():
+    small = capture()
+    large = [dataclasses.replace(view, width=2600, height=100) for view in small.views[:3]]
+    found = forecast(
+        dataclasses.replace(small, views=large), Wanted(device_budget_gb=0.15), Console(quiet=True)
+    )
+    assert 0 < found.room.crop_pixels < 260_000
+    assert sum(share.nbytes for share in found.device) <= 0.15 * GB
+    assert not found.warnings
+
+
 def test_disk_holds_two_generations_and_a_checkpoint():
-    room = Room(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000)
+    room = Room(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000, batch=4)
     needs = DeviceNeeds(100, 1)
     assert sum(share.nbytes for share in disk_shares(room, needs)) == 1000 * 236 * (2 * 3 + 1)
     assert device_shares(room, needs)[0].nbytes == 1000 * needs.gaussian_bytes
@@ -71,13 +83,13 @@ def test_disk_holds_two_generations_and_a_checkpoint():
 @pytest.mark.parametrize("where", ["device", "ram", "disk"])
 def test_what_does_not_fit_is_said_with_what_to_do(where):
     shares = {"device": FITS, "ram": FITS, "disk": FITS, where: (Share("too much", 2**60),)}
-    (line,) = warnings_of(Room(2, 100, 100, GB, 100), (5, 5), **shares)
+    (line,) = warnings_of(Room(2, 100, 100, GB, 100, 4), (5, 5), **shares)
     assert {"device": "on the device", "ram": "of RAM", "disk": "of disk"}[where] in line
     assert ": " in line
 
 
 def test_blocks_that_hardly_any_view_sees_are_counted():
-    (line,) = warnings_of(Room(3, 100, 100, GB, 100), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
+    (line,) = warnings_of(Room(3, 100, 100, GB, 100, 4), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
     assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
 
 

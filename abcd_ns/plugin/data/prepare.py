@@ -48,6 +48,8 @@ class Prepared:
     """The same points, float64 [n, 3], in the scene's world."""
     notes: tuple[str, ...]
     """What the user should know but need not repair."""
+    chosen: tuple[str, ...] = ()
+    """What was chosen where the user said nothing."""
 
 
 def read_scene(data: Path) -> Scene:
@@ -105,8 +107,8 @@ def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
     if both:
         more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
     reduced = [_reduction(scene, sources, factor)] if wanted is None and factor > 1 and needs_photos else []
-    notes = (*scene.notes, *reduced, *notes, *more)
-    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes)
+    notes = (*scene.notes, *notes, *more)
+    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, tuple(reduced))
 
 
 def automatic_factor(scene: Scene) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from abcd_ns.plugin.data.photos import default_budget
+from abcd_ns.plugin.data.prepare import DOWNSCALE, MAX_AUTO_SIDE
 from abcd_ns.tools.check.survey import Survey
 from abcd_ns.tools.check.words import few, many
 from abcd_ns.tools.findings import Finding
@@ -57,12 +58,11 @@ def large_photos(survey: Survey) -> Iterator[Finding]:
     """Photos that will make training slow."""
     width, height = max((source.size for source in survey.sources), key=lambda size: size[0] * size[1])
     if width * height > MANY_PIXELS:
-        factor = int(np.ceil(np.sqrt(width * height / MANY_PIXELS * 2)))
         yield Finding(
             "note",
             "large-photos",
-            f"Photos of up to {width} x {height} px are trained on at full size, which takes long.",
-            f"For a first result: --pipeline.datamanager.dataparser.downscale-factor {factor}",
+            f"Photos of up to {width} x {height} px are trained on, which takes long.",
+            f"For a first result leave out {DOWNSCALE}: photos are then reduced to {MAX_AUTO_SIDE} px.",
         )
 
 

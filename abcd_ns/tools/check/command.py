@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.plugin.data.prepare import DOWNSCALE
 from abcd_ns.plugin.input_errors import InputError, one_line
 from abcd_ns.tools.check import about_cameras, about_photos, about_points
 from abcd_ns.tools.check.summary import Summary, print_summary, summarize
@@ -16,8 +17,6 @@ from abcd_ns.tools.json_option import check_json, write_report
 
 SCHEMA = 1
 """Of the JSON file; changes with its fields."""
-DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
-"""Training's option for what is --downscale here."""
 REFUSED = 2
 """Exit code where training would refuse the data."""
 
@@ -28,7 +27,8 @@ class Report:
 
     schema: int
     data: str
-    downscale: int
+    downscale: int | None
+    """As asked for; None leaves it to training."""
     summary: Summary | None
     """None where the data cannot be read."""
     findings: tuple[Finding, ...]
@@ -40,7 +40,7 @@ class Report:
         return any(finding.level == "error" for finding in self.findings)
 
 
-def check(*, data: Path, downscale: int = 1, json: Path | None = None) -> int:
+def check(*, data: Path, downscale: int | None = None, json: Path | None = None) -> int:
     """Examine a data set without training, and explain what is wrong or doubtful with it.
 
     Reads it as `ns-train abcd` does and refuses what that refuses, in the same words; then decodes every
@@ -49,13 +49,14 @@ def check(*, data: Path, downscale: int = 1, json: Path | None = None) -> int:
 
     Args:
         data: Folder with a COLMAP model or a transforms.json, and photos; as for `ns-train abcd --data`.
-        downscale: Divides the photos' width and height, as training's downscale-factor.
+        downscale: Divides the photos' width and height, as training's downscale-factor. Left out, it is chosen as
+            in training: no side is over 1600 px.
         json: Also write what was found into this file.
 
     Raises:
         UserError: an option is out of range, or the JSON file cannot be written.
     """
-    if downscale < 1:
+    if downscale is not None and downscale < 1:
         raise UserError(f"--downscale is {downscale}; it must be a whole number from 1.")
     check_json(json)
     report = examine(data, downscale)
@@ -68,7 +69,7 @@ def check(*, data: Path, downscale: int = 1, json: Path | None = None) -> int:
     return REFUSED if report.refused else 0
 
 
-def examine(data: Path, downscale: int = 1) -> Report:
+def examine(data: Path, downscale: int | None = None) -> Report:
     """Everything that can be said of a data set."""
     try:
         found = survey(data, downscale)
@@ -81,6 +82,7 @@ def examine(data: Path, downscale: int = 1) -> Report:
 def findings_of(found: Survey) -> list[Finding]:
     """What is wrong or doubtful with a scene that can be read: the reader's own notes, then all others."""
     findings = [Finding("warning", "input", note) for note in found.prepared.notes]
+    findings += [Finding("note", "input", note) for note in found.prepared.chosen]
     for look in (*about_photos.ALL, *about_cameras.ALL, *about_points.ALL):
         findings.extend(look(found))
     return findings
@@ -92,5 +94,5 @@ def _verdict(report: Report) -> str:
         return f"\nTraining cannot work with {data}: mend the errors first."
     if any(finding.level == "warning" for finding in report.findings):
         return f"\n{data} can be trained on; see whether the warnings matter to you."
-    reduced = f" {DOWNSCALE} {report.downscale}" if report.downscale > 1 else ""
+    reduced = f" {DOWNSCALE} {report.downscale}" if report.downscale else ""
     return f"\n{data} is fine: ns-train abcd --data {shlex.quote(data)}{reduced}"

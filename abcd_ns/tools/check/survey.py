@@ -65,7 +65,7 @@ class Survey:
         return self.prepared.points_in_model
 
 
-def survey(data: Path, downscale: int) -> Survey:
+def survey(data: Path, downscale: int | None) -> Survey:
     """Read a scene as training does, then look at every photo.
 
     Raises:

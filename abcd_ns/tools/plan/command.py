@@ -62,8 +62,7 @@ def plan(
 
     Args:
         data: the scene, as for `ns-train abcd --data`.
-        downscale: divides the photos' width and height; left out, photos are reduced to 1600 px at most, as
-            in training.
+        downscale: divides the photos' width and height; left out, no side is over 1600 px, as in training.
         blocks: number of blocks; 0 takes as few as the device's budget allows.
         device_budget_gb: memory of the device that training may take; 0 takes what is free.
         max_gaussians: limit on Gaussians in the whole scene; 0 is none, and five for each point are expected.
@@ -148,8 +147,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     owner = tree.assign(points)
     seen = _said(console, "Looking which view sees which block", lambda: views_of_blocks(tree, points, views))
     batch = views_per_step(training.batch, room.blocks, training.batch_limit)
-    levels = levels_of(room.blocks_at_the_end)
-    needs = DeviceNeeds(pixels, batch, training.sh_degree, training.crop_pixels, levels)
+    options = (training.sh_degree, training.crop_pixels, levels_of(room.blocks))
+    needs = DeviceNeeds(pixels, batch, *options)
     fullest = owner == owner.bincount(minlength=room.blocks).argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
