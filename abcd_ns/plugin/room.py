@@ -22,8 +22,6 @@ RAM_SHARE = 0.25
 """Of the machine's RAM, where the CPU is the device."""
 LEAST_BLOCK = 1_000
 """A block with room for fewer Gaussians is not worth a visit."""
-
-
 PICTURE_SHARE = 0.75
 """Of the budget, for a step's pictures at most; the rest is for Gaussians."""
 LEAST_CROP = 250_000

@@ -49,8 +49,8 @@ def check(*, data: Path, downscale: int | None = None, json: Path | None = None)
 
     Args:
         data: Folder with a COLMAP model or a transforms.json, and photos; as for `ns-train abcd --data`.
-        downscale: Divides the photos' width and height, as training's downscale-factor. Left out, it is chosen as
-            in training: no side is over 1600 px.
+        downscale: Divides the photos' width and height, as training's downscale-factor. Left out, no side is
+            over 1600 px, as in training.
         json: Also write what was found into this file.
 
     Raises:
