@@ -86,7 +86,7 @@ class Coordinator(StepDrawing):
     ) -> None:
         self.config, self.budget, self.scene, self.cache = config, budget, scene, cache
         self.params, self.optimizers = params, optimizers
-        self.views = {view.index: view for view in views}
+        self.views = {view.index: view for view in views}  # on the CPU, whatever the device
         self.device = torch.device(device)
         self.announce = Announcer()
         self.stopwatch = Stopwatch()

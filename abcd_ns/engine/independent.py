@@ -170,7 +170,8 @@ class IndependentCoordinator(Coordinator):
             index = sample.view.index
             region = self._regions[index][sample.crop.within(self._crops[index])]
             counts = (region.own | region.clear)[..., None].to(picture)
-            target = torch.where(region.clear[..., None], sample.background.to(photo), photo)
+            clear = region.clear[..., None].to(photo.device)
+            target = torch.where(clear, sample.background.to(photo), photo)
             shown.append(picture * counts)
             wanted.append(target * counts)
         return super().loss(batch, shown, wanted)

@@ -1,18 +1,15 @@
 """The gsplat backend's own logic (crops, frozen Gaussians, absgrad), with CPU stand-ins for the CUDA ops.
 
-The stand-ins are gsplat's torch twins where they exist, and a plain loop for compositing; the real kernels
-are compared under tests/gpu.
+The real kernels are compared under tests/gpu.
 """
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
-from gsplat.cuda import _torch_impl
 
 from abcd_ns.engine.density import DensityConfig, DensityControl
-from abcd_ns.engine.rasterizer import Shot, TorchRasterizer, ZWindow, gsplat_backend, self_check
+from abcd_ns.engine.rasterizer import Shot, TorchRasterizer, ZWindow, self_check
 from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
 from tests.engine.rasterizer_scenes import (
@@ -24,95 +21,16 @@ from tests.engine.rasterizer_scenes import (
     small_view,
     stacked,
 )
+from tests.reference.gsplat_stand_ins import lent
 
 VIEW = small_view(70, 45)
 
 
-def fake_projection(
-    means, covars, quats, scales, viewmats, Ks, width, height, near_plane, packed, calc_compensations
-):
-    assert covars is None
-    assert not packed
-    covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    options = {"near_plane": near_plane, "calc_compensations": calc_compensations}
-    return _torch_impl._fully_fused_projection(means, covars, viewmats, Ks, width, height, **options)
-
-
-def fake_harmonics(degree, dirs, coeffs, masks):
-    return torch.where(masks[..., None], _torch_impl._spherical_harmonics(degree, dirs, coeffs), 0.0)
-
-
-def fake_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
-    return _torch_impl._isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height)
-
-
-def fake_compositing(
-    means2d, conics, colors, opacities, width, height, tile_size, offsets, flatten_ids, absgrad=False
-):
-    """Tile by tile from the lists, as in CUDA."""
-    absolute = torch.zeros_like(means2d)
-    if absgrad:
-        means2d.register_hook(lambda _: setattr(means2d, "absgrad", absolute))
-    bounds = [*offsets.flatten().tolist(), flatten_ids.numel()]
-    rows = []
-    for row in range(offsets.shape[1]):
-        tiles = []
-        for col in range(offsets.shape[2]):
-            index = row * offsets.shape[2] + col
-            ids = flatten_ids[bounds[index] : bounds[index + 1]]
-            tiles.append(
-                fake_tile(
-                    means2d,
-                    absolute,
-                    conics,
-                    colors,
-                    opacities,
-                    ids,
-                    col * tile_size,
-                    row * tile_size,
-                    tile_size,
-                )
-            )
-        rows.append(torch.cat(tiles, dim=1))
-    image = torch.cat(rows, dim=0)[None, :height, :width]
-    return image[..., :-1], 1 - image[..., -1:]
-
-
-def add_absolute(total, grad):
-    total += grad.abs().sum(dim=(0, 1))
-
-
-def fake_tile(means2d, absolute, conics, colors, opacities, ids, x, y, size):
-    centers = torch.stack(torch.meshgrid(torch.arange(size), torch.arange(size), indexing="xy"), dim=-1) + 0.5
-    color, T, live = (
-        means2d.new_zeros((size, size, colors.shape[-1])),
-        means2d.new_ones((size, size)),
-        torch.ones(size, size).bool(),
-    )
-    for i in ids.tolist():
-        mean = means2d[0, i].expand(size, size, 2)
-        if mean.requires_grad:
-            mean.register_hook(partial(add_absolute, absolute[0, i]))
-        dx, dy = (mean - torch.tensor([x, y]) - centers).unbind(-1)
-        a, b, c = conics[0, i]
-        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        alpha = (opacities[0, i] * torch.exp(-sigma)).clamp_max(0.999)
-        alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0.0)
-        live = live & ~((T * (1 - alpha) <= 1e-4) & (alpha > 0))
-        alpha = torch.where(live, alpha, 0.0)
-        color, T = color + (alpha * T)[..., None] * colors[0, i], T * (1 - alpha)
-    return torch.cat((color, T[..., None]), dim=-1)
-
-
 @pytest.fixture
-def backend(monkeypatch):
+def backend():
     """A GsplatRasterizer on CPU stand-ins."""
-    monkeypatch.setattr(gsplat_backend, "fully_fused_projection", fake_projection)
-    monkeypatch.setattr(gsplat_backend, "spherical_harmonics", fake_harmonics)
-    monkeypatch.setattr(gsplat_backend, "isect_tiles", fake_tiles)
-    monkeypatch.setattr(gsplat_backend, "isect_offset_encode", _torch_impl._isect_offset_encode)
-    monkeypatch.setattr(gsplat_backend, "rasterize_to_pixels", fake_compositing)
-    return GsplatRasterizer()
+    with lent():
+        yield GsplatRasterizer()
 
 
 @pytest.mark.parametrize(

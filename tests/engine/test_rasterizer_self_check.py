@@ -120,3 +120,8 @@ def test_no_case_hangs_on_rounding(case, shift, window_side):
     draw = TorchRasterizer("never", window_side=window_side)
     found, expected = (values_and_gradients(draw, "cpu", case, s) for s in (shift, 0.0))
     assert max(errors(found, expected).values()) < TOLERANCE / 4
+
+
+def test_gradients_are_checked_where_they_are_switched_off():
+    with torch.no_grad():
+        assert self_check(TorchRasterizer("never"), "cpu") < 1e-6

@@ -20,11 +20,14 @@ __all__ = [
     "self_check",
 ]
 
+WITHOUT_GSPLAT = ("cpu", "mps")
+"""Types of devices."""
+
 
 def make_rasterizer(
     name: Literal["auto", "torch", "gsplat"], device: torch.device | str, *, compile: CompilePolicy = "auto"
 ) -> Rasterizer:
-    """The rasterizer called `name`; "auto" takes gsplat on CUDA devices and torch elsewhere.
+    """The rasterizer called `name`; "auto" takes gsplat where there may be kernels for it, else torch.
 
     gsplat's kernels are checked against the torch backend on a tiny scene first (see self_check).
 
@@ -32,13 +35,13 @@ def make_rasterizer(
         compile: passed to TorchRasterizer.
 
     Raises:
-        ValueError: gsplat was asked for on a device other than CUDA.
+        ValueError: gsplat was asked for on such a device.
         RuntimeError: gsplat's kernels do not agree with the torch backend.
     """
     device = torch.device(device)
-    if name == "torch" or (name == "auto" and device.type != "cuda"):
+    if name == "torch" or (name == "auto" and device.type in WITHOUT_GSPLAT):
         return TorchRasterizer(compile)
-    if device.type != "cuda":
+    if device.type in WITHOUT_GSPLAT:
         raise ValueError(
             f'The gsplat rasterizer needs a CUDA device, not "{device}"; set the rasterizer to "torch".'
         )

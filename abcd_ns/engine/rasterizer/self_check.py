@@ -37,7 +37,7 @@ def check_scene(device: torch.device | str) -> tuple[Gaussians, View]:
     K = torch.tensor([[32.0, 0.0, 19.5], [0.0, 30.0, 12.5], [0.0, 0.0, 1.0]])
     viewmat = torch.eye(4)
     viewmat[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
-    return gaussians.to(device=device, dtype=torch.float32), View(viewmat, K, WIDTH, HEIGHT).to(device)
+    return gaussians.to(device=device, dtype=torch.float32), View(viewmat, K, WIDTH, HEIGHT)
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,7 @@ def _loss(raster: Raster) -> Float[Tensor, ""]:
     return (planes * weights).sum()
 
 
+@torch.enable_grad()  # whoever evaluates or renders asks for the first picture without
 def values_and_gradients(
     rasterizer: Rasterizer, device: torch.device | str, case: Case, shift: float = 0.0
 ) -> dict[str, Tensor]:

@@ -1,0 +1,247 @@
+"""What training asks of an accelerator whatever its speed: launches, waits, copies; on a simulated one.
+
+    python -m benchmarks.device --blocks 1 8 --out device.json
+
+Trains a small procedural scene by the engine, with gsplat's rasterizer, on a device that is CPU memory (see
+tests/reference/simulated_device.py), and counts. Nothing is downloaded and no GPU is needed.
+
+What the figures mean: a wait is a point where the host can launch nothing before the device has done all
+that it was given, so each costs what the device has left to do; copies that block are waits, too. A launch is
+one operation of torch's, or one function of gsplat's, which may be several kernels on CUDA. Steps are those
+within a visit; what is done when a visit begins (survey, attach, layers) and ends (settle, commit) is counted
+apart, a visit at a time. Layer copies are those that are made while layers are kept and read back. Peak bytes
+are those of live tensors.
+
+What they do not mean: there are no seconds of an accelerator here, no speed of its memory, and no fraction of
+its cores that such small pictures would keep busy. Counts of waits and launches hardly depend on the scene's
+size; bytes do.
+"""
+
+import json
+import platform
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gsplat
+import torch
+import tyro
+
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.rasterizer import make_rasterizer
+from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.engine.visit import VisitLayers
+from tests.reference.device_counts import Counts
+from tests.reference.gsplat_stand_ins import lent
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
+from tests.reference.simulated_device import DEVICE, simulated_device
+
+ROOT = Path(__file__).resolve().parent.parent
+GROWS = DensityConfig(
+    refine_start=0.0, refine_stop=1.0, warmup_passes=1, refine_every=4, densify_grad_thresh=2e-4
+)
+"""Refines often, so that steps that do are among those counted."""
+MOST_PLACES = 12
+
+
+@dataclass
+class Args:
+    """What to train, and where to write."""
+
+    out: Path
+    """JSON is written there."""
+    blocks: tuple[int, ...] = (1, 8)
+    """A run with each of these."""
+    steps: int = 64
+    """Of each run."""
+    views: int = 8
+    """Training views."""
+    gaussians: int = 600
+    """To begin with."""
+    width: int = 64
+    """Of the pictures; three quarters of it high."""
+    seed: int = 0
+    """Of scene and run."""
+
+
+@dataclass
+class Tally:
+    """What is counted of one kind of work."""
+
+    times: int = 0
+    counts: Counts = field(default_factory=Counts)
+
+    def add(self, counts: Counts) -> None:
+        self.times += 1
+        self.counts = self.counts.plus(counts)
+
+    def each(self, unit: str) -> dict[str, float]:
+        """Means, each named for the `unit` that it is of."""
+        times, counts = max(self.times, 1), self.counts
+        values = {
+            "waits": counts.waited,
+            "copies_to_host": counts.copies_to_host,
+            "copies_to_device": counts.copies_to_device,
+            "bytes_to_host": counts.bytes_to_host,
+            "bytes_to_device": counts.bytes_to_device,
+            "launches": counts.launches,
+        }
+        return {f"{name}_per_{unit}": round(value / times, 2) for name, value in values.items()}
+
+
+class Watch:
+    """Sorts what the device counts: steps, visits' beginnings and ends, and layers."""
+
+    def __init__(self, counts: Counts) -> None:
+        self._counts = counts
+        self.steps, self.visits, self.layers = Tally(), Tally(), Tally()
+        self._drawing = False
+
+    @contextmanager
+    def layers_in(self) -> Iterator[None]:
+        """Count the copies that VisitLayers makes, whoever calls it."""
+        originals = VisitLayers._keep, VisitLayers._cached
+        VisitLayers._keep, VisitLayers._cached = map(self._counted, originals)
+        try:
+            yield
+        finally:
+            VisitLayers._keep, VisitLayers._cached = originals
+
+    def _counted(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def counted(*args: Any) -> Any:
+            before = self._counts.copy()
+            result = method(*args)
+            self.layers.add(self._counts.since(before))
+            return result
+
+        return counted
+
+    def take_step(self, coordinator: Coordinator, photos: Photos) -> None:
+        """A step of training; whatever a visit's beginning or end adds to it is that visit's."""
+        edges: list[Counts] = []
+        originals = coordinator._begin_visit, coordinator._end_visit
+
+        def apart(method: Callable[[], None]) -> None:
+            before = self._counts.copy()
+            method()
+            edges.append(self._counts.since(before))
+
+        coordinator._begin_visit, coordinator._end_visit = (
+            lambda: apart(originals[0]),
+            lambda: apart(originals[1]),
+        )
+        before = self._counts.copy()
+        train_step(coordinator, photos)
+        coordinator._begin_visit, coordinator._end_visit = originals
+        taken = self._counts.since(before)
+        for edge in edges:
+            taken = taken.since(edge)
+            self.visits.add(edge)
+        self.steps.add(taken)
+
+
+def scene(args: Args) -> tuple[Gaussians, list[View], Photos]:
+    """What a run begins with, and the photos of another scene to train it on."""
+    views = ring_of_views(args.views, width=args.width, height=3 * args.width // 4)
+    truth = random_gaussians(args.gaussians, seed=args.seed + 7, size=0.1)
+    return random_gaussians(args.gaussians, seed=args.seed + 1, size=0.08), views, Photos(truth, views)
+
+
+def run(args: Args, blocks: int, folder: Path) -> dict[str, Any]:
+    """Train once; what was counted."""
+    start, views, photos = scene(args)
+    began = time.perf_counter()
+    with simulated_device() as counts, lent():
+        rasterizer = make_rasterizer("auto", DEVICE)
+        options = {"steps": args.steps, "seed": args.seed, "density": GROWS, "bits": 16, "warmup": 0.0}
+        coordinator = make_coordinator(
+            folder, start, views, blocks=blocks, rasterizer=rasterizer, device=DEVICE, **options
+        )
+        watch = Watch(counts)
+        counts.reset_peak()
+        with watch.layers_in():
+            while not coordinator.finished:
+                watch.take_step(coordinator, photos)
+        visits = max(coordinator.state.visit, 1)
+        found = summary(watch, visits)
+        found |= {"gaussians": coordinator.count(), "views_in_a_step": coordinator.batch}
+        found |= {"peak_bytes": counts.peak_bytes, "ownership": coordinator._ownership}
+        coordinator.scene.store.close()
+    return {"blocks": blocks, **found, "host_seconds": round(time.perf_counter() - began, 1)}
+
+
+def summary(watch: Watch, visits: int) -> dict[str, Any]:
+    """Means by step and by visit, and where the steps' waits are."""
+    steps, at_edges, layers = watch.steps, Tally(visits, watch.visits.counts), watch.layers.counts
+    places = steps.counts.places.most_common(MOST_PLACES)
+    return {
+        "steps": steps.times,
+        "visits": visits,
+        **steps.each("step"),
+        **at_edges.each("visit"),
+        "layer_copies_per_visit": round((layers.copies_to_host + layers.copies_to_device) / visits, 2),
+        "waits_per_step_by_operation": by_step(steps.counts.waits.most_common(), steps.times),
+        "waits_per_step_by_place": by_step(places, steps.times),
+    }
+
+
+def by_step(counted: list[tuple[str, int]], steps: int) -> dict[str, float]:
+    """The same for each step."""
+    return {name: round(count / max(steps, 1), 2) for name, count in counted if count}
+
+
+def commit() -> str:
+    """Of the working tree; empty where there is no git."""
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+    except FileNotFoundError:
+        return ""
+
+
+COLUMNS = {
+    "waits_per_step": "waits",
+    "launches_per_step": "launches",
+    "copies_to_host_per_step": "copies to host",
+    "copies_to_device_per_step": "copies to device",
+    "bytes_to_device_per_step": "bytes to device",
+    "waits_per_visit": "waits a visit",
+    "layer_copies_per_visit": "layer copies a visit",
+}
+
+
+def table(runs: list[dict[str, Any]]) -> str:
+    """For the terminal: a step of each run, and a visit's beginning and end."""
+    names = [f"{each['blocks']} block{'s' * (each['blocks'] > 1)}" for each in runs]
+    lines = ["| a step | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(runs)]
+    for key, title in COLUMNS.items():
+        lines.append(f"| {title} | " + " | ".join(f"{each[key]:,.1f}" for each in runs) + " |")
+    return "\n".join(lines)
+
+
+def main(args: Args) -> None:
+    """Run all, print the table, write the JSON."""
+    runs = []
+    for blocks in args.blocks:
+        with tempfile.TemporaryDirectory() as folder:
+            runs.append(run(args, blocks, Path(folder)))
+    print(table(runs))
+    for each in runs:
+        print(f"\nWaits of a step with {each['blocks']}: {each['waits_per_step_by_operation']}")
+        print(f"at: {each['waits_per_step_by_place']}")
+    versions = {"torch": torch.__version__, "gsplat": gsplat.__version__, "python": platform.python_version()}
+    scene_of = {"views": args.views, "width": args.width, "gaussians": args.gaussians, "seed": args.seed}
+    result = {"runs": runs, "scene": scene_of, "versions": versions, "commit": commit()}
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,82 @@
+"""What is counted on a simulated accelerator."""
+
+import sys
+from collections import Counter
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+from torch import Tensor
+
+PACKAGE = str(Path(__file__).resolve().parents[2] / "abcd_ns")
+
+
+@dataclass
+class Counts:
+    """What happened on the device."""
+
+    launches: int = 0
+    """Operations that ran there."""
+    copies_to_host: int = 0
+    """Of tensors; values that are read one by one are waits alone."""
+    bytes_to_host: int = 0
+    copies_to_device: int = 0
+    bytes_to_device: int = 0
+    live_bytes: int = 0
+    """Of all tensors that are there now."""
+    peak_bytes: int = 0
+    """The most that were there at once."""
+    waits: Counter[str] = field(default_factory=Counter)
+    """Points where the host waits for all that it has launched, by operation. Copies from and to pageable
+    memory are among them, unless they go to the device and are called with `non_blocking`."""
+    places: Counter[str] = field(default_factory=Counter)
+    """The same by the package's line that waits."""
+
+    @property
+    def waited(self) -> int:
+        """Waits of all kinds."""
+        return sum(self.waits.values())
+
+    def copy(self) -> "Counts":
+        """What is counted so far."""
+        return self.since(Counts())
+
+    def since(self, earlier: "Counts") -> "Counts":
+        """What came after `earlier`; of the bytes that are there, this moment's."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        less = {
+            n: v - getattr(earlier, n) for n, v in values.items() if n not in ("live_bytes", "peak_bytes")
+        }
+        return Counts(**{**values, **less})
+
+    def plus(self, other: "Counts") -> "Counts":
+        """Both together; the larger peak."""
+        names = [f.name for f in fields(self) if f.name not in ("live_bytes", "peak_bytes")]
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        return Counts(**sums, live_bytes=other.live_bytes, peak_bytes=max(self.peak_bytes, other.peak_bytes))
+
+    def reset_peak(self) -> None:
+        """Count the peak anew from here."""
+        self.peak_bytes = self.live_bytes
+
+    def wait(self, why: str) -> None:
+        """The host waits."""
+        self.waits[why] += 1
+        self.places[_place()] += 1
+
+    def move(self, tensor: Tensor, *, to_device: bool, blocks: bool = True) -> None:
+        """A tensor is copied between host and device."""
+        way = "to_device" if to_device else "to_host"
+        setattr(self, f"copies_{way}", getattr(self, f"copies_{way}") + 1)
+        setattr(self, f"bytes_{way}", getattr(self, f"bytes_{way}") + tensor.numel() * tensor.element_size())
+        if blocks:
+            self.wait(f"copy {way}".replace("_", " "))
+
+
+def _place() -> str:
+    """The innermost line of the package that is being run."""
+    frame = sys._getframe(2)
+    while frame is not None:
+        if frame.f_code.co_filename.startswith(PACKAGE):
+            return f"{frame.f_code.co_filename[len(PACKAGE) + 1 :]}:{frame.f_lineno}"
+        frame = frame.f_back
+    return "elsewhere"

@@ -1,0 +1,332 @@
+"""gsplat 1.4.0's CUDA functions in torch, under the names and signatures of `gsplat.cuda._wrapper`.
+
+    with lent():
+        GsplatRasterizer()...  # on CPU tensors, or on the simulated device, where each counts as one launch
+
+Gradients are right, `absgrad` included. As in CUDA, what is not drawn is left uninitialised: it is NaN here.
+Only what this package uses is there: no packed layouts, no masks, no backgrounds.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from gsplat.cuda import _torch_impl
+from torch import Tensor
+
+from tests.reference.simulated_device import kernel
+
+PAIRS_AT_ONCE = 4096
+"""(Gaussian, tile) pairs that are composited together, unless a tile has more: bounds memory."""
+LOG_STOP = math.log(1e-4)
+"""Of the transmittance at which drawing stops."""
+NAMES = (
+    "fully_fused_projection",
+    "isect_offset_encode",
+    "isect_tiles",
+    "rasterize_to_pixels",
+    "spherical_harmonics",
+)
+"""What is stood in for."""
+
+
+class _Differentiable(torch.autograd.Function):
+    """A kernel, and another for its gradient: torch's own of the same computation, which is done again."""
+
+    @staticmethod
+    def forward(ctx: Any, compute: Callable[..., Any], *tensors: Tensor) -> Any:
+        ctx.compute = compute
+        ctx.save_for_backward(*tensors)
+        results = tuple(kernel(compute, *tensors))
+        whole = [x for x in results if not x.is_floating_point()]
+        ctx.mark_non_differentiable(*whole)
+        return results
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor | None) -> Any:
+        inputs, wanted = ctx.saved_tensors, ctx.needs_input_grad[1:]
+        given = [g for g in upstream if g is not None and g.is_floating_point()]
+
+        def gradient(*tensors: Tensor) -> list[Tensor]:
+            leaves = [x.detach().requires_grad_(w) for x, w in zip(tensors, wanted, strict=False)]
+            with torch.enable_grad():
+                results = [x for x in ctx.compute(*leaves) if x.is_floating_point()]
+            asked = [x for x in leaves if x.requires_grad]
+            return torch.autograd.grad(results, asked, tensors[len(leaves) :], materialize_grads=True)
+
+        found = iter(kernel(gradient, *inputs, *given))
+        return None, *(next(found) if w else None for w in wanted)
+
+
+def fully_fused_projection(
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    packed: bool = False,
+    sparse_grad: bool = False,
+    calc_compensations: bool = False,
+    camera_model: str = "pinhole",
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+    """radii [C, N], means2d [C, N, 2], depths [C, N], conics [C, N, 3], compensations [C, N] or None."""
+    assert covars is None
+    assert not packed
+    assert not sparse_grad
+    assert radius_clip == 0
+    assert camera_model == "pinhole"
+    options = {"eps2d": eps2d, "near_plane": near_plane, "far_plane": far_plane}
+
+    def project(rows: slice | Tensor, means: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+        quats, scales, viewmat, K = others
+        covars, _ = _torch_impl._quat_scale_to_covar_preci(quats[rows], scales[rows], compute_preci=False)
+        return _torch_impl._fully_fused_projection(
+            means[rows], covars, viewmat[None], K[None], width, height, **options, calc_compensations=True
+        )
+
+    def _project(
+        means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor
+    ) -> Sequence[Tensor]:
+        cameras = []
+        for viewmat, K in zip(viewmats, Ks, strict=True):
+            inputs = means, quats, scales, viewmat, K
+            with torch.no_grad():
+                radii = project(slice(None), *inputs)[0][0]
+            drawn = (radii > 0).nonzero()[:, 0]
+            # Those alone: what is not drawn has no gradient, not even one of 0 times infinity.
+            values = (value[0] for value in project(drawn, *inputs)[1:])
+            empty = [means.new_full((len(means), *size), torch.nan) for size in ((2,), (), (3,))]
+            empty.append(means.new_zeros(len(means)))  # gsplat initialises these alone
+            cameras.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=True))])
+        return [torch.stack(values) for values in zip(*cameras, strict=True)]
+
+    radii, means2d, depths, conics, compensations = _Differentiable.apply(
+        _project, means, quats, scales, viewmats, Ks
+    )
+    return radii, means2d, depths, conics, compensations if calc_compensations else None
+
+
+def spherical_harmonics(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
+) -> Tensor:
+    """Colours [..., 3] without the offset of 0.5."""
+
+    def _harmonics(dirs: Tensor, coeffs: Tensor, *masks: Tensor) -> tuple[Tensor]:
+        colors = _torch_impl._spherical_harmonics(degrees_to_use, dirs, coeffs)
+        return (torch.where(masks[0][..., None], colors, torch.nan) if masks else colors,)
+
+    tensors = (dirs, coeffs) if masks is None else (dirs, coeffs, masks)
+    return _Differentiable.apply(_harmonics, *tensors)[0]
+
+
+@torch.no_grad()
+def isect_tiles(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    sort: bool = True,
+    packed: bool = False,
+    n_cameras: int | None = None,
+    camera_ids: Tensor | None = None,
+    gaussian_ids: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """tiles per Gaussian [C, N], isect_ids [pairs] (camera | tile << 32 | bits of the depth), flatten_ids."""
+    assert not packed
+    assert n_cameras is camera_ids is gaussian_ids is None
+    most = torch.tensor([tile_width, tile_height])
+
+    def _isect_tiles(means2d: Tensor, radii: Tensor, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        drawn, reach = radii > 0, radii[..., None].to(means2d)
+        middle = torch.where(drawn[..., None], means2d, 0.0)
+        first = ((middle - reach) / tile_size).floor().clamp_min(0).minimum(most).long()
+        end = ((middle + reach) / tile_size).ceil().clamp_min(0).minimum(most).long()
+        size = (end - first) * drawn[..., None]
+        counts = size.prod(dim=-1)
+        flatten_ids = torch.repeat_interleave(counts.flatten())
+        place = torch.arange(len(flatten_ids)) - (counts.flatten().cumsum(0) - counts.flatten())[flatten_ids]
+        (x, y), width = first.flatten(0, -2)[flatten_ids].T, size[..., 0].flatten()[flatten_ids]
+        tile = (y + place // width.clamp_min(1)) * tile_width + x + place % width.clamp_min(1)
+        bits = depths.float().flatten()[flatten_ids].view(torch.int32).long()
+        camera = (flatten_ids // radii.shape[1]) << _bits(tile_width, tile_height)
+        isect_ids = (camera | tile) << 32 | bits
+        if sort:
+            isect_ids, order = isect_ids.sort(stable=True)
+            flatten_ids = flatten_ids[order]
+        return counts.int(), isect_ids, flatten_ids.int()
+
+    return kernel(_isect_tiles, means2d, radii, depths, waits=1)
+
+
+def _bits(tile_width: int, tile_height: int) -> int:
+    """Of a tile's number."""
+    return (tile_width * tile_height).bit_length()
+
+
+@torch.no_grad()
+def isect_offset_encode(isect_ids: Tensor, n_cameras: int, tile_width: int, tile_height: int) -> Tensor:
+    """Where each tile's pairs begin in a sorted list: int32 [C, tile_height, tile_width]."""
+
+    def _offsets(isect_ids: Tensor) -> Tensor:
+        tiles = torch.arange(tile_width * tile_height)
+        cameras = torch.arange(n_cameras)[:, None] << _bits(tile_width, tile_height)
+        found = torch.searchsorted(isect_ids >> 32, cameras | tiles)
+        return found.view(n_cameras, tile_height, tile_width).int()
+
+    return kernel(_offsets, isect_ids)
+
+
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    masks: Tensor | None = None,
+    packed: bool = False,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Colours [C, h, w, channels] and alphas [C, h, w, 1], from any lists of pairs."""
+    assert backgrounds is None
+    assert masks is None
+    assert not packed
+    assert isect_offsets.shape[1] * tile_size >= image_height
+    assert isect_offsets.shape[2] * tile_size >= image_width
+    size = image_width, image_height, tile_size
+    tensors = means2d, conics, colors, opacities, isect_offsets, flatten_ids
+    image = _Rasterize.apply(size, absgrad, *tensors)
+    return image[..., :-1], image[..., -1:]
+
+
+class _Rasterize(torch.autograd.Function):
+    """Composites tiles, some of them at a time, and does so again for the gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, size: tuple[int, int, int], absgrad: bool, *tensors: Tensor) -> Tensor:
+        ctx.size, ctx.absgrad = size, absgrad
+        ctx.save_for_backward(*tensors)
+
+        def _rasterize(*tensors: Tensor) -> Tensor:
+            parts = [_tiles(p, b, tensors, size[2])[0] for p, b in _parts(*tensors[4:])]
+            return _image(torch.cat(parts), tensors[4], size).to(tensors[2])
+
+        return kernel(_rasterize, *tensors)
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> Any:
+        means2d = ctx.saved_tensors[0]
+        *gradients, absolute = kernel(partial(_gradients, ctx.size), *ctx.saved_tensors, upstream)
+        if ctx.absgrad:
+            means2d.absgrad = absolute
+        return None, None, *gradients, None, None
+
+
+def _parts(offsets: Tensor, flatten_ids: Tensor) -> Iterator[tuple[range, list[int]]]:
+    """Tiles that are composited together, and where the pairs of each begin; their end last."""
+    starts = [*offsets.flatten().tolist(), len(flatten_ids)]
+    first = 0
+    for tile in range(len(starts) - 1):
+        if tile + 2 == len(starts) or starts[tile + 2] - starts[first] > PAIRS_AT_ONCE:
+            yield range(first, tile + 1), starts[first : tile + 2]
+            first = tile + 1
+
+
+def _tiles(
+    tiles: range, starts: list[int], tensors: Sequence[Tensor], side: int, wants_gradient: bool = False
+) -> tuple[Tensor, list[Tensor], Tensor]:
+    """Composite some tiles: [tiles, side * side, channels + 1], alpha last.
+
+    Returns:
+        The picture, the values of each pair that it is made of ([pairs, pixels, 2] for the distances from the
+        mean), and the row of each pair's Gaussian.
+    """
+    means2d, conics, colors, opacities, offsets, flatten_ids = tensors
+    rows = flatten_ids[starts[0] : starts[-1]].long()
+    counts = torch.tensor(starts).diff()
+    tile = torch.repeat_interleave(counts)
+    first = torch.tensor(starts)[:-1] - starts[0]
+    number = torch.arange(tiles.start, tiles.stop)[tile] % (offsets.shape[1] * offsets.shape[2])
+    origin = torch.stack((number % offsets.shape[2], number // offsets.shape[2]), dim=1) * side
+    pixel = torch.arange(side * side)
+    centers = torch.stack((pixel % side, pixel // side), dim=1) + 0.5
+    # float64: transmittances are differences of logarithms, summed over all tiles.
+    values = [x.detach().flatten(0, 1)[rows].double() for x in (means2d, conics, colors, opacities)]
+    values[0] = (values[0] - origin)[:, None] - centers
+    values = [x.requires_grad_(wants_gradient) for x in values]
+    (dx, dy), (a, b, c) = values[0].unbind(2), values[1][:, None].unbind(2)
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = (values[3][:, None] * torch.exp(-sigma)).clamp_max(0.999)
+    alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0.0)
+    through = torch.log1p(-alpha)
+    behind = torch.cat((through.new_zeros(1, side * side), through.cumsum(0)))
+    before = behind[:-1] - behind[first][tile]
+    after = before + through
+    weight = torch.where(after > LOG_STOP, alpha * before.exp(), 0.0)
+    drawn = torch.cat((values[2], torch.ones_like(values[3])[:, None]), dim=1)
+    image = drawn.new_zeros(len(tiles), side * side, drawn.shape[1])
+    return image.index_add(0, tile, weight[..., None] * drawn[:, None]), values, rows
+
+
+def _image(tiles: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
+    """[C, h, w, channels] from [tiles, side * side, channels]."""
+    (width, height, side), (cameras, rows, cols) = size, offsets.shape
+    image = tiles.view(cameras, rows, cols, side, side, -1).transpose(2, 3).flatten(3, 4).flatten(1, 2)
+    return image[:, :height, :width].contiguous()
+
+
+def _by_tiles(image: Tensor, offsets: Tensor, side: int) -> Tensor:
+    """The inverse of _image; 0 beyond the image."""
+    cameras, rows, cols = offsets.shape
+    whole = image.new_zeros(cameras, rows * side, cols * side, image.shape[-1])
+    whole[:, : image.shape[1], : image.shape[2]] = image
+    return (
+        whole.view(cameras, rows, side, cols, side, -1)
+        .transpose(2, 3)
+        .reshape(-1, side * side, image.shape[-1])
+    )
+
+
+def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
+    """Of means2d, conics, colours and opacities, and the sum of the means' absolute ones over pixels."""
+    *inputs, offsets, _, upstream = tensors
+    upstream = _by_tiles(upstream, offsets, size[2]).double()
+    sums = [torch.zeros_like(x.flatten(0, 1), dtype=torch.float64) for x in (*inputs, inputs[0])]
+    for tiles, starts in _parts(*tensors[4:6]):
+        with torch.enable_grad():
+            picture, values, rows = _tiles(tiles, starts, tensors[:6], size[2], wants_gradient=True)
+            found = torch.autograd.grad(picture, values, upstream[tiles.start : tiles.stop])
+        for total, part in zip(sums, (found[0].sum(1), *found[1:], found[0].abs().sum(1)), strict=True):
+            total.index_add_(0, rows, part)
+    return [total.view_as(x).to(x) for total, x in zip(sums, (*inputs, inputs[0]), strict=True)]
+
+
+@contextmanager
+def lent() -> Iterator[None]:
+    """Within, the package's modules call the stand-ins, where they call gsplat's functions by name."""
+    import abcd_ns.engine.rasterizer.gsplat_backend  # noqa: F401 - so that it is among the modules
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in [m for n, m in sys.modules.items() if n.startswith("abcd_ns.engine.rasterizer")]:
+            for name in NAMES:
+                if hasattr(module, name):
+                    patch.setattr(module, name, globals()[name])
+        yield

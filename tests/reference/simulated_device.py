@@ -1,0 +1,332 @@
+"""A simulated accelerator: CPU memory behind a device of its own, for machines without a GPU.
+
+    with simulated_device() as counts:
+        x = torch.zeros(3, device=DEVICE)
+        x + torch.zeros(3)  # RuntimeError, as on CUDA: the tensors are on different devices
+    counts.launches, counts.waited, counts.copies_to_host, counts.peak_bytes, ...
+
+Tensors on `DEVICE` cannot be mixed with CPU tensors where CUDA would refuse it, through autograd, optimizers
+and custom functions alike; what costs time on any accelerator is counted: operations launched, points where
+the host waits for the device, and copies between the two. It says nothing about seconds. An operation is one
+launch here, whatever number of kernels CUDA would take for it, and views are none. `live_bytes` are those of
+the tensors alone: no allocator's rounding and reserve, and no memory that a CUDA kernel takes for itself.
+
+Kernels that exist for CUDA only are stood in for by functions under `kernel`, see gsplat_stand_ins. Random
+numbers on the device come from the CPU's generator.
+
+Built on `torch.utils.backend_registration._setup_privateuseone_for_python_backend`, which torch 2.11 calls
+experimental.
+"""
+
+import functools
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+
+from tests.reference.device_counts import Counts
+
+_setup_privateuseone_for_python_backend("simulated")
+DEVICE = torch.device("simulated", 0)
+# Asked for wherever torch.autocast is named, though it be disabled.
+torch.get_device_module(DEVICE).get_amp_supported_dtype = lambda: [torch.float16, torch.bfloat16]
+
+WAITS = {
+    "_linalg_check_errors",
+    "_local_scalar_dense",
+    "_unique2",
+    "bincount",
+    "equal",
+    "masked_select",
+    "multinomial",
+    "nonzero",
+    "unique_consecutive",
+    "unique_dim",
+}
+"""Operations that the host cannot go on from before it has seen a result: a value, or how large it is."""
+INDEXING = {"_index_put_impl_", "_unsafe_index", "index", "index_put", "index_put_"}
+TAKES_CPU_SCALARS = {*INDEXING, "fill_", "fill", "masked_fill", "masked_fill_"}
+"""Operations, beside the pointwise ones, whose operands may be 0-dimensional CPU tensors. A fused Adam is
+none: its kernel reads `step` by address."""
+ALLOCATES = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided"}
+
+
+_counts = Counts()
+_storages: dict[int, weakref.ref] = {}
+
+
+def _hold(inner: Tensor) -> None:
+    """Count the memory behind a tensor on the device, once for all of its views."""
+    storage = inner.untyped_storage()
+    key, size = storage._cdata, storage.nbytes()
+    if key in _storages or size == 0:
+        return
+
+    def release(_: weakref.ref) -> None:
+        del _storages[key]
+        _counts.live_bytes -= size
+
+    _storages[key] = weakref.ref(storage, release)
+    _counts.live_bytes += size
+    _counts.peak_bytes = max(_counts.peak_bytes, _counts.live_bytes)
+
+
+class OnDevice(torch.Tensor):
+    """A tensor that says it is on the device and keeps its values in a CPU tensor, `inner`."""
+
+    @staticmethod
+    def __new__(cls, inner: Tensor) -> "OnDevice":
+        made = torch.Tensor._make_wrapper_subclass(
+            cls,
+            inner.size(),
+            strides=inner.stride(),
+            storage_offset=inner.storage_offset(),
+            dtype=inner.dtype,
+            layout=inner.layout,
+            device=DEVICE,
+        )
+        made.inner = inner
+        _hold(inner)
+        return made
+
+    def __init__(self, inner: Tensor) -> None: ...
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    def __repr__(self) -> str:
+        return f"{self.inner!r} on {DEVICE}"
+
+    def __reduce_ex__(self, protocol: int) -> Any:
+        return self.detach().cpu().__reduce_ex__(protocol)
+
+    # Calls that torch's own bindings would not let reach dispatch.
+
+    @property
+    def data(self) -> Tensor:
+        return torch.Tensor.data.__get__(self)
+
+    @data.setter
+    def data(self, value: Tensor) -> None:
+        torch.Tensor.data.__set__(self, value)
+        self.inner = _inner(value)
+        _hold(self.inner)
+
+    def tolist(self) -> Any:
+        return self.detach().cpu().tolist()
+
+    def numpy(self, *_: Any, **__: Any) -> Any:
+        raise TypeError(f"can't convert {DEVICE} device type tensor to numpy; use Tensor.cpu() first")
+
+    __array__ = numpy
+
+    def new_tensor(self, data: Any, *, device: Any = DEVICE, dtype: Any = None, **options: Any) -> Tensor:
+        return torch.tensor(data, dtype=dtype or self.dtype, **options).to(device)
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        return _run(func, args, kwargs or {})
+
+
+@dataclass(frozen=True)
+class _Traits:
+    """What matters about an operation."""
+
+    name: str
+    launches: bool
+    takes_cpu_scalars: bool
+
+
+@functools.cache
+def _traits(func: Any) -> _Traits:
+    name = func._schema.name.removeprefix("aten::")
+    pointwise = torch.Tag.pointwise in func.tags
+    return _Traits(name, not func.is_view and name not in ALLOCATES, pointwise or name in TAKES_CPU_SCALARS)
+
+
+def _inner(value: Any) -> Any:
+    return value.inner if isinstance(value, OnDevice) else value
+
+
+def _map(function: Callable[[Any], Any], value: Any) -> Any:
+    """`value` with `function` of each tensor in it; arguments of operations are no deeper than lists."""
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, (list, tuple)):
+        return type(value)(_map(function, x) for x in value)
+    return value
+
+
+def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, (list, tuple)):
+            yield from _tensors(value)
+
+
+def _is_device(device: Any) -> bool:
+    return device is not None and torch.device(device).type == DEVICE.type
+
+
+def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """An operation as torch dispatches it, on CPU tensors, on device tensors, or between them."""
+    traits = _traits(func)
+    if traits.name == "_to_copy":
+        return _to_copy(func, args[0], **kwargs)
+    if traits.name == "copy_" and isinstance(args[0], OnDevice) != isinstance(args[1], OnDevice):
+        to_device = isinstance(args[0], OnDevice)
+        _counts.move(args[1], to_device=to_device, blocks=not (to_device and _non_blocking(args, kwargs)))
+        func(_inner(args[0]), _inner(args[1]), *args[2:], **kwargs)
+        return args[0]
+    tensors = [*_tensors(args), *_tensors(kwargs.values())]
+    here = [x for x in tensors if isinstance(x, OnDevice)]
+    if not here and not _is_device(kwargs.get("device")):
+        return func(*args, **kwargs)
+    _check_places(traits, tensors, here)
+    _check_generator(kwargs.get("generator"))
+    _counts.launches += traits.launches
+    if _waits(traits.name, args, kwargs):
+        _counts.wait(traits.name)
+    if kwargs.get("device") is not None:
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    result = func(*_map(_inner, args), **{name: _map(_inner, value) for name, value in kwargs.items()})
+    return _wrapped(result, here)
+
+
+def _non_blocking(args: Any, kwargs: dict[str, Any]) -> bool:
+    return bool(args[2] if len(args) > 2 else kwargs.get("non_blocking", False))
+
+
+def _wrapped(result: Any, given: list[OnDevice]) -> Any:
+    """Results on the device; operations in place give back what they were given."""
+    known = {id(x.inner): x for x in given}
+
+    def wrap(value: Tensor) -> Tensor:
+        found = known.get(id(value))
+        if found is None:
+            return OnDevice(value)
+        if found.shape != value.shape or found.stride() != value.stride():
+            raise NotImplementedError("the simulated device has no operations that change a shape in place")
+        return found
+
+    return _map(wrap, result)
+
+
+def _check_places(traits: _Traits, tensors: list[Tensor], here: list[OnDevice]) -> None:
+    """Refuse what CUDA would refuse.
+
+    Raises:
+        RuntimeError: some tensors are on the CPU that must be on the device.
+    """
+    for x in tensors:
+        if isinstance(x, OnDevice):
+            continue
+        if traits.name in INDEXING and not x.dtype.is_floating_point and here:
+            _counts.move(x, to_device=True)  # indices are copied to where they are needed
+        elif x.dim() > 0 or not traits.takes_cpu_scalars:
+            shapes = [(str(t.device), tuple(t.shape)) for t in tensors]
+            raise RuntimeError(
+                f"Expected all tensors to be on the same device: aten::{traits.name} of {shapes}"
+            )
+
+
+def _check_generator(generator: torch.Generator | None) -> None:
+    if generator is not None:
+        raise RuntimeError(
+            f"Expected a '{DEVICE.type}' device type for generator but found '{generator.device}'"
+        )
+
+
+def _waits(name: str, args: Any, kwargs: dict[str, Any]) -> bool:
+    if name == "repeat_interleave":
+        return kwargs.get("output_size") is None
+    if name in INDEXING:
+        by_mask = any(x is not None and x.dtype == torch.bool for x in args[1])
+        fills = name != "index" and len(args) > 2 and args[2].numel() == 1  # runs as masked_fill does
+        return by_mask and not fills
+    return name in WAITS
+
+
+def _to_copy(
+    func: Any, source: Tensor, device: Any = None, non_blocking: bool = False, **rest: Any
+) -> Tensor:
+    copied = func(_inner(source), **rest)
+    to_device = isinstance(source, OnDevice) if device is None else _is_device(device)
+    if to_device != isinstance(source, OnDevice):
+        _counts.move(copied, to_device=to_device, blocks=not (to_device and non_blocking))
+    elif to_device:
+        _counts.launches += 1
+    return OnDevice(copied) if to_device else copied
+
+
+def kernel(compute: Callable[..., Any], *tensors: Tensor, waits: int = 0) -> Any:
+    """Run `compute` on the values of `tensors` as if it were one kernel of the device.
+
+    On CPU tensors it just runs: then nothing is counted.
+
+    Args:
+        tensors: all on the device, or none.
+        waits: points in it where the host waits.
+    """
+    here = [x for x in tensors if isinstance(x, OnDevice)]
+    if not here:
+        return compute(*tensors)
+    if len(here) < len(tensors):
+        shapes = [(str(t.device), tuple(t.shape)) for t in tensors]
+        raise RuntimeError(f"a kernel was given the address of a tensor of the host: {shapes}")
+    _counts.launches += 1
+    for _ in range(waits):
+        _counts.wait(compute.__name__.strip("_"))
+    with _disable_current_modes():
+        result = compute(*(x.inner for x in here))
+    return _map(OnDevice, result)
+
+
+# Below Python's dispatch (torch.tensor, another thread) torch asks the backend itself.
+_library = torch.library.Library("aten", "IMPL")
+
+
+def _empty(size: Any, *_: Any, dtype: torch.dtype | None = None, **__: Any) -> OnDevice:
+    return OnDevice(torch.empty(size, dtype=dtype))
+
+
+def _empty_strided(size: Any, stride: Any, dtype: torch.dtype | None = None, **_: Any) -> OnDevice:
+    return OnDevice(torch.empty_strided(size, stride, dtype=dtype))
+
+
+def _copy_from(source: Tensor, target: Tensor, non_blocking: bool = False) -> Tensor:
+    if isinstance(source, OnDevice) != isinstance(target, OnDevice):
+        to_device = isinstance(target, OnDevice)
+        _counts.move(source, to_device=to_device, blocks=not (to_device and non_blocking))
+    _inner(target).copy_(_inner(source))
+    return target
+
+
+for _name, _function in (
+    ("empty.memory_format", _empty),
+    ("empty_strided", _empty_strided),
+    ("_copy_from", _copy_from),
+):
+    _library.impl(_name, _function, "PrivateUse1")
+
+
+class _Dispatch(TorchDispatchMode):
+    """Operations that begin without a tensor on the device."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        return _run(func, args, kwargs or {})
+
+
+@contextmanager
+def simulated_device() -> Iterator[Counts]:
+    """Tensors may be put on `DEVICE` within; gives what is counted meanwhile, and goes on being counted."""
+    global _counts
+    _counts = Counts(live_bytes=_counts.live_bytes, peak_bytes=_counts.live_bytes)
+    with torch.autograd.set_multithreading_enabled(False), _Dispatch():
+        yield _counts

@@ -1,0 +1,206 @@
+"""Whole trainings by the engine on the simulated device: whatever is on the wrong side raises."""
+
+import math
+
+import pytest
+import torch
+
+from abcd_ns.engine.block_state import MOMENTS
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import BlockSplit, VisitEnded
+from abcd_ns.engine.exact import ExactCoordinator
+from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
+from abcd_ns.engine.painter import Painter, PaintSettings
+from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer
+from abcd_ns.engine.training_loop import train
+from abcd_ns.engine.types import Gaussians
+from tests.reference.scenes import make_coordinator, whole_scene
+from tests.reference.simulated_device import DEVICE
+
+OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "warmup_passes": 1, "refine_every": 3}
+GROWING = DensityConfig(**OFTEN, densify_grad_thresh=2e-4, reset_every=6)
+MCMC = DensityConfig(**OFTEN, strategy="mcmc", max_gaussians=160)
+
+pytestmark = pytest.mark.usefixtures("simulated_gsplat")
+
+
+def on_device(folder, start, views, rasterizer="auto", **options):
+    """A coordinator on the simulated device, with gsplat unless told otherwise."""
+    draws = TorchRasterizer("never") if rasterizer == "torch" else make_rasterizer(rasterizer, DEVICE)
+    return make_coordinator(folder, start, views, device=DEVICE, rasterizer=draws, **options)
+
+
+def losses_of(scene: Gaussians, views, photos) -> float:
+    draw = TorchRasterizer("never")
+    with torch.no_grad():
+        pictures = [draw(scene, v, sh_degree=scene.sh_degree).color.clamp(0, 1) for v in views]
+    return sum(
+        float((p - photos.images[v.index]).square().mean()) for p, v in zip(pictures, views, strict=True)
+    )
+
+
+def assert_on_device(coordinator) -> None:
+    """The live block is all there: parameters, moments, and Adam's steps."""
+    for name, parameter in coordinator.params.items():
+        state = coordinator.optimizers[name].state[parameter]
+        assert {parameter.device, *(state[key].device for key in ("step", *MOMENTS))} == {DEVICE}
+
+
+@pytest.mark.parametrize("layers", [True, False], ids=["layers", "ablated"])
+@pytest.mark.parametrize("density", [GROWING, MCMC], ids=["default", "mcmc"])
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_blocks_are_trained(tmp_path, start, views, photos, blocks, density, layers):
+    if blocks == 1 and not layers:
+        pytest.skip("with one block there are no layers")
+    steps = 8 if blocks == 1 else 16  # so that something grows
+    coordinator = on_device(
+        tmp_path, start, views, blocks=blocks, steps=steps, density=density, layers=layers
+    )
+    train(coordinator, photos, steps=3)
+    assert_on_device(coordinator)
+    train(coordinator, photos)
+    scene = whole_scene(coordinator)
+    assert coordinator.state.step == steps
+    assert len(scene) != len(start)
+    assert all(bool(value.isfinite().all()) for _, value in scene.items())
+
+
+@pytest.mark.parametrize("ownership", ["means", "fragments"])
+def test_the_torch_rasterizer_trains_there_too(tmp_path, start, views, photos, ownership):
+    coordinator = on_device(tmp_path, start, views, "torch", blocks=2, steps=2, ownership=ownership)
+    train(coordinator, photos)
+    assert coordinator.state.step == 2
+
+
+def test_both_rasterizers_train_alike(tmp_path, start, views, photos):
+    """On the device with gsplat, on the device with torch, and on the CPU: the same to rounding."""
+    scenes = []
+    for name, make in (("auto", on_device), ("torch", on_device), (None, make_coordinator)):
+        folder = tmp_path / str(name)
+        folder.mkdir()
+        options = {"rasterizer": name} if name else {}
+        options |= {"density": DensityConfig(strategy="off"), "ownership": "means"}
+        coordinator = make(folder, start, views, blocks=2, steps=3, **options)
+        train(coordinator, photos)
+        scenes.append(whole_scene(coordinator))
+    for other in scenes[:2]:
+        assert all(
+            torch.allclose(value, getattr(other, name), atol=2e-3) for name, value in scenes[2].items()
+        )
+
+
+def test_a_warm_up_is_trained(tmp_path, start, views, photos):
+    coordinator = on_device(
+        tmp_path, start, views, blocks=4, steps=14, density=GROWING, scaffold=100, warmup=0.4
+    )
+    train(coordinator, photos)
+    assert coordinator.state.step == 14
+    assert coordinator.state.warm > 0
+
+
+def test_blocks_that_outgrow_their_limit_are_split(tmp_path, start, views, photos):
+    coordinator = on_device(
+        tmp_path, start, views, blocks=2, steps=14, density=GROWING, block_limit=60, sole_limit=60
+    )
+    splits = []
+    coordinator.announce.subscribe(lambda e: splits.append(e) if isinstance(e, BlockSplit) else None)
+    train(coordinator, photos)
+    assert splits
+    assert coordinator.scene.tree.num_blocks == 2 + len(splits)
+
+
+def test_gaussians_migrate(tmp_path, start, views, photos):
+    coordinator = on_device(tmp_path, start, views, blocks=4, steps=12)
+    moved = []
+    coordinator.announce.subscribe(lambda e: moved.append(e.migrated) if isinstance(e, VisitEnded) else None)
+    while not coordinator.finished:
+        train(coordinator, photos, steps=1)
+        with torch.no_grad():
+            coordinator.params["means"].add_(0.1 * torch.randn_like(coordinator.params["means"]))
+    assert sum(moved) > 0
+
+
+def test_what_is_no_number_is_mended(tmp_path, start, views, photos):
+    coordinator = on_device(tmp_path, start, views, blocks=2, steps=8, density=GROWING)
+    train(coordinator, photos, steps=3)
+    with torch.no_grad():
+        coordinator.params["scales"][0] = math.nan
+        coordinator.params["scales"][1] = 5.0
+    train(coordinator, photos)
+    assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
+    assert sum(record.values for record in coordinator.state.health.values()) > 0
+
+
+@pytest.mark.parametrize("stop", [2, 5])
+def test_a_run_is_saved_and_gone_on_with(tmp_path, start, views, photos, stop):
+    """On the CPU, on the device, and on the CPU again."""
+    options = {"steps": 11, "density": GROWING, "blocks": 3}
+    first = make_coordinator(tmp_path, start, views, **options)
+    train(first, photos, steps=stop)
+    first.save()
+    first.scene.store.close()
+    second = on_device(tmp_path, start, views, resume=True, **options)
+    assert second.state.step == stop
+    train(second, photos, steps=3)
+    if second.state.active is not None:
+        assert_on_device(second)
+    second.save(pin="here")
+    second.scene.store.close()
+    third = make_coordinator(tmp_path, start, views, resume=True, **options)
+    assert third.state.step == stop + 3
+    train(third, photos)
+    assert third.state.step == 11
+
+
+def test_a_run_that_was_shared_by_a_crew_is_gone_on_with(tmp_path, start, views, photos):
+    """Where there are no helpers' processes: their shares are drawn in turn, on the device."""
+    options = {"steps": 6, "density": GROWING, "blocks": 2, "processes": 2}
+
+    def target(sample):
+        return photos(sample.view.index, sample.crop).to(sample.background.device), None
+
+    first = make_coordinator(tmp_path, start, views, target=target, **options)
+    train(first, photos, steps=1)
+    assert first.state.active.crew == 2
+    first.save()
+    first._crew.dismiss()
+    first.scene.store.close()
+    second = on_device(tmp_path, start, views, resume=True, target=target, **options)
+    train(second, photos, steps=2)
+    assert second.state.step == 3
+    assert_on_device(second)
+
+
+@pytest.mark.parametrize("density", [GROWING, MCMC], ids=["default", "mcmc"])
+def test_blocks_are_trained_jointly(tmp_path, start, views, photos, density):
+    coordinator = on_device(tmp_path, start, views, blocks=3, steps=4, density=density, kind=ExactCoordinator)
+    before = losses_of(start, views, photos)
+    train(coordinator, photos)
+    assert losses_of(whole_scene(coordinator), views, photos) < before
+
+
+def test_blocks_are_trained_apart(tmp_path, start, views, photos):
+    options = {
+        "kind": IndependentCoordinator,
+        "content": independent_at_rest,
+        "layers": False,
+        "overlap": 0.25,
+    }
+    coordinator = on_device(tmp_path, start, views, blocks=2, steps=6, density=GROWING, **options)
+    train(coordinator, photos)
+    assert coordinator.state.step == 6
+
+
+@pytest.mark.parametrize("rasterizer", ["auto", "torch"])
+@pytest.mark.parametrize("ownership", ["means", "fragments"])
+def test_a_picture_is_composited(tmp_path, start, views, ownership, rasterizer):
+    coordinator = on_device(tmp_path, start, views, rasterizer, blocks=4)
+    draws = coordinator._rasterizer
+    if ownership == "fragments" and not getattr(draws, "supports_z_window", True):
+        pytest.skip("gsplat's backend has no windows")
+    painter = Painter(coordinator.scene, views, draws, ownership=ownership, pass_gaussians=0, device=DEVICE)
+    layer = painter.picture(views[0], PaintSettings(1, False))
+    assert layer.color.device == DEVICE
+    if ownership == "fragments":
+        merged = TorchRasterizer("never")(whole_scene(coordinator), views[0], sh_degree=1)
+        assert float((layer.color.cpu() - merged.color).abs().max()) < 5e-4

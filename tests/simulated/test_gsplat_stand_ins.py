@@ -1,0 +1,126 @@
+"""The stand-ins for gsplat's functions: signatures, lists, gradients, and one launch each on the device."""
+
+import inspect
+
+import pytest
+import torch
+from gsplat.cuda import _torch_impl, _wrapper
+
+from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer, self_check
+from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
+from tests.engine.rasterizer_scenes import as_leaves, random_gaussians, small_view
+from tests.reference import gsplat_stand_ins as stand_ins
+from tests.reference.simulated_device import DEVICE, simulated_device
+
+TILE, COLS, ROWS = 16, 5, 3
+SIZE = COLS * TILE, ROWS * TILE
+
+
+def projected(count: int = 30, channels: int = 4) -> dict[str, torch.Tensor]:
+    """Faint splats in an image of 5 x 3 tiles, float64."""
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    return {
+        "means2d": uniform(1, count, 2) * torch.tensor(SIZE),
+        "conics": torch.cat(
+            (
+                0.01 + 0.05 * uniform(1, count, 1),
+                0.01 * uniform(1, count, 1),
+                0.01 + 0.05 * uniform(1, count, 1),
+            ),
+            dim=2,
+        ),
+        "colors": uniform(1, count, channels),
+        "opacities": 0.3 + 0.5 * uniform(1, count),
+    }
+
+
+def lists(splats, sort=True):
+    radii = torch.full((1, splats["means2d"].shape[1]), 20, dtype=torch.int32)
+    depths = 1 + torch.rand(radii.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return stand_ins.isect_tiles(splats["means2d"], radii, depths, TILE, COLS, ROWS, sort)
+
+
+def drawn(splats, offsets, ids, **options):
+    return stand_ins.rasterize_to_pixels(*splats.values(), *SIZE, TILE, offsets, ids, **options)
+
+
+@pytest.mark.parametrize("name", stand_ins.NAMES)
+def test_signatures_are_gsplats(name):
+    theirs, mine = (inspect.signature(getattr(module, name)).parameters for module in (_wrapper, stand_ins))
+    assert [(p.name, p.default) for p in mine.values()] == [(p.name, p.default) for p in theirs.values()]
+
+
+def test_lists_are_gsplats():
+    splats = projected()
+    found = lists(splats)
+    radii = torch.full((1, 30), 20, dtype=torch.int32)
+    radii[0, :4] = 0
+    depths = torch.rand(1, 30, generator=torch.Generator().manual_seed(2))
+    args = splats["means2d"].float(), radii, depths, TILE, COLS, ROWS
+    found, expected = stand_ins.isect_tiles(*args), _torch_impl._isect_tiles(*args)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    kept = found[1][::3]
+    encoded = stand_ins.isect_offset_encode(kept, 1, COLS, ROWS)
+    assert torch.equal(encoded, _torch_impl._isect_offset_encode(kept, 1, COLS, ROWS))
+    nothing = stand_ins.isect_offset_encode(kept[:0], 1, COLS, ROWS)
+    assert nothing.shape == (1, ROWS, COLS)
+    assert not nothing.any()
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+@pytest.mark.parametrize("keep", [1, 3])
+def test_gradients_are_those_of_the_picture(channels, keep, monkeypatch):
+    monkeypatch.setattr(stand_ins, "PAIRS_AT_ONCE", 40)
+    splats = projected(8, channels)
+    _, ids, rows = lists(splats)
+    ids, rows = ids[::keep], rows[::keep]
+    offsets = stand_ins.isect_offset_encode(ids, 1, COLS, ROWS)
+    weights = torch.rand(1, SIZE[1], SIZE[0], channels + 1, dtype=torch.float64)
+
+    def total(*values):
+        return (
+            weights * torch.cat(drawn(dict(zip(splats, values, strict=True)), offsets, rows), dim=3)
+        ).sum()
+
+    leaves = [x.requires_grad_() for x in splats.values()]
+    assert torch.autograd.gradcheck(total, leaves, eps=1e-7, atol=1e-5)
+
+
+def test_absolute_gradients_are_summed_over_pixels():
+    splats = projected()
+    _, ids, rows = lists(splats)
+    offsets = stand_ins.isect_offset_encode(ids, 1, COLS, ROWS)
+    splats = {name: x.requires_grad_() for name, x in splats.items()}
+    color, _ = drawn(splats, offsets, rows, absgrad=True)
+    expected = torch.zeros_like(splats["means2d"])
+    for x, y in ((3, 3), (20, 11), (44, 40)):
+        (gradient,) = torch.autograd.grad(color[0, y, x].sum(), splats["means2d"], retain_graph=True)
+        expected += gradient.abs()
+    sum(color[0, y, x].sum() for x, y in ((3, 3), (20, 11), (44, 40))).backward()
+    assert float(expected.abs().max()) > 0
+    torch.testing.assert_close(splats["means2d"].absgrad, expected)
+
+
+def test_each_is_one_launch_and_lists_wait_once():
+    with simulated_device() as counts, stand_ins.lent():
+        draw, view = GsplatRasterizer(), small_view(70, 45, dtype=torch.float32)
+        gaussians = as_leaves(random_gaussians(40, dtype=torch.float32).to(DEVICE))
+        raster = draw(gaussians, view, sh_degree=1, absgrad=True)
+        assert counts.waits["isect_tiles"] == 1
+        assert counts.waited == counts.waits["isect_tiles"] + counts.waits["copy to device"]
+        (raster.color.sum() + raster.depth.sum()).backward()
+        assert raster.info["means2d"].absgrad.device == DEVICE
+        expected = TorchRasterizer("never")(random_gaussians(40, dtype=torch.float32), view, sh_degree=1)
+        torch.testing.assert_close(raster.color.detach().cpu(), expected.color, rtol=1e-4, atol=1e-5)
+
+
+def test_auto_is_gsplat_on_the_simulated_device_and_agrees_with_torch():
+    with simulated_device(), stand_ins.lent():
+        rasterizer = make_rasterizer("auto", DEVICE)
+        assert rasterizer.name.startswith("gsplat")
+        assert 0 < self_check(rasterizer, DEVICE) < 1e-4
+        assert make_rasterizer("torch", DEVICE).name.startswith("torch")

@@ -1,0 +1,107 @@
+"""`ns-train abcd`, evaluation and pictures, in this process, on the simulated device."""
+
+import pytest
+import torch
+import yaml
+from nerfstudio.utils.eval_utils import eval_load_checkpoint
+
+from abcd_ns import methods
+from abcd_ns.engine.storage import ParameterStore
+from abcd_ns.viewer.pictures import Choice, Show
+from tests.plugin.test_training import configure, run
+from tests.reference.colmap_scene import HEIGHT, WIDTH, write_scene
+from tests.reference.gsplat_stand_ins import lent
+from tests.reference.simulated_device import DEVICE, simulated_device
+
+STEPS = 14
+
+
+@pytest.fixture(scope="module", autouse=True)
+def counts():
+    """The simulated device, for the whole module."""
+    with simulated_device() as counts, lent():
+        yield counts
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+def on_device(data, out, method=methods.abcd, **options):
+    """As `ns-train --machine.device-type simulated` would configure it."""
+    config = configure(data, out, method, **{"steps": STEPS, "blocks": 2, **options})
+    config.machine.device_type = DEVICE.type
+    config.pipeline.training.density.refine_every = 3
+    config.pipeline.training.density.refine_start = 0.0
+    return config
+
+
+def draw_for_viewer(trainer) -> None:
+    """All that a viewer may ask for, in the middle of a visit."""
+    model = trainer.pipeline.model
+    if trainer.step % 5 == 0:
+        camera = trainer.pipeline.datamanager.train_dataset.cameras[:1].to(DEVICE)
+        camera.metadata = None
+        outputs = model.get_outputs_for_camera(camera)
+        assert outputs["rgb"].shape == (HEIGHT, WIDTH, 3)
+        assert {outputs[name].device for name in ("rgb", "depth", "accumulation")} == {DEVICE}
+        for show in Show:
+            model.choice = Choice(show, None)
+            assert model.draw_for_viewer(model.view(camera)).color.device == DEVICE
+        model.choice = Choice()
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    config = on_device(data, tmp_path_factory.mktemp("out"))
+    config.steps_per_eval_image = config.steps_per_eval_all_images = 10
+    return run(config, after_step=draw_for_viewer)
+
+
+def loaded(folder):
+    """As ns-eval loads a run, but for the device, which it chooses itself."""
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    config.load_dir = folder / "nerfstudio_models"
+    pipeline = config.pipeline.setup(device=str(DEVICE), test_mode="test")
+    pipeline.eval()
+    eval_load_checkpoint(config, pipeline)
+    return pipeline
+
+
+def test_a_run_is_on_the_device_and_leaves_a_checkpoint(trained):
+    assert trained.pipeline.device == DEVICE
+    assert trained.pipeline.model.draws_with().name.startswith("gsplat")
+    (checkpoint,) = trained.checkpoint_dir.iterdir()
+    state = torch.load(checkpoint, weights_only=True)["pipeline"]
+    assert {value.device.type for value in state.values() if isinstance(value, torch.Tensor)} == {"cpu"}
+    assert len(state["_model.gauss_params.means"]) == trained.pipeline.coordinator.count()
+    store = ParameterStore.open(trained.base_dir / "abcd" / "store", read_only=True)
+    assert store.state["step"] == STEPS
+
+
+def test_a_checkpoint_is_evaluated_and_composited(trained):
+    pipeline = loaded(trained.base_dir)
+    assert pipeline.get_average_eval_image_metrics()["psnr"] > 8
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    merged = pipeline.model.get_outputs_for_camera(camera)
+    pipeline.model.config.render = "composited"
+    composited = pipeline.model.get_outputs_for_camera(camera)
+    assert merged["rgb"].device == composited["rgb"].device == DEVICE
+    if pipeline.model._ownership() == "fragments":
+        assert float((merged["rgb"] - composited["rgb"]).abs().max()) < 5e-4
+
+
+def test_a_run_is_gone_on_with(data, tmp_path, trained):
+    longer = run(on_device(data, tmp_path, load_dir=trained.checkpoint_dir, steps=STEPS + 3))
+    assert longer.pipeline.coordinator.state.step == STEPS + 3
+
+
+@pytest.mark.parametrize(
+    "method",
+    [methods.abcd_ablated, methods.abcd_monolithic, methods.abcd_partition, methods.abcd_exact],
+    ids=lambda method: method.config.method_name,
+)
+def test_the_other_methods_train(data, tmp_path, method):
+    trainer = run(on_device(data, tmp_path, method, steps=4))
+    assert trainer.pipeline.coordinator.state.step == 4
