@@ -88,8 +88,7 @@ def test_a_checkpoint_is_evaluated_and_composited(trained):
     pipeline.model.config.render = "composited"
     composited = pipeline.model.get_outputs_for_camera(camera)
     assert merged["rgb"].device == composited["rgb"].device == DEVICE
-    if pipeline.model._ownership() == "fragments":
-        assert float((merged["rgb"] - composited["rgb"]).abs().max()) < 5e-4
+    assert float((merged["rgb"] - composited["rgb"]).abs().max()) < 5e-4
 
 
 def test_a_run_is_gone_on_with(data, tmp_path, trained):

@@ -61,7 +61,7 @@ class Case:
         options = {"sh_degree": self.sh_degree, "antialiased": self.antialiased}
         seen = [rasterizer.project(frozen, each, **options) if self.frozen else None for each in views]
         crops = [self.crop or each.full for each in views]
-        windows = [_window(rasterizer, crop, view.K.device) if self.windowed else None for crop in crops]
+        windows = [_window(rasterizer, crop, frozen.device) if self.windowed else None for crop in crops]
         return [Shot(*shot) for shot in zip(views, crops, seen, windows, strict=True)]
 
 
