@@ -32,6 +32,9 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 
 from tests.reference.device_counts import Counts
 
+# Autograd starts threads for all devices that there are at a process' first backward pass, and after that no
+# process may be forked from it. Here, before there is a device, it starts none.
+torch.zeros((), requires_grad=True).backward()
 _setup_privateuseone_for_python_backend("simulated")
 DEVICE = torch.device("simulated", 0)
 # Asked for wherever torch.autocast is named, though it be disabled.

@@ -101,8 +101,11 @@ def test_what_is_no_results_file_is_refused(tmp_path, content):
 
 
 def test_every_field_of_a_run_is_required():
+    """But for those that came later: older results are read."""
     data = encode(made_up_run())
-    for field in dataclasses.fields(Run):
+    required = [field for field in dataclasses.fields(Run) if field.default is dataclasses.MISSING]
+    assert len(required) > 10
+    for field in required:
         with pytest.raises(RecordError, match=f"lacks the field '{field.name}'"):
             decode(Run, {name: value for name, value in data.items() if name != field.name}, "run.json")
 

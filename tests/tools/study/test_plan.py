@@ -67,7 +67,7 @@ def test_several_options_may_change_at_once():
         ("training.batch=many", "training.batch must be a whole number"),
         ("training.warmup=nan", "training.warmup must be a number"),
         ("training.layers=maybe", "training.layers must be true or false"),
-        ("training.ownership=foo", "must be auto, fragments or means"),
+        ("training.ownership=foo", "must be fragments or means"),
         ("layer_bits=8", "must be 16 or 32"),
         ("training.seed=1", "set it with --seeds"),
         ("max_seconds=5", "set it with --seconds"),
