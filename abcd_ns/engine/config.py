@@ -44,7 +44,7 @@ class TrainingConfig:
     """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
     another one each time, and weighs it by how much of the crop it leaves out. 0 is no limit; `ns-train abcd`
     sets it by the device's memory where not even one whole view fits."""
-    batch_power: float = 0.75
+    batch_power: float = 1.0
     """Learning rates grow with this power of the views in a step: 0.5 suits gradients that are noise, 1 such
     as agree. A scene's views show different Gaussians, but a block's all show the same ones."""
     processes: int = 0
