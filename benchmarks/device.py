@@ -59,13 +59,13 @@ class Args:
     """JSON is written there."""
     blocks: tuple[int, ...] = (1, 8)
     """A run with each of these."""
-    steps: int = 64
+    steps: int = 24
     """Of each run."""
-    views: int = 8
+    views: int = 6
     """Training views."""
-    gaussians: int = 600
+    gaussians: int = 400
     """To begin with."""
-    width: int = 64
+    width: int = 48
     """Of the pictures; three quarters of it high."""
     seed: int = 0
     """Of scene and run."""

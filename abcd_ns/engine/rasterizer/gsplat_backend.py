@@ -75,7 +75,8 @@ class _Pairs:
 
     def __getitem__(self, keep: Bool[Tensor, "q"]) -> "_Pairs":
         """Some of them, in order."""
-        return _Pairs(self.grid, self.ids[keep], self.gaussians[keep])
+        kept = keep.nonzero()[:, 0]  # one wait, and not one for each list
+        return _Pairs(self.grid, self.ids.index_select(0, kept), self.gaussians.index_select(0, kept))
 
     def offsets(self) -> Int[Tensor, "1 r c"]:
         """Where each tile's pairs begin."""
