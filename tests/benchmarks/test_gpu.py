@@ -144,10 +144,9 @@ def test_every_record_is_drawn(tmp_path):
 
 @pytest.mark.cli
 def test_a_dry_run_goes_through(tmp_path, capsys):
-    assert main(Args(out=tmp_path, parts=("build", "extent"), dry_run=True)) == 0
+    assert main(Args(out=tmp_path, parts=("build",), dry_run=True)) == 0
     assert read_json(tmp_path / "build.json")["found"]["self_check"] < 1e-3
-    assert len(read_json(tmp_path / "extent.json")["found"]["scale"]["arms"]) == 2
-    assert "ABCD, 2 blocks" in capsys.readouterr().out
+    assert "build" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -161,4 +160,5 @@ def test_all_parts_of_a_dry_run_go_through(tmp_path, capsys):
         assert found["left_out"][0]["method"] == "splatfacto"
         assert not list((out / "work" / part).rglob("nerfstudio_models"))
     assert read_json(out / "visit.json")["found"]["by_blocks"][0]["profile"]
+    assert len(read_json(out / "extent.json")["found"]["scale"]["arms"]) == 2
     assert "a dry run: these numbers mean nothing" in capsys.readouterr().out
