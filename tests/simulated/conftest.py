@@ -2,9 +2,11 @@
 
 import pytest
 
+from tests.engine.conftest import photos, start, views
 from tests.reference.gsplat_stand_ins import lent
-from tests.reference.scenes import Photos, random_gaussians, ring_of_views
 from tests.reference.simulated_device import simulated_device
+
+__all__ = ["counts", "photos", "simulated_gsplat", "start", "views"]
 
 
 @pytest.fixture
@@ -19,18 +21,3 @@ def simulated_gsplat(counts):
     """The same, with gsplat's functions."""
     with lent():
         yield counts
-
-
-@pytest.fixture(scope="module")
-def views():
-    return ring_of_views(5)
-
-
-@pytest.fixture(scope="module")
-def photos(views):
-    return Photos(random_gaussians(150, seed=7, size=0.12), views)
-
-
-@pytest.fixture
-def start():
-    return random_gaussians(120, seed=1, size=0.12)
