@@ -1,4 +1,4 @@
-"""All kernels there are, and the process that builds them: `python -m abcd_ns.engine.build_kernels 4 16`."""
+"""All kernels there are, and the process that builds them: `python -m abcd_ns.engine.build_kernels 4 8`."""
 
 import sys
 

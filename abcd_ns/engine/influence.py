@@ -17,8 +17,9 @@ from abcd_ns.engine.rasterizer import Rasterizer, Shot
 from abcd_ns.engine.rasterizer.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians, View
 
-COARSE = 2
-"""Influences of whole views are found in images that are so many times smaller."""
+COARSE, COARSE_SIDE = 2, 80
+"""Influences of whole views are found in images that are so many times smaller, and those of large images in
+such as are about so many pixels long: what counts is the order of a block's views, and there may be many."""
 DIGITS = 6
 """Decimals that are kept: a millionth of the image is less than a pixel."""
 
@@ -80,7 +81,7 @@ def influence(
     blocks = int(owner.max()) + 1 if len(owner) else 0
     found: Influence = {}
     for view in views:
-        small = coarser(view, COARSE)
+        small = coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE))
         each = weights(gaussians, rasterizer, Shot(small, small.full), antialiased=antialiased)
         sums = each.new_zeros(blocks).index_add_(0, owner, each) / small.full.pixels
         for block, value in enumerate(sums.tolist()):

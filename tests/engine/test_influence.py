@@ -38,6 +38,23 @@ def test_influence_is_what_a_block_painted_white_adds_to_a_black_picture(rasteri
             assert found[block][view.index] == pytest.approx(float(picture.color[..., 0].mean()), abs=2e-6)
 
 
+def test_large_views_are_looked_at_in_small_pictures():
+    sizes = []
+
+    class Watching(TorchRasterizer):
+        def draw(self, gaussians, shots, **options):
+            sizes.extend((shot.crop.width, shot.crop.height) for shot in shots)
+            return super().draw(gaussians, shots, **options)
+
+    views = ring_of_views(2, width=800, height=600)
+    found = influence(
+        random_gaussians(20, size=0.2), torch.zeros(20, dtype=torch.int64), views, Watching("never")
+    )
+    assert set(sizes) == {(80, 60)}
+    full = weights(random_gaussians(20, size=0.2), TorchRasterizer("never"), Shot(views[0], views[0].full))
+    assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
+
+
 def test_what_stands_in_front_takes_its_share(rasterizer):
     gaussians, (view,) = random_gaussians(20, seed=2, size=0.2), ring_of_views(1)
     shot = Shot(view, view.full)

@@ -273,16 +273,16 @@ def test_equal_depths_are_drawn_in_the_order_of_their_index():
 
 
 def test_backward_keeps_little():
-    """Saved values per fragment: five planes per chunk of 16, not the dozens that autograd would keep."""
+    """Saved values per fragment: five planes per chunk of 8, not the dozens that autograd would keep."""
     gaussians = random_gaussians(300, sh_degree=0)
     changed = {"scales": gaussians.scales + 2, "opacities": torch.full_like(gaussians.opacities, -4.5)}
     wide = Gaussians(**{**dict(gaussians.items()), **changed})
-    fragments = bin_splats(project(wide, VIEW), TileGrid(VIEW.full, 4), 16).fragments
+    fragments = bin_splats(project(wide, VIEW), TileGrid(VIEW.full, 4), 8).fragments
     saved = []
     with torch.autograd.graph.saved_tensors_hooks(lambda x: (saved.append(x.numel()), x)[1], lambda x: x):
         EAGER(as_leaves(wide), VIEW, sh_degree=0)
     assert fragments > 60_000
-    assert sum(saved) < 0.5 * fragments + 150 * 300  # 150 values per Gaussian: projection and colours
+    assert sum(saved) < 0.75 * fragments + 150 * 300  # 150 values per Gaussian: projection and colours
 
 
 def test_nothing_is_saved_without_gradients():

@@ -80,6 +80,18 @@ def test_built_equals_eager(antialiased):
 
 
 @needs_kernels
+def test_built_weights_equal_eager():
+    view, gaussians = small_view(dtype=torch.float32), random_gaussians(60, dtype=torch.float32)
+    eager, built = (
+        TorchRasterizer(policy).depth_window(gaussians, view, crop=view.full, visible=0.05)
+        for policy in ("never", "auto")
+    )
+    for plane in ("near", "far"):
+        differs = (getattr(eager, plane) - getattr(built, plane)).abs() > 1e-4
+        assert float(differs.float().mean()) < 0.02  # a weight may fall to either side of what is visible
+
+
+@needs_kernels
 @pytest.mark.parametrize("size", [(SSIM_WINDOW, SSIM_WINDOW), (SSIM_WINDOW + 1, 40), (33, 61)])
 def test_built_loss_equals_eager(size):
     photo = torch.rand(*size, 3)
@@ -135,7 +147,7 @@ def test_float64_is_eager_whatever_is_built():
 
 def test_names_tell_all_kernels_and_sizes_apart():
     kernels = {kernel for side in (2, 4) for chunk in (8, 16) for kernel in all_kernels(side, chunk)}
-    assert len({kernel.path for kernel in kernels}) == len(kernels) == 7 + 4 * 2
+    assert len({kernel.path for kernel in kernels}) == len(kernels) == 7 + 4 * 3
 
 
 def test_using_kernels_does_not_import_the_compiler():

@@ -1,4 +1,4 @@
-"""The two chunk kernels of one size, and the choice between eager and built ones."""
+"""The chunk kernels of one size, and the choice between eager and built ones."""
 
 import functools
 from typing import Literal
@@ -10,24 +10,27 @@ from torch import Tensor
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.kernels.build import build_kernels
 from abcd_ns.engine.rasterizer import splat_kernels
-from abcd_ns.engine.rasterizer.splat_kernels import GRADED, SPLAT_KERNELS
-from abcd_ns.engine.rasterizer.torch_kernels import STATE_PLANES, backward_chunk, forward_chunk
+from abcd_ns.engine.rasterizer.splat_kernels import GRADED, OPACITY, SPLAT_KERNELS
+from abcd_ns.engine.rasterizer.torch_kernels import STATE_PLANES, backward_chunk, forward_chunk, weigh_chunk
 
 CompilePolicy = Literal["auto", "always", "never"]
 
 
 @functools.cache
-def chunk_kernels(side: int, chunk: int) -> tuple[Kernel, Kernel]:
-    """`forward_chunk` and `backward_chunk` for tiles of `side` pixels and `chunk` Gaussians a call."""
+def chunk_kernels(side: int, chunk: int) -> tuple[Kernel, Kernel, Kernel]:
+    """`forward_chunk`, `backward_chunk`, `weigh_chunk` for tiles of `side` px, `chunk` Gaussians a call."""
     pixels = side * side
     state = f"{STATE_PLANES} {pixels} a"
     given = (f"{GRADED} {chunk} a", "2 a", state)
     depends = (splat_kernels.__file__,)
     forward = functools.partial(forward_chunk, side)
     backward = functools.partial(backward_chunk, side)
+    weigh = functools.partial(weigh_chunk, side)
+    seen = (f"{OPACITY + 1} {chunk} a", "2 a", f"1 {pixels} a")
     return (
         Kernel(f"forward-{side}-{chunk}", forward, given, depends),
         Kernel(f"backward-{side}-{chunk}", backward, (*given, state), depends),
+        Kernel(f"weigh-{side}-{chunk}", weigh, seen, depends),
     )
 
 
@@ -41,7 +44,7 @@ class ChunkKernels:
 
     def __init__(self, policy: CompilePolicy, side: int, chunk: int) -> None:
         self._policy, self._size = policy, (side, chunk)
-        self._forward, self._backward = chunk_kernels(side, chunk)
+        self._forward, self._backward, self._weigh = chunk_kernels(side, chunk)
         self.built = policy != "never" and all(kernel.is_built for kernel in self._all)
         """Whether float32 on the CPU runs fast."""
         if policy == "always":
@@ -55,7 +58,7 @@ class ChunkKernels:
 
     @property
     def _all(self) -> tuple[Kernel, ...]:
-        return (*SPLAT_KERNELS, self._forward, self._backward)
+        return (*SPLAT_KERNELS, self._forward, self._backward, self._weigh)
 
     def forward(
         self,
@@ -77,6 +80,17 @@ class ChunkKernels:
         """See torch_kernels.backward_chunk."""
         wide = _two_wide(params, origins, state, upstream)
         return self._backward(*wide, built=self.built)[0][..., : params.shape[-1]]
+
+    def weigh(
+        self,
+        params: Float[Tensor, "c k a"],
+        origins: Float[Tensor, "2 a"],
+        state: Float[Tensor, "1 p a"],
+    ) -> tuple[Float[Tensor, "1 p a"], Float[Tensor, "k a"]]:
+        """See torch_kernels.weigh_chunk."""
+        found = self._weigh(*_two_wide(params, origins, state), built=self.built)
+        state, weights = (plane[..., : params.shape[-1]] for plane in found)
+        return state, weights
 
 
 def _two_wide(*tensors: Tensor) -> tuple[Tensor, ...]:

@@ -1,5 +1,6 @@
 """Alpha compositing of projected Gaussians as one differentiable function of bounded memory."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,6 @@ from abcd_ns.engine.rasterizer.splat_kernels import CONIC_XX, OPACITY
 from abcd_ns.engine.rasterizer.torch_kernels import (
     ALL_GRADIENTS,
     GRADIENTS,
-    MOMENTS,
     STATE_PLANES,
     gather_params,
 )
@@ -55,7 +55,7 @@ def _initial_state(lists: TileLists, dtype: torch.dtype) -> Float[Tensor, "5 p a
     return state
 
 
-def _live_columns(state: Float[Tensor, "5 p a"]) -> Int[Tensor, "b"] | None:
+def _live_columns(state: Float[Tensor, "s p a"]) -> Int[Tensor, "b"] | None:
     """The columns with an unfinished pixel, if dropping the others is worth it."""
     live = (state[0] > 0).any(dim=0).nonzero()[:, 0]
     return live if live.numel() < COMPACT * state.shape[2] else None
@@ -72,13 +72,13 @@ def _take(planes: Tensor, width: int, columns: Tensor | None) -> Tensor:
     return planes[..., :width].contiguous() if columns is None else planes.index_select(-1, columns)
 
 
-def _composite(
-    job: Job, table: Tensor, origins: Float[Tensor, "2 a"], keep_states: bool
-) -> tuple[Float[Tensor, "5 p a"], _Trace]:
-    """Draw all levels, front to back. Returns the final state of every tile and the trace."""
-    lists, trace = job.lists, _Trace()
-    state, columns = _initial_state(lists, table.dtype), None
-    final = state.clone()
+DrawChunk = Callable[[int, Tensor | None, Float[Tensor, "s p a"]], Float[Tensor, "s p a"]]
+"""(level, columns, state) -> the state after that level's chunk; no columns are all of the level's."""
+
+
+def _walk(lists: TileLists, state: Float[Tensor, "s p a"], draw: DrawChunk) -> Float[Tensor, "s p a"]:
+    """All levels front to back, for as long as a tile has unfinished pixels. Returns the last states."""
+    columns, final = None, state.clone()
     for index, level in enumerate(lists.levels):
         if columns is not None and level.width < lists.levels[index - 1].width:
             keep = int((columns < level.width).sum())
@@ -94,16 +94,28 @@ def _composite(
             columns, state = held[live], state.index_select(2, live)
         if state.shape[2] == 0:
             break
-        if keep_states:
-            trace.columns.append(columns)
-            trace.states.append(state)
-        params = gather_params(table, _level_ranks(lists, index, columns))
-        state = job.kernels.forward(params, _take(origins, level.width, columns), state)
+        state = draw(index, columns, state)
     if columns is None:
         final[..., : state.shape[2]] = state
     else:
         final.index_copy_(2, columns, state)
-    return final, trace
+    return final
+
+
+def _composite(
+    job: Job, table: Tensor, origins: Float[Tensor, "2 a"], keep_states: bool
+) -> tuple[Float[Tensor, "5 p a"], _Trace]:
+    """Draw all levels. Returns the final state of every tile and the trace."""
+    lists, trace = job.lists, _Trace()
+
+    def draw(index: int, columns: Tensor | None, state: Tensor) -> Tensor:
+        if keep_states:
+            trace.columns.append(columns)
+            trace.states.append(state)
+        params = gather_params(table, _level_ranks(lists, index, columns))
+        return job.kernels.forward(params, _take(origins, lists.levels[index].width, columns), state)
+
+    return _walk(lists, _initial_state(lists, table.dtype), draw), trace
 
 
 class Composite(torch.autograd.Function):
@@ -153,26 +165,35 @@ def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> 
         params = gather_params(table, _level_ranks(lists, index, columns))
         level_origins, level_upstream = (_take(x, level.width, columns) for x in (origins, upstream))
         sums = job.kernels.backward(params, level_origins, state, level_upstream)
-        by_slot = sums[:kept].reshape(kept, -1).T
-        if columns is None:
-            per_slot[level.start : level.start + by_slot.shape[0]] = by_slot
-        else:
-            lanes = torch.arange(lists.chunk, device=columns.device) * level.width
-            per_slot.index_copy_(0, (level.start + lanes[:, None] + columns).view(-1), by_slot)
+        _put(per_slot, lists, index, columns, sums[:kept].reshape(kept, -1).T)
     return per_slot
 
 
-def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
-    """For each pair of the job's lists the sum of the Gaussian's weight alpha T over the tile's pixels.
+def _put(per_slot: Tensor, lists: TileLists, index: int, columns: Tensor | None, by_slot: Tensor) -> None:
+    """Write what a level's chunk gave for some columns to their slots."""
+    level = lists.levels[index]
+    if columns is None:
+        per_slot[level.start : level.start + by_slot.shape[0]] = by_slot
+    else:
+        lanes = torch.arange(lists.chunk, device=columns.device) * level.width
+        per_slot.index_copy_(0, (level.start + lanes[:, None] + columns).view(-1), by_slot)
 
-    It is the gradient of the picture's sum by the Gaussian's colour.
-    """
+
+def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
+    """For each pair of the job's lists the sum of the Gaussian's weight alpha T over the tile's pixels."""
     lists = job.lists
-    table, origins = _table(drawn, job)
-    final, trace = _composite(job, table, origins, keep_states=True)
-    upstream = torch.zeros_like(final)
-    upstream[0] = 1.0
-    return _slot_gradients(job, table, origins, upstream, trace.columns, trace.states)[lists.slots, MOMENTS]
+    table, origins = _table(drawn[: OPACITY + 1], job)
+    per_slot = table.new_zeros(lists.ranks.numel())
+
+    def weigh(index: int, columns: Tensor | None, state: Tensor) -> Tensor:
+        params = gather_params(table, _level_ranks(lists, index, columns))
+        level_origins = _take(origins, lists.levels[index].width, columns)
+        state, weights = job.kernels.weigh(params, level_origins, state)
+        _put(per_slot, lists, index, columns, weights.reshape(-1))
+        return state
+
+    _walk(lists, _initial_state(lists, table.dtype)[:1], weigh)
+    return per_slot[lists.slots]
 
 
 def _table(drawn: Float[Tensor, "d m"], job: Job) -> tuple[Float[Tensor, "c n"], Float[Tensor, "2 a"]]:

@@ -21,7 +21,7 @@ from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 TILE_SIDE = 4
 """Pixels along a tile's side; small, since Gaussians of low-resolution views are a few pixels wide."""
-CHUNK = 16
+CHUNK = 8
 """Gaussians per kernel call and tile."""
 
 

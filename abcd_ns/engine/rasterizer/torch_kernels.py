@@ -1,6 +1,6 @@
-"""The two inner kernels of the torch rasterizer, forward and backward, over one chunk of many tiles at once.
+"""The inner kernels of the torch rasterizer, forward and backward, over one chunk of many tiles at once.
 
-Both walk K Gaussians front to back with a Python loop, which compiling unrolls and fuses. Layout:
+They walk K Gaussians front to back with a Python loop, which compiling unrolls and fuses. Layout:
 [lane k, pixel p, tile a], tiles innermost, so that every operation runs along contiguous memory.
 
 The state of a pixel is five planes: transmittance T, then premultiplied colour and depth. Compositing
@@ -87,6 +87,26 @@ def forward_chunk(
         blue = blue + weight * params[BLUE, k]
         depth = depth + weight * params[DEPTH, k]
     return (torch.stack((T, red, green, blue, depth)),)
+
+
+def weigh_chunk(
+    side: int,
+    params: Params,
+    origins: Float[Tensor, "2 a"],
+    state: Float[Tensor, "1 p a"],
+) -> tuple[Float[Tensor, "1 p a"], Float[Tensor, "k a"]]:
+    """`forward_chunk` for those who ask for the weights alone, summed over each tile's pixels.
+
+    Args:
+        params: rows up to the opacity.
+        state: transmittance.
+    """
+    alphas = _alphas(params, *_offsets(params, origins, side))
+    T, sums = state[0], []
+    for k in range(params.shape[1]):
+        T, weight, _ = _advance(T, alphas[k])
+        sums.append(weight.sum(dim=0))
+    return T[None], torch.stack(sums)
 
 
 def backward_chunk(
