@@ -51,6 +51,17 @@ class BlockState:
     def __len__(self) -> int:
         return len(self.gaussians)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tensors."""
+        parts = (self.gaussians, self.exp_avg, self.exp_avg_sq, *self.growth.values())
+        return sum(part.nbytes for part in parts)
+
+    @property
+    def nobody(self) -> "BlockState":
+        """None of its Gaussians, under its clocks; shares no memory, as an empty slice would."""
+        return self[torch.zeros(0, dtype=torch.long, device=self.gaussians.device)]
+
     @staticmethod
     def fresh(gaussians: Gaussians) -> "BlockState":
         """A block that has not been trained: zero moments, clocks at zero."""
@@ -110,7 +121,12 @@ class BlockState:
         growth = {k.removeprefix("growth."): v for k, v in tensors.items() if k.startswith("growth.")}
         moments = (Gaussians(**{n: tensors[f"{m}.{n}"] for n in PARAM_NAMES}) for m in MOMENTS)
         gaussians = Gaussians(**{name: tensors[name] for name in PARAM_NAMES})
-        return BlockState(gaussians, *moments, growth, Clocks(**meta["clocks"]))
+        return BlockState(gaussians, *moments, growth, BlockState.clocks_of(meta))
+
+    @staticmethod
+    def clocks_of(meta: dict[str, Any]) -> Clocks:
+        """Those in the JSON of `to_tensors`."""
+        return Clocks(**meta["clocks"])
 
 
 def _statistic(state: BlockState, name: str) -> Tensor:

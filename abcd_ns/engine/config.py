@@ -80,6 +80,9 @@ class TrainingConfig:
     sole_limit: int = 0
     """The same for a block that is the whole scene: it has no neighbours, and draws one view in a step, so
     there is room for more. 0 takes `block_limit`."""
+    commit_seconds: float = 60.0
+    """A kill loses at most so many seconds of the run; what happens is written to disk beside the training.
+    0 commits at the end of every visit, which waits for the disk."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
     sh_degree: int = 3

@@ -20,7 +20,6 @@ from abcd_ns.engine.crew import Crew
 from abcd_ns.engine.density import DensityClock, DensityControl, Infos, added, for_blocks
 from abcd_ns.engine.events import (
     Announcer,
-    BlockSplit,
     LayersDrawn,
     StepTaken,
     SweepEnded,
@@ -35,7 +34,6 @@ from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, 
 from abcd_ns.engine.planner import Planner
 from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.scaffold import LIVE
 from abcd_ns.engine.scene import BlockScene, StoredScene
 from abcd_ns.engine.schedule import (
     endless_order,
@@ -48,7 +46,8 @@ from abcd_ns.engine.schedule import (
 )
 from abcd_ns.engine.settle import at_rest, count_at_rest, has_scaffold, settle
 from abcd_ns.engine.share import Target, Task
-from abcd_ns.engine.splitting import split_full
+from abcd_ns.engine.special_blocks import LIVE
+from abcd_ns.engine.splitting import cut_full, is_full
 from abcd_ns.engine.step_drawing import StepDrawing
 from abcd_ns.engine.storage import LayerCache, crash_points
 from abcd_ns.engine.types import View
@@ -167,8 +166,16 @@ class Coordinator(StepDrawing):
             self._refine(rendered.infos if sound else (), taken)
         self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
         is_warm = active.is_whole and self.progress >= self.config.warmup
-        if active.done >= active.steps or self.finished or is_warm:
+        if active.done >= active.steps or self.finished or is_warm or self._has_outgrown(active):
             self._end_visit()
+        elif self.scene.is_due(self.config.commit_seconds):
+            self._rest_amid_visit(self.config.commit_seconds)
+
+    def _has_outgrown(self, active: ActiveVisit) -> bool:
+        """Whether the one block of the scene has just grown to where it must be cut."""
+        limits = self.config.block_limit, self.config.sole_limit
+        grown = active.sole and self._clocks.refined == self._clocks.steps
+        return grown and is_full(len(self.params["means"]), 1, *limits)
 
     def _refine(self, infos: Infos, taken: int) -> None:
         clock = self._density_clock(taken)
@@ -220,7 +227,8 @@ class Coordinator(StepDrawing):
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use."""
         active = self.state.active
-        share = active.done / active.steps if self.config.sh_restart and active else self.progress
+        restarts = self.config.sh_restart and active is not None and not active.sole
+        share = active.done / active.steps if restarts else self.progress
         return sh_degree_at(share, self.config.sh_ramp, self.config.sh_degree)
 
     def save(self, pin: str | None = None) -> None:
@@ -229,22 +237,33 @@ class Coordinator(StepDrawing):
         Args:
             pin: keep this state under a name until it is unpinned.
         """
-        updates = {}
-        if (active := self.state.active) is not None:
-            self.health.look_over()
-            updates = {LIVE: self._detached().to_tensors()}
-            active.saved = True
-        self.state.seconds = self.stopwatch.seconds
-        self.scene.store.commit(updates, state=self.state.to_json())
+        self._rest_amid_visit(0.0)
         if pin is not None:
             self.scene.store.pin(pin)
 
+    def _rest_amid_visit(self, within: float) -> None:
+        """Put the live block to rest under a number of its own, and the run's state."""
+        updates = {}
+        if (active := self.state.active) is not None:
+            self.health.look_over()
+            updates = {LIVE: self._detached()}
+            active.saved = True
+        self._rest(self.scene.tree, updates, within)
+
+    def _rest(self, tree: BlockTree, updates: dict[int, BlockState], within: float) -> None:
+        self.state.seconds = self.stopwatch.seconds
+        self.scene.rest(tree, updates, self.state.to_json(), within)
+
     def restore(self) -> None:
-        """Go on from the store's newest generation: where `save` was called, or the last visit ended."""
+        """Go on from the store's newest generation: where `save` was called, or something was put to rest."""
         self.state = RunState.from_json(self.scene.store.state)
         self.stopwatch = Stopwatch(self.state.seconds)
         if self.state.active is not None:
             self._attach(self.state.active)
+
+    def close(self) -> None:
+        """Write what waits to be written, and let go of the store, as `StoredScene.close`."""
+        self.scene.close()
 
     @property
     def _active(self) -> ActiveVisit:
@@ -270,7 +289,7 @@ class Coordinator(StepDrawing):
             rest = rest.forgetful()
         attach(rest, self.params, self.optimizers, batch=self.batch)
         self.health.begin_visit(active, self.state.health)
-        self._growth, self._clocks = dict(rest.growth), rest.clocks
+        self._growth, self._clocks = {n: value.clone() for n, value in rest.growth.items()}, rest.clocks
         if active.done == 0 and not active.is_whole:
             self._hold_back_giants()
         block = None if active.is_whole else active.geometry.block
@@ -284,6 +303,8 @@ class Coordinator(StepDrawing):
         active.layer_seconds += self.stopwatch.seconds - before
         if active.done == 0:
             self._measure_influence(active)
+        for plan in self.state.queue[:1]:
+            self.scene.read_ahead(plan.block)
 
     def _measure_influence(self, active: ActiveVisit) -> None:
         """Find out how much the doubtful views show of the block by now."""
@@ -296,7 +317,7 @@ class Coordinator(StepDrawing):
             )
 
     def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:
-        taken = 0 if active.is_whole else active.steps * (self.batch // active.crew)
+        taken = 0 if active.is_alone else active.steps * (self.batch // active.crew)
         views = views_of_member(active.views, member, active.crew)
         return view_order(views, taken, active.number, self.config.seed, member)
 
@@ -305,7 +326,7 @@ class Coordinator(StepDrawing):
         return self.scene
 
     def _draw_layers(self, active: ActiveVisit, order: tuple[int, ...]) -> VisitLayers | None:
-        if active.is_whole or self.scene.tree.num_blocks == 1 or not self.config.layers:
+        if active.is_alone or self.scene.tree.num_blocks == 1 or not self.config.layers:
             return None
         painter = Painter(
             self._surroundings(),
@@ -337,23 +358,23 @@ class Coordinator(StepDrawing):
         state = self.health.end_visit(active, self._detached)
         if active.is_whole:
             self.state.warm = min(self.progress, self.config.warmup)
-            owner, views = self.scene.tree.assign(state.gaussians.means), self.views.values()
-            options = {"antialiased": self.config.antialiased}
-            self.state.influence = influence(state.gaussians, owner, views, self._rasterizer, **options)
+            live, views = live_gaussians(self.params).detach(), self.views.values()
+            owner, options = self.scene.tree.assign(live.means), {"antialiased": self.config.antialiased}
+            self.state.influence = influence(live, owner, views, self._rasterizer, **options)
         updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
-        tree, updates = self._split_full(updates)
+        limits = self.config.block_limit, self.config.sole_limit
+        tree, updates = cut_full(self.scene, updates, self.state, *limits, self.announce)
         split = tree is not self.scene.tree
         if active.saved:
-            updates[LIVE] = state[:0]
+            updates[LIVE] = state.nobody
         self.scene.lift()
         if self._layers is not None:
             self._layers.forget()
         if self._crew is not None:
             self._crew.dismiss()
         self.state.active, self._layers, self._crew = None, None, None
-        self.state.seconds = self.stopwatch.seconds
         crash_points.reached(crash_points.VISIT_TRAINED)
-        self.scene.rest(tree, {b: s.to_tensors() for b, s in updates.items()}, self.state.to_json())
+        self._rest(tree, updates, 0.0 if self.finished else self.config.commit_seconds)
         if split:
             self.density = self._density_control()
         block = None if active.is_whole else active.geometry.block
@@ -371,15 +392,6 @@ class Coordinator(StepDrawing):
         )
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
-
-    def _split_full(self, updates: dict[int, BlockState]) -> tuple[BlockTree, dict[int, BlockState]]:
-        """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole."""
-        limits = self.config.block_limit, self.config.sole_limit
-        tree, updates, parents = split_full(self.scene.tree, updates, *limits)
-        for new, parent in parents.items():
-            self.state.inherit(new, parent)
-            self.announce(BlockSplit(parent, new, len(updates[parent]), len(updates[new])))
-        return tree, updates
 
     def _detached(self) -> BlockState:
         return detach(self.params, self.optimizers, self._growth, self._clocks)

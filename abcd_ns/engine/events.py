@@ -39,7 +39,7 @@ class StepTaken:
 
 @dataclass(frozen=True)
 class VisitEnded:
-    """The block was committed to the store."""
+    """The block is at rest; it is on disk TrainingConfig.commit_seconds later at most."""
 
     visit: int
     sweep: int
@@ -64,7 +64,7 @@ class SweepEnded:
 
 @dataclass(frozen=True)
 class BlockSplit:
-    """A block had outgrown its limit and was cut in two; in the store as soon as its visit has ended."""
+    """A block had outgrown its limit and was cut in two, when its visit ended."""
 
     block: int
     """It keeps its number and one part."""

@@ -144,6 +144,8 @@ class ExactCoordinator(Coordinator):
         self.announce(StepTaken(self.state.step, 0, self.state.step, psnr))
         if self.finished:
             self.save()
+        elif self.scene.is_due(self.config.commit_seconds):
+            self._rest_amid_visit(self.config.commit_seconds)
 
     def gradients(self) -> Gradients:
         """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given.
@@ -172,16 +174,11 @@ class ExactCoordinator(Coordinator):
         """Gaussians in the whole scene."""
         return len(self._all)
 
-    def save(self, pin: str | None = None) -> None:
-        """Commit every block."""
-        held = part(self._all, self._owner_of_all())
-        nobody = self._all[:0]
+    def _rest_amid_visit(self, within: float) -> None:
+        """Put every block to rest; there are no visits."""
+        held, nobody = part(self._all, self._owner_of_all()), self._all.nobody
         blocks = range(self.scene.tree.num_blocks)
-        self.state.seconds = self.stopwatch.seconds
-        content = {block: held.get(block, nobody).to_tensors() for block in blocks}
-        self.scene.store.commit(content, state=self.state.to_json())
-        if pin is not None:
-            self.scene.store.pin(pin)
+        self._rest(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
 
     def restore(self) -> None:
         """Go on from what the store holds: where `save` was called, the order of the Gaussians aside."""
@@ -192,7 +189,7 @@ class ExactCoordinator(Coordinator):
 
     def _take(self) -> None:
         blocks = range(self.scene.tree.num_blocks)
-        self._all = join([BlockState.from_tensors(*self.scene.store.load(block)) for block in blocks])
+        self._all = join([self.scene.state(block) for block in blocks])
         self._lay_over()
 
     def _lay_over(self) -> None:
@@ -260,7 +257,7 @@ class ExactCoordinator(Coordinator):
             (self._info(gradients, rows),),
             self._clock_of(block, len(state), clocks.steps, taken),
         )
-        stepped = detach(self.params, self.optimizers, growth, clocks).to("cpu")
+        stepped = detach(self.params, self.optimizers, growth, clocks)
         attach(stepped[:0].to(self.device), self.params, self.optimizers)
         return stepped
 

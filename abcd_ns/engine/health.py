@@ -62,6 +62,7 @@ class Health:
         self._active: ActiveVisit | None = None
         self._ledger: Ledger = {}
         self._attached: Tensor | None = None
+        self._resumed = False
         self._bad: Tensor | None = None
         self._losses: list[tuple[int, Tensor]] = []
         self._shares: list[Tensor] = []
@@ -86,6 +87,7 @@ class Health:
         """
         self._active, self._ledger = active, ledger
         self._attached, self._bad, self._shares = self._params["means"], None, []
+        self._resumed = active.saved
 
     def see(self, share: Float[Tensor, ""]) -> None:
         """Take note of how large a part of a picture the live block was."""
@@ -168,7 +170,7 @@ class Health:
         record.undone += 1
         record.damping = max(record.damping / 2, LEAST_DAMPING)
         self._announce(VisitUndone(active.number, active.geometry.block, rise[0], rise[1]))
-        before = at_rest(self._scene, active.geometry.block).to(state.gaussians.device)
+        before = at_rest(self._scene, active.geometry.block)
         clocks = replace(state.clocks, adam_views=before.clocks.adam_views)
         return replace(before, clocks=clocks)
 
@@ -214,7 +216,7 @@ class Health:
         """Numbers for `rows`: as they are at rest where rows still are what they were, else stand-ins."""
         active = self._active
         if active is not None and self._params["means"] is self._attached:
-            before = at_rest(self._scene, active.geometry.block, active.saved).gaussians
+            before = at_rest(self._scene, active.geometry.block, self._resumed).gaussians
             if len(before) == len(live):
                 kept = before[rows.cpu()]
                 if not bool(unsound(kept).any()):

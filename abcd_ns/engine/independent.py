@@ -38,6 +38,7 @@ from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.scaffold import blocks_at_rest, join
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import exponential_decay, plan_sweep, sh_degree_at
+from abcd_ns.engine.special_blocks import initial_of
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitGeometry, survey
 
@@ -49,17 +50,12 @@ BEYOND = 1e30
 """Camera z of a pixel that shows no point: further than any finite cell."""
 
 
-def initial_of(tree: BlockTree, block: int) -> int:
-    """Under which number the store keeps a block as it began; the first is left to the reserve."""
-    return tree.num_blocks + 1 + block
-
-
 def independent_at_rest(
     tree: BlockTree, gaussians: Gaussians
 ) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
     """The first content of a store: every block, and once more every block as it began."""
     blocks = blocks_at_rest(tree, gaussians)
-    return {**blocks, **{initial_of(tree, block): content for block, content in blocks.items()}}
+    return {**blocks, **{initial_of(block): content for block, content in blocks.items()}}
 
 
 def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
@@ -218,8 +214,7 @@ class IndependentCoordinator(Coordinator):
             until=since + (1 - since) * share if plans else 1.0,
         )
         self.state.visit += 1
-        joined = {block: self._joined(block).to_tensors()}
-        self.scene.store.commit(joined, state=self.state.to_json())
+        self._rest(self.scene.tree, {block: self._joined(block)}, self.config.commit_seconds)
         self._attach(self.state.active)
 
     def _plan(self) -> None:
@@ -236,7 +231,7 @@ class IndependentCoordinator(Coordinator):
         block = active.geometry.block
         self._look(block)
         super()._attach(active)
-        begun = sum(self.scene.store.counts(initial_of(self.scene.tree, b)) for b in self._blocks)
+        begun = sum(self.scene.rows(initial_of(b)) for b in self._blocks)
         self._part = len(self._joined(block)) / begun
         # What looks at the scene meanwhile sees the block as it will be merged.
         cell = self.scene.tree.cell(block)
@@ -273,5 +268,4 @@ class IndependentCoordinator(Coordinator):
 
 def initial_gaussians(scene: StoredScene, block: int) -> Gaussians:
     """A block's Gaussians as they began."""
-    tensors, meta = scene.store.load(initial_of(scene.tree, block))
-    return BlockState.from_tensors(tensors, meta).gaussians
+    return scene.stored(initial_of(block))

@@ -51,27 +51,31 @@ def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: 
 
 
 def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clocks: Clocks) -> BlockState:
-    """The live block as a BlockState that shares no memory with later steps; it stays live.
+    """The live block as a BlockState on the CPU that shares no memory with later steps; it stays live.
+
+    From a GPU the copies are in pinned memory, which is not for keeping: what is put to rest is copied once
+    more.
 
     Args:
         growth: the strategy's statistics, each [n]; copied.
         clocks: the block's clocks, up to date.
     """
-    moments: dict[str, dict[str, Tensor]] = {moment: {} for moment in MOMENTS}
-    for name in PARAM_NAMES:
-        adam = optimizers[name].state.get(params[name], {})
-        for moment in MOMENTS:
-            value = adam.get(moment)
-            moments[moment][name] = (
-                torch.zeros_like(params[name]) if value is None else value.detach().clone()
-            )
-    return BlockState(
-        Gaussians(**{name: params[name].detach().clone() for name in PARAM_NAMES}),
-        Gaussians(**{n: v.detach() for n, v in moments["exp_avg"].items()}),
-        Gaussians(**{n: v.detach() for n, v in moments["exp_avg_sq"].items()}),
-        {name: value.clone() for name, value in growth.items()},
-        clocks,
-    )
+    held = [params, *({n: _moment(n, params, optimizers, moment) for n in PARAM_NAMES} for moment in MOMENTS)]
+    values = [part[name] for part in held for name in PARAM_NAMES]
+    copies = iter(_on_cpu([*values, *growth.values()]))
+    parts = [Gaussians(**{name: next(copies) for name in PARAM_NAMES}) for _ in held]
+    return BlockState(*parts, {name: next(copies) for name in growth}, clocks)
+
+
+def _moment(name: str, params: Params, optimizers: Optimizers, moment: str) -> Tensor:
+    found = optimizers[name].state.get(params[name], {}).get(moment)
+    return torch.zeros_like(params[name]) if found is None else found
+
+
+def _on_cpu(values: list[Tensor]) -> list[Tensor]:
+    """Copies of tensors of one device, for which it is waited once: the last comes when all have come."""
+    last = len(values) - 1
+    return [value.detach().to("cpu", copy=True, non_blocking=k < last) for k, value in enumerate(values)]
 
 
 def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:

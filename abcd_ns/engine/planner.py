@@ -5,13 +5,11 @@ from collections.abc import Mapping
 
 import torch
 
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.culling import Frusta, Optics
 from abcd_ns.engine.influence import worth_training
 from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, Budget, RunState
-from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
     VisitPlan,
@@ -22,6 +20,7 @@ from abcd_ns.engine.schedule import (
     views_per_warm_up_step,
     visit_views,
 )
+from abcd_ns.engine.special_blocks import WHOLE
 from abcd_ns.engine.types import View
 from abcd_ns.engine.visit import VisitGeometry, survey
 from abcd_ns.errors import UserError
@@ -82,6 +81,8 @@ class Planner:
             geometry = self._survey(plan.block)
             kept = self._worth_training(state, geometry)
             state.views[plan.block] = len(kept)
+            if kept and self._scene.tree.num_blocks == 1:
+                return self._sole_visit(state, plan.block, kept, sh_degree, began)
             if kept:
                 return self._visit(state, plan, geometry, kept, sh_degree, began)
 
@@ -99,7 +100,7 @@ class Planner:
         began: float,
     ) -> ActiveVisit:
         seed, used = self._config.seed, self._views_used(state, len(kept))
-        earlier = BlockState.from_tensors(*self._scene.store.load(plan.block)).clocks.visits
+        earlier = self._scene.clocks(plan.block).visits
         doubtful = tuple(view for view in geometry.views if view not in set(kept))
         looked_at = visit_views(doubtful, 1, earlier, seed) if doubtful else ()
         return ActiveVisit(
@@ -111,6 +112,15 @@ class Planner:
             looked_at=looked_at,
             began=began,
         )
+
+    def _sole_visit(
+        self, state: RunState, block: int, kept: tuple[int, ...], sh_degree: int, began: float
+    ) -> ActiveVisit:
+        """The visit to a block that is the whole scene: all that is left of the run, on whole views, for the
+        block may grow anywhere."""
+        steps = UNLIMITED if self._budget.steps is None else self._budget.steps - state.step
+        geometry = VisitGeometry(block, {view: self._views[view].full for view in kept})
+        return ActiveVisit(state.visit, geometry, sh_degree, steps, geometry.views, began=began, sole=True)
 
     def _worth_training(self, state: RunState, geometry: VisitGeometry) -> tuple[int, ...]:
         """Of the views that see the block, those that show nearly all that is to be seen of it."""

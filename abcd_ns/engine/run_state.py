@@ -7,8 +7,8 @@ from typing import Any
 
 from abcd_ns.engine.health_record import BlockHealth, Ledger
 from abcd_ns.engine.influence import Influence
-from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
+from abcd_ns.engine.special_blocks import WHOLE
 from abcd_ns.engine.visit import VisitGeometry
 
 UNLIMITED = 2**31
@@ -52,7 +52,10 @@ class ActiveVisit:
     """Members that share the views of each step, see `crew`."""
     done: int = 0
     saved: bool = False
-    """Whether the store holds the live block as it was in the middle of the visit, see scaffold.LIVE."""
+    """Whether the live block was put to rest in the middle of the visit, see special_blocks.LIVE."""
+    sole: bool = False
+    """Whether the block is the whole scene: then the visit lasts as long as the run, if the block need not be
+    cut."""
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
     began: float = 0.0
@@ -70,6 +73,11 @@ class ActiveVisit:
     def is_whole(self) -> bool:
         """Whether this is the warm-up, in which the scaffold of all blocks is trained at once."""
         return self.geometry.block == WHOLE
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether what is trained has nothing around it, and may go on for as long as the run."""
+        return self.is_whole or self.sole
 
 
 @dataclass
@@ -105,13 +113,13 @@ class RunState:
             self.queue.insert(place + 1, VisitPlan(new, self.queue[place].steps))
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; `from_json` gives an equal state."""
+        """As JSON, which shares nothing with this state; `from_json` gives an equal one."""
         active = self.active and {
             **vars(self.active),
             "geometry": self.active.geometry.to_json(),
             "views": list(self.active.views),
             "looked_at": list(self.active.looked_at),
-            "objective": {str(view): losses for view, losses in self.active.objective.items()},
+            "objective": {str(view): list(losses) for view, losses in self.active.objective.items()},
         }
         queue = [[plan.block, plan.steps] for plan in self.queue]
         views = {str(block): count for block, count in self.views.items()}

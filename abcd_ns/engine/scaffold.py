@@ -17,15 +17,9 @@ from torch import Tensor
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.initialize import split_off
+from abcd_ns.engine.special_blocks import RESERVE
 from abcd_ns.engine.types import Gaussians
 
-WHOLE = -1
-"""Stands for all blocks at once where a visit names its block."""
-RESERVE = 1 << 20
-"""Under which number the store keeps the Gaussians that wait; no tree has so many blocks."""
-LIVE = RESERVE + 1
-"""Under which number it keeps a block that a save found in the middle of its visit. Under its own number that
-block stays as the visit found it: its layers hang on that."""
 REVEALED_OPACITY = 0.02
 """Of a Gaussian from the reserve: enough to be drawn and to learn, too little to spoil what is there."""
 REVEALED_SCALE = 0.5

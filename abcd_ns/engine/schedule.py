@@ -10,6 +10,7 @@ import math
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
@@ -126,9 +127,14 @@ def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int, member
 def endless_order(views: tuple[int, ...], index: int, seed: int) -> int:
     """The view of step `index` where nobody knows how many there will be: shuffled passes over all views."""
     number, place = divmod(index, len(views))
+    return _one_pass(views, number, seed)[place]
+
+
+@lru_cache(maxsize=2)
+def _one_pass(views: tuple[int, ...], number: int, seed: int) -> tuple[int, ...]:
     shuffled = list(views)
     random.Random(f"scaffold {seed} {number}").shuffle(shuffled)
-    return shuffled[place]
+    return tuple(shuffled)
 
 
 def exponential_decay(progress: float, initial: float, final: float) -> float:

@@ -1,12 +1,15 @@
-"""Where the Gaussians of a visit come to rest: each in the block that holds its mean."""
+"""Where the Gaussians of a visit come to rest, on the CPU: in their block, or in the inbox of another."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
-from abcd_ns.engine.block_state import BlockState
-from abcd_ns.engine.scaffold import LIVE, RESERVE, WHOLE, join, part, put_to_wait, revealed
+from abcd_ns.engine.block_state import BlockState, Clocks
+from abcd_ns.engine.scaffold import join, part, put_to_wait, revealed
 from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.special_blocks import INBOX, LIVE, RESERVE, WHOLE
 
 
 def at_rest(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
@@ -15,68 +18,82 @@ def at_rest(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
     Args:
         saved: the visit goes on where a save found it.
     """
-    state = join([_at_rest(scene, number) for number in _numbers(scene, block, saved)])
+    state = (
+        scene.state(LIVE) if saved else join([with_mail(scene, number) for number in _blocks(scene, block)])
+    )
     return replace(state, gaussians=revealed(state.gaussians))
 
 
 def count_at_rest(scene: StoredScene, block: int, saved: bool = False) -> int:
     """Rows of `at_rest`, without reading them."""
-    return sum(scene.store.counts(number) for number in _numbers(scene, block, saved))
-
-
-def _numbers(scene: StoredScene, block: int, saved: bool) -> list[int]:
     if saved:
-        return [LIVE]
-    return list(range(scene.tree.num_blocks)) if block == WHOLE else [block]
+        return scene.rows(LIVE)
+    return sum(scene.rows(number) + len(scene.mail(number) or ()) for number in _blocks(scene, block))
+
+
+def _blocks(scene: StoredScene, block: int) -> range:
+    return range(scene.tree.num_blocks) if block == WHOLE else range(block, block + 1)
+
+
+def with_mail(scene: StoredScene, block: int) -> BlockState:
+    """A block at rest, joined by those that wait for its next visit."""
+    state, mail = scene.state(block), scene.mail(block)
+    return state if mail is None else state.joined_by(mail)
 
 
 def settle(scene: StoredScene, block: int, state: BlockState, migrate: bool = True) -> dict[int, BlockState]:
-    """The blocks that change when `block`, or with WHOLE the scaffold of all, has been trained.
+    """What changes when `block`, or with WHOLE the scaffold of all, has been trained.
 
     Args:
+        state: on the CPU.
         migrate: False drops the Gaussians that left their cell.
     """
     if block == WHOLE:
         return settle_scaffold(scene, state)
-    if not migrate:
-        return {block: state[_owner(scene, state) == block]}
-    return settle_block(scene, block, state)
+    inside = _owner(scene, state) == block
+    left = state[~inside] if migrate else state.nobody
+    return {block: state[inside], **inbox_without(scene, {block}, left)}
 
 
-def settle_block(scene: StoredScene, block: int, state: BlockState) -> dict[int, BlockState]:
-    """The blocks that change when `block` has been trained: it, and those that its Gaussians moved to."""
-    parts = part(state, _owner(scene, state))
-    settled = {block: parts.get(block, state[:0])}
-    for target, arrivals in parts.items():
-        if target != block:
-            settled[target] = _at_rest(scene, target).to(state.gaussians.device).joined_by(arrivals)
-    return settled
+def inbox_without(
+    scene: StoredScene, blocks: set[int], arrivals: BlockState | None = None
+) -> dict[int, BlockState]:
+    """The inbox, under its number, without what waited for these blocks and with arrivals; nothing where that
+    leaves it as it was."""
+    inbox, taken = scene.inbox, any(scene.mail(block) is not None for block in blocks)
+    come = [] if arrivals is None or not len(arrivals) else [arrivals]
+    if not taken and not come:
+        return {}
+    if inbox is not None:
+        come = [without(scene, inbox, blocks), *come]
+    return {INBOX: replace(join(come), clocks=Clocks())}
+
+
+def without(scene: StoredScene, state: BlockState, blocks: Iterable[int]) -> BlockState:
+    """Those of a state that lie in none of these blocks."""
+    return state[~torch.isin(_owner(scene, state), torch.tensor(sorted(blocks)))]
 
 
 def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockState]:
     """Every block with its part of the scaffold and of the reserve, which is empty from then on.
 
     Raises:
-        KeyError: the store holds no reserve.
+        KeyError: there is no reserve.
     """
-    waiting = _at_rest(scene, RESERVE).to(state.gaussians.device)
+    waiting = scene.state(RESERVE)
     trained, arrivals = part(state, _owner(scene, state)), part(put_to_wait(waiting), _owner(scene, waiting))
-    nobody = replace(waiting[:0], clocks=state.clocks)
+    nobody = replace(waiting.nobody, clocks=state.clocks)
     settled = {
         block: trained.get(block, nobody).joined_by(arrivals.get(block, nobody))
         for block in range(scene.tree.num_blocks)
     }
-    return {**settled, RESERVE: waiting[:0]}
+    return {**settled, RESERVE: waiting.nobody}
 
 
 def has_scaffold(scene: StoredScene) -> bool:
     """Whether the scene begins with a warm-up; the reserve may be empty."""
-    return RESERVE in scene.store.blocks
-
-
-def _at_rest(scene: StoredScene, block: int) -> BlockState:
-    return BlockState.from_tensors(*scene.store.load(block))
+    return scene.has(RESERVE)
 
 
 def _owner(scene: StoredScene, state: BlockState) -> Tensor:
-    return scene.tree.assign(state.gaussians.means.cpu()).to(state.gaussians.device)
+    return scene.tree.assign(state.gaussians.means)

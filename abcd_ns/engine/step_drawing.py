@@ -97,7 +97,7 @@ class StepDrawing(ABC):
     @property
     def _degree_drawn(self) -> int:
         """The degree of spherical harmonics in this step."""
-        changes = self._active.is_whole or self.config.sh_restart
+        changes = self._active.is_alone or self.config.sh_restart
         return self.sh_degree if changes else self._active.sh_degree
 
     def render(self, batch: Batch) -> Rendered:

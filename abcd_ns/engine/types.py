@@ -39,6 +39,11 @@ class Gaussians:
         return self.means.device
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of all parameters."""
+        return sum(value.nbytes for _, value in self.items())
+
+    @property
     def sh_degree(self) -> int:
         """The highest degree of spherical harmonics that is stored."""
         return int((self.features_rest.shape[1] + 1) ** 0.5) - 1

@@ -12,7 +12,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.events import Event, LayersDrawn
-from abcd_ns.engine.storage import crash_points
+from abcd_ns.engine.storage import StoreError, crash_points
 from abcd_ns.engine.storage.atomic import TEMPORARY_SUFFIX, fsync_folder
 from abcd_ns.errors import UserError
 from abcd_ns.plugin.input_errors import exit_on_user_error, print_error
@@ -77,8 +77,17 @@ class AbcdTrainer(Trainer):
         except (UserError, torch.cuda.OutOfMemoryError) as error:
             self._end_report()
             print_error(str(error) if isinstance(error, UserError) else self._memory_is_full())
+            try:
+                self.pipeline.coordinator.scene.flush()
+            except StoreError as refused:
+                if not isinstance(error, StoreError):
+                    print_error(str(refused))
             self._say_how_to_go_on()
             raise SystemExit(2) from None
+        except Exception:
+            with suppress(StoreError):  # what went wrong first is what matters
+                self.pipeline.coordinator.scene.flush()
+            raise
 
     def _memory_is_full(self) -> str:
         limit = self.pipeline.coordinator.config.block_limit

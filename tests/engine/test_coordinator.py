@@ -6,14 +6,14 @@ import math
 import pytest
 import torch
 
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite, fold
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import LayersDrawn, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.ordering import front_to_back
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import RunState
-from abcd_ns.engine.scaffold import LIVE
+from abcd_ns.engine.settle import with_mail
+from abcd_ns.engine.special_blocks import LIVE
 from abcd_ns.engine.storage import StaleLayerError
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
@@ -144,12 +144,11 @@ def test_nothing_is_lost_when_gaussians_migrate(tmp_path, views, photos, start, 
         with torch.no_grad():
             noise = torch.randn(coordinator.params["means"].shape, generator=generator)
             coordinator.params["means"].add_(0.05 * noise)
-        store, tree = coordinator.scene.store, coordinator.scene.tree
-        assert sum(store.counts(b) for b in range(tree.num_blocks)) == total
+        assert coordinator.count() == total
         if coordinator.state.active is None:
-            for b in range(tree.num_blocks):
-                state = BlockState.from_tensors(*store.load(b))
-                assert bool((tree.assign(state.gaussians.means) == b).all())
+            for b in range(coordinator.scene.tree.num_blocks):
+                means = with_mail(coordinator.scene, b).gaussians.means
+                assert bool((coordinator.scene.tree.assign(means) == b).all())
     assert (moved > 0) == (blocks > 1)
 
 
@@ -164,10 +163,12 @@ def test_migrants_take_their_moments_along(tmp_path, views, photos, start):
         coordinator.params["means"][0] = coordinator.scene.gaussians(1 - block).means[0]
     moments = coordinator.optimizers["scales"].state[coordinator.params["scales"]]["exp_avg"]
     row = coordinator.params["scales"][0].detach().clone()
-    arrived_before = coordinator.scene.store.counts(1 - block)
+    arrived_before, at_rest = coordinator.scene.count(1 - block), coordinator.scene.state(1 - block)
     train_step(coordinator, photos)
-    arrived = BlockState.from_tensors(*coordinator.scene.store.load(1 - block))
-    assert len(arrived) == arrived_before + 1
+    assert coordinator.scene.state(1 - block) is at_rest
+    arrived = with_mail(coordinator.scene, 1 - block)
+    assert len(arrived) == coordinator.scene.count(1 - block) == arrived_before + 1
+    assert equal(coordinator.scene.gaussians(1 - block), arrived.gaussians)
     assert torch.allclose(arrived.gaussians.scales[-1], row, atol=0.02)
     assert torch.allclose(arrived.exp_avg.scales[-1], moments[0], atol=1e-3)
     assert float(arrived.exp_avg.scales[-1].abs().max()) > 0
@@ -217,7 +218,8 @@ def test_a_frozen_block_that_changes_during_a_visit_is_noticed(tmp_path, views, 
     coordinator = make_coordinator(tmp_path, start, views, blocks=3, steps=30)
     train_step(coordinator, photos)
     other = next(b for b in range(3) if b != coordinator._active.geometry.block)
-    coordinator.scene.store.commit({other: coordinator.scene.store.load(other)})
+    scene = coordinator.scene
+    scene.rest(scene.tree, {other: scene.state(other)}, coordinator.state.to_json())
     with pytest.raises(StaleLayerError):
         train_step(coordinator, photos)
 

@@ -52,6 +52,26 @@ def test_a_run_killed_at_a_bad_moment_ends_as_it_would_have(runs, undisturbed, t
     assert digest(tmp_path) == digest(undisturbed)
 
 
+WRITING = [
+    crash_points.FILE_WRITTEN,
+    crash_points.FILE_SYNCED,
+    crash_points.FILE_IN_PLACE,
+    crash_points.SHARDS_IN_PLACE,
+    crash_points.GENERATION_PUBLISHED,
+    crash_points.SHARD_DELETED,
+]
+
+
+@pytest.mark.parametrize("point", WRITING)
+def test_a_run_killed_while_it_writes_beside_the_training_ends_as_it_would_have(
+    runs, undisturbed, tmp_path, point
+):
+    assert runs.finish(tmp_path, kill=Kill(point, 9), commit_seconds=0.02) == -9
+    assert lost_steps(tmp_path) == 0
+    assert runs.finish(tmp_path, commit_seconds=0.02) == 0
+    assert digest(tmp_path) == digest(undisturbed)
+
+
 def test_a_run_that_the_disk_refuses_goes_on_when_there_is_room(runs, undisturbed, tmp_path):
     largest = max(path.stat().st_size for path in (undisturbed / "store").glob("*.safetensors"))
     assert runs.finish(tmp_path, file_bytes=largest - 1) == DISK_FULL

@@ -5,12 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.compositing import composite
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.exact import ExactCoordinator
-from abcd_ns.engine.scaffold import LIVE
+from abcd_ns.engine.special_blocks import LIVE
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
@@ -174,9 +173,7 @@ def test_views_of_a_step_may_differ_in_size(tmp_path):
         coordinator = make_coordinator(folder, start, views, kind=kind, **options)
         train_step(coordinator, photos)
         coordinator.save()
-        state = BlockState.from_tensors(
-            *coordinator.scene.store.load(0 if kind is ExactCoordinator else LIVE)
-        )
+        state = coordinator.scene.state(0 if kind is ExactCoordinator else LIVE)
         counted.append(state.growth)
     exactly, jointly = counted
     assert torch.equal(exactly["count"], jointly["count"])

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from abcd_ns.engine import health_rules
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
 from abcd_ns.engine.health import Health
@@ -17,6 +16,7 @@ from abcd_ns.engine.memory import OutOfRoomError, bytes_for, check_room
 from abcd_ns.engine.param_swap import attach
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import RunState
+from abcd_ns.engine.settle import with_mail
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
@@ -76,7 +76,7 @@ def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(
     assert sum(event.count for event in told) == 12
     assert sum(record.gradients for record in coordinator.state.health.values()) == 12
     for block in range(blocks):
-        tensors, _ = coordinator.scene.store.load(block)
+        tensors, _ = coordinator.scene.state(block).to_tensors()
         assert all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values())
 
 
@@ -151,8 +151,7 @@ def test_a_visit_that_made_its_pictures_worse_is_undone(tmp_path, views, photos,
 
     def remember(event) -> None:
         if isinstance(event, VisitEnded):
-            store = coordinator.scene.store
-            states.append([BlockState.from_tensors(*store.load(b)) for b in range(2)])
+            states.append([with_mail(coordinator.scene, b) for b in range(2)])
 
     coordinator.announce.subscribe(remember)
     darkened(coordinator, photos, visit=2)

@@ -5,7 +5,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.loss import photometric_loss
@@ -41,7 +40,7 @@ def test_moments_are_forgotten_at_the_next_visit_only_when_asked(tmp_path, views
     train(coordinator, photos, steps=6)
     coordinator.next_batch()
     block = coordinator.state.active.geometry.block
-    stored = BlockState.from_tensors(*coordinator.scene.store.load(block))
+    stored = coordinator.scene.state(block)
     assert stored.clocks.adam_views == 3
     adam = coordinator.optimizers["scales"].state[coordinator.params["scales"]]
     assert int(adam["step"]) == (3 if keep else 0)

@@ -139,8 +139,8 @@ def test_opening_what_is_no_store_says_so(tmp_path, store):
     with pytest.raises(StoreError, match="already holds a store"):
         ParameterStore.create(store.folder, {})
     manifest = store.folder / "manifest.json"
-    manifest.write_bytes(manifest.read_bytes().replace(b'"version": 2', b'"version": 3'))
-    with pytest.raises(StoreError, match=r"format version 3.*version 2"):
+    manifest.write_bytes(manifest.read_bytes().replace(b'"version":3', b'"version":4'))
+    with pytest.raises(StoreError, match=r"format version 4.*version 3"):
         ParameterStore.open(store.folder)
 
 

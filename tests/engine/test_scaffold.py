@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.initialize import split_off
 from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.scaffold import RESERVE, REVEALED_OPACITY, WAITING, blocks_at_rest
+from abcd_ns.engine.scaffold import REVEALED_OPACITY, WAITING, blocks_at_rest
 from abcd_ns.engine.schedule import WARM_UP_BATCH
+from abcd_ns.engine.special_blocks import RESERVE
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import make_coordinator, whole_scene
@@ -72,10 +72,10 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
     coordinator.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
     train(coordinator, photos, steps=10)
     assert coordinator.state.active is None
-    scene, store = coordinator.scene, coordinator.scene.store
-    assert store.counts(RESERVE) == 0
+    scene = coordinator.scene
+    assert scene.rows(RESERVE) == 0
     for block in range(4):
-        state = BlockState.from_tensors(*store.load(block))
+        state = scene.state(block)
         assert bool((scene.tree.assign(state.gaussians.means) == block).all())
         waits = state.gaussians.opacities[:, 0] == WAITING
         trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)

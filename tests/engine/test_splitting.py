@@ -8,8 +8,8 @@ from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import BlockSplit, VisitBegan
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.run_state import RunState
-from abcd_ns.engine.scaffold import RESERVE
 from abcd_ns.engine.schedule import VisitPlan
+from abcd_ns.engine.special_blocks import RESERVE
 from abcd_ns.engine.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.training_loop import train, train_step
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene

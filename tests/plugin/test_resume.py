@@ -98,7 +98,9 @@ def test_only_the_visit_under_way_is_lost(data, undisturbed, tmp_path):
         if store.generation not in [generation for generation, _ in ends]:
             ends.append((store.generation, trainer.pipeline.coordinator.state.step))
 
-    stopped = run(configure(data, tmp_path / "stopped"), stop_after=29, after_step=note)
+    config = configure(data, tmp_path / "stopped")
+    config.pipeline.training.commit_seconds = 0.0
+    stopped = run(config, stop_after=29, after_step=note)
     resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped.checkpoint_dir))
     assert resumed.resumed_from.step == ends[-1][1] > 2 * STEPS_PER_SAVE + 1
     assert_same(resumed.base_dir, undisturbed)

@@ -47,11 +47,16 @@ class Kill:
 
 
 def run(
-    folder: Path, kill: Kill | None = None, file_bytes: int | None = None, failing_file: int | None = None
+    folder: Path,
+    kill: Kill | None = None,
+    file_bytes: int | None = None,
+    failing_file: int | None = None,
+    commit_seconds: float = 0.0,
 ) -> None:
     """Train from where `folder` stands to the end; the body of a process.
 
     Args:
+        commit_seconds: as of TrainingConfig. With 0 the run says at the end of each visit that it is safe.
         file_bytes: no file may grow above this, as on a full disk.
         failing_file: the n-th file that is written, counted from 1, has no room.
     """
@@ -65,7 +70,7 @@ def run(
     if file_bytes is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, most))
     try:
-        _train(folder)
+        _train(folder, commit_seconds)
     except (StoreError, OSError) as error:
         resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
         (folder / "error.txt").write_text(str(error))
@@ -112,22 +117,23 @@ def points_reached(folder: Path) -> dict[str, int]:
     return counts
 
 
-def _train(folder: Path) -> None:
+def _train(folder: Path, commit_seconds: float = 0.0) -> None:
     views = ring_of_views(3, width=24, height=18)
     photos = Photos(random_gaussians(60, seed=7, size=0.12), views)
     with LayerCache(folder / "layers", 1 << 22) as cache:
-        coordinator = _open(folder, views, cache)
-        coordinator.announce.subscribe(lambda event: _note(folder, coordinator, event))
+        coordinator = _open(folder, views, cache, commit_seconds)
+        if commit_seconds == 0:
+            coordinator.announce.subscribe(lambda event: _note(folder, coordinator, event))
         while not coordinator.finished:
             train_step(coordinator, photos)
             if coordinator.state.step % SAVE_EVERY == 0:
                 coordinator.save(pin="saved")
                 _write(folder, coordinator.state.step)
         coordinator.save()
-        coordinator.scene.store.close()
+        coordinator.close()
 
 
-def _open(folder: Path, views: list, cache: LayerCache) -> Coordinator:
+def _open(folder: Path, views: list, cache: LayerCache, commit_seconds: float) -> Coordinator:
     """Go on from a clone of what is there, as the trainer does with --load-dir, or begin."""
     start = random_gaussians(60, seed=1, size=0.12)
     resume = begun(folder)
@@ -154,6 +160,7 @@ def _open(folder: Path, views: list, cache: LayerCache) -> Coordinator:
         cache=cache,
         at_hand_bytes=AT_HAND_BYTES,
         density=density,
+        commit_seconds=commit_seconds,
     )
 
 

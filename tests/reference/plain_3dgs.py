@@ -9,14 +9,7 @@ from abcd_ns.engine.density import DensityClock, DensityControl
 from abcd_ns.engine.loss import photometric_loss
 from abcd_ns.engine.param_swap import LEARNING_RATES
 from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
-from abcd_ns.engine.schedule import (
-    exponential_decay,
-    passes_of_sweep,
-    plan_sweep,
-    sh_degree_at,
-    view_order,
-    visit_views,
-)
+from abcd_ns.engine.schedule import endless_order, exponential_decay, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.scenes import Photos
 
@@ -63,17 +56,8 @@ def train_plain(
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 
 
-def _shuffled(views: int, visits: int, seed: int) -> tuple[int, ...]:
-    return visit_views(tuple(range(views)), views, visits, seed)
-
-
 def _rows(views: list[View], steps: int, config: TrainingConfig):
-    """(view, degree) of each step; the degree changes between visits only, as in a run of blocks."""
-    taken, sweep = 0, 0
-    while taken < steps:
-        passes = passes_of_sweep(sweep, config.first_passes, config.last_passes)
-        (plan,) = plan_sweep(sweep, {0: len(views)}, passes, steps - taken, config.seed)
+    """(view, degree) of each step."""
+    for taken in range(steps):
         degree = sh_degree_at(taken / steps, config.sh_ramp, config.sh_degree)
-        for row in view_order(_shuffled(len(views), sweep, config.seed), plan.steps, sweep, config.seed):
-            yield row, degree
-        taken, sweep = taken + plan.steps, sweep + 1
+        yield endless_order(tuple(range(len(views))), taken, config.seed), degree

@@ -8,11 +8,13 @@ import pytest
 import torch
 from plyfile import PlyData
 
+from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.frames import Frame
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.run_state import RunState
 from abcd_ns.engine.scaffold import blocks_at_rest
+from abcd_ns.engine.special_blocks import INBOX
 from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.errors import UserError
 from abcd_ns.tools.export.command import TRANSFORMS, export
@@ -53,6 +55,16 @@ def positions(vertices) -> np.ndarray:
 
 def by_position(vertices) -> np.ndarray:
     return vertices[np.lexsort([vertices[axis] for axis in "xyz"])]
+
+
+def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, tmp_path):
+    assert export(run, out=tmp_path / "before.ply") == 0
+    with ParameterStore.open(run / "abcd/store") as store:
+        state = BlockState.from_tensors(*store.load(0))
+        store.commit({0: state[3:].to_tensors(), INBOX: state[:3].to_tensors()})
+    assert export(run, out=tmp_path / "after.ply") == 0
+    before, after = by_position(read(tmp_path / "before.ply")), by_position(read(tmp_path / "after.ply"))
+    assert np.array_equal(before, after)
 
 
 def test_in_the_runs_own_frame_every_value_is_what_is_stored(run, scene, tmp_path):

@@ -6,8 +6,8 @@ import pytest
 
 from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, RunState
-from abcd_ns.engine.scaffold import WHOLE
 from abcd_ns.engine.schedule import VisitPlan
+from abcd_ns.engine.special_blocks import WHOLE
 from abcd_ns.engine.types import Crop
 from abcd_ns.engine.visit import VisitGeometry
 from abcd_ns.viewer.board import MOST_POINTS, BlockRow, Board, Status, seconds_left, sweep_share

@@ -3,14 +3,14 @@
 import hashlib
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from abcd_ns.errors import UserError
 
 FORMAT = "abcd-parameter-store"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 
 class StoreError(UserError):
@@ -29,6 +29,8 @@ class Shard:
     """blake2b of the whole file, hexadecimal."""
     rows: int
     """Rows of the tensor "means"."""
+    meta: dict[str, Any]
+    """The block's JSON: known without opening the file."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,13 @@ class Manifest:
         return {shard.file for shard in self.blocks.values()}
 
     def to_bytes(self) -> bytes:
-        """Canonical JSON: equal manifests give equal bytes."""
-        body = asdict(self) | {"blocks": {str(b): asdict(shard) for b, shard in sorted(self.blocks.items())}}
-        envelope = {"format": FORMAT, "version": FORMAT_VERSION, "checksum": _checksum(body), "body": body}
-        return _canonical(envelope)
+        """As JSON.
+
+        Raises:
+            TypeError, ValueError: something in it is not JSON.
+        """
+        blocks = {str(block): vars(shard) for block, shard in sorted(self.blocks.items())}
+        return _in_envelope(_compact({**vars(self), "blocks": blocks}))
 
     @staticmethod
     def from_bytes(data: bytes, path: Path) -> "Manifest":
@@ -70,9 +75,18 @@ class Manifest:
                 "Open it with the program that wrote it."
             )
         body = envelope.get("body")
-        # Comparing the bytes as well finds alterations that JSON reads as the same value.
-        if envelope.get("checksum") != _checksum(body) or _canonical(envelope) != data:
+        # Comparing bytes finds alterations, too, that JSON reads as the same value.
+        if _in_envelope(_compact(body)) != data:
             raise StoreError(f"{path} is damaged: its checksum is wrong. Restore it from a pin or a copy.")
+        return Manifest._of(body)
+
+    @staticmethod
+    def written(data: bytes) -> "Manifest":
+        """The manifest that was just written as `data`: shares nothing with the one that it was made from."""
+        return Manifest._of(json.loads(data)["body"])
+
+    @staticmethod
+    def _of(body: dict[str, Any]) -> "Manifest":
         blocks = {int(block): Shard(**shard) for block, shard in body["blocks"].items()}
         return Manifest(body["generation"], body["header"], body["state"], blocks)
 
@@ -127,17 +141,6 @@ def read_checked_manifest(path: Path) -> Manifest:
         # A writer has committed meanwhile, and deleted shards of the generation read here.
 
 
-def json_copy(value: dict[str, Any]) -> dict[str, Any]:
-    """`value` as it will be after a reopen: tuples are lists, keys are strings.
-
-    Raises:
-        TypeError, ValueError: no dictionary, or something in it is not JSON.
-    """
-    if not isinstance(value, dict):
-        raise TypeError(f"A store keeps JSON dictionaries, not {type(value).__name__}.")
-    return json.loads(json.dumps(value))
-
-
 def _missing_or_resized(folder: Path, manifest: Manifest) -> str | None:
     for shard in manifest.blocks.values():
         path = folder / shard.file
@@ -150,9 +153,11 @@ def _missing_or_resized(folder: Path, manifest: Manifest) -> str | None:
     return None
 
 
-def _canonical(value: Any) -> bytes:
-    return json.dumps(value, sort_keys=True, indent=1).encode()
+def _compact(body: Any) -> bytes:
+    return json.dumps(body, separators=(",", ":")).encode()
 
 
-def _checksum(body: Any) -> str:
-    return hashlib.blake2b(_canonical(body), digest_size=16).hexdigest()
+def _in_envelope(body: bytes) -> bytes:
+    checksum = hashlib.blake2b(body, digest_size=16).hexdigest()
+    head = f'{{"format":"{FORMAT}","version":{FORMAT_VERSION},"checksum":"{checksum}","body":'
+    return head.encode() + body + b"}"

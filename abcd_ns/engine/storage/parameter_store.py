@@ -1,7 +1,6 @@
 """Blocks on disk: one immutable shard per block and generation, and one manifest that names those in use."""
 
 import copy
-import json
 import shutil
 import warnings
 from collections.abc import Iterable, Mapping
@@ -18,7 +17,6 @@ from abcd_ns.engine.storage.atomic import FolderLock, fsync_folder, remove_tempo
 from abcd_ns.engine.storage.manifest import (
     Manifest,
     Shard,
-    json_copy,
     manifest_path,
     pin_names,
     read_checked_manifest,
@@ -53,14 +51,14 @@ class ParameterStore:
             FolderLockedError: another writer has it.
         """
         folder = Path(folder)
-        manifest = Manifest(0, json_copy(header), {}, {})
+        data = Manifest(0, header, {}, {}).to_bytes()
         lock = _claim(folder)
         try:
-            write_file(manifest_path(folder), manifest.to_bytes())
+            write_file(manifest_path(folder), data)
         except OSError as error:
             lock.release()
             raise StoreError(f"No store can be made in {folder}: {error.strerror}.") from error
-        return cls(folder, manifest, lock)
+        return cls(folder, Manifest.written(data), lock)
 
     @classmethod
     def open(
@@ -144,6 +142,10 @@ class ParameterStore:
         """The rows of the block's tensor "means"; 0 if it has none."""
         return self._shard(block).rows
 
+    def meta(self, block: int) -> dict[str, Any]:
+        """A copy of the block's JSON; no file is read."""
+        return copy.deepcopy(self._shard(block).meta)
+
     def load(self, block: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """All tensors of a block, on the CPU and owning their memory, and its JSON; checked each time.
 
@@ -151,7 +153,8 @@ class ParameterStore:
             KeyError: no such block.
             StoreError: the shard is missing, unreadable or altered.
         """
-        return self._read(block, None)
+        tensors, shard = self._read(block, None)
+        return tensors, copy.deepcopy(shard.meta)
 
     def load_names(self, block: int, names: Iterable[str]) -> dict[str, Tensor]:
         """Only these tensors of a block; the rest of the shard is not read once it was checked.
@@ -187,18 +190,17 @@ class ParameterStore:
                 raise ValueError(f"A block's number must not be negative; got {block}.")
         old = self._manifest
         generation = old.generation + 1
-        metas = {block: json.dumps(json_copy(meta)) for block, (_, meta) in updates.items()}
         new = replace(
             old,
             generation=generation,
-            header=old.header if header is None else json_copy(header),
-            state=old.state if state is None else json_copy(state),
+            header=old.header if header is None else header,
+            state=old.state if state is None else state,
         )
         try:
             self._require_space(sum(data_nbytes(tensors) for tensors, _ in updates.values()))
             shards = {
-                block: write_shard(self.folder, block, generation, tensors, metas[block])
-                for block, (tensors, _) in updates.items()
+                block: write_shard(self.folder, block, generation, tensors, meta)
+                for block, (tensors, meta) in updates.items()
             }
             fsync_folder(self.folder)
             crash_points.reached(crash_points.SHARDS_IN_PLACE)
@@ -302,7 +304,7 @@ class ParameterStore:
         except KeyError:
             raise KeyError(f"{self.folder} has no block {block}; it has {self.blocks}.") from None
 
-    def _read(self, block: int, names: list[str] | None) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def _read(self, block: int, names: list[str] | None) -> tuple[dict[str, Tensor], Shard]:
         while True:
             shard = self._shard(block)
             path = self.folder / shard.file
@@ -310,8 +312,7 @@ class ParameterStore:
                 if names is None or shard.file not in self._verified:
                     verify_shard(path, shard)
                     self._verified.add(shard.file)
-                tensors, meta = read_shard(path, names)
-                return tensors, json.loads(meta)
+                return read_shard(path, names), shard
             except FileNotFoundError as error:
                 if self._shard(block) == shard:
                     raise StoreError(
@@ -336,8 +337,9 @@ class ParameterStore:
 
     def _publish(self, manifest: Manifest) -> None:
         """Make `manifest` the present one, on disk and here. Its shards must be on disk."""
-        write_file(manifest_path(self.folder), manifest.to_bytes())
-        self._manifest = manifest
+        data = manifest.to_bytes()
+        write_file(manifest_path(self.folder), data)
+        self._manifest = Manifest.written(data)
         crash_points.reached(crash_points.GENERATION_PUBLISHED)
 
     def _roll_back(self, old: Manifest) -> str:

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import torch
 from safetensors import safe_open
@@ -16,11 +16,12 @@ from torch import Tensor
 from abcd_ns.engine.storage.atomic import replacing
 from abcd_ns.engine.storage.manifest import Shard, StoreError
 
-_META = "abcd"  # the entry of the file's safetensors metadata that holds the block's JSON
 _CHUNK = 1 << 20
 
 
-def write_shard(folder: Path, block: int, generation: int, tensors: Mapping[str, Tensor], meta: str) -> Shard:
+def write_shard(
+    folder: Path, block: int, generation: int, tensors: Mapping[str, Tensor], meta: dict[str, Any]
+) -> Shard:
     """Write a block and sync it; the folder is left for the caller to sync.
 
     Raises:
@@ -28,12 +29,12 @@ def write_shard(folder: Path, block: int, generation: int, tensors: Mapping[str,
     """
     path = folder / f"block-{block:06d}-{generation:08d}.safetensors"
     with replacing(path) as temporary:
-        save_file(_plain(tensors), temporary, metadata={_META: meta})
+        save_file(_plain(tensors), temporary)
         with open(temporary, "rb") as file:
             checksum = _checksum(file)
             nbytes = file.tell()
     rows = tensors["means"].shape[0] if "means" in tensors else 0
-    return Shard(path.name, generation, nbytes, checksum, rows)
+    return Shard(path.name, generation, nbytes, checksum, rows, meta)
 
 
 def verify_shard(path: Path, shard: Shard) -> None:
@@ -48,8 +49,8 @@ def verify_shard(path: Path, shard: Shard) -> None:
             raise StoreError(f"{path} is damaged: its checksum is wrong. Go back to a pinned generation.")
 
 
-def read_shard(path: Path, names: Iterable[str] | None) -> tuple[dict[str, Tensor], str]:
-    """The tensors of these names, or all, on the CPU, and the block's JSON.
+def read_shard(path: Path, names: Iterable[str] | None) -> dict[str, Tensor]:
+    """The tensors of these names, or all, on the CPU.
 
     Raises:
         KeyError: no tensor of this name.
@@ -62,7 +63,7 @@ def read_shard(path: Path, names: Iterable[str] | None) -> tuple[dict[str, Tenso
             if name not in present:
                 raise KeyError(f"{path} has no tensor {name!r}; it has {sorted(present)}.")
         # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
-        return {name: file.get_tensor(name).clone() for name in wanted}, file.metadata()[_META]
+        return {name: file.get_tensor(name).clone() for name in wanted}
 
 
 def _opened(path: Path) -> safe_open:

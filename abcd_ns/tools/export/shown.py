@@ -11,6 +11,7 @@ from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.frames import Frame
 from abcd_ns.engine.rasterizer.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.run_state import RunState
+from abcd_ns.engine.special_blocks import INBOX
 from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
@@ -39,25 +40,23 @@ class Shown:
                 f"{self.store.folder}: no block has been trained yet. Wait until the warm-up is over, or use "
                 "`ns-export gaussian-splat` on a checkpoint."
             )
-        self.blocks = range(BlockTree.from_json(self.store.header["tree"]).num_blocks)
+        self._tree = BlockTree.from_json(self.store.header["tree"])
+        self.blocks = range(self._tree.num_blocks)
         self.largest, self.size = 0.0, 0.0
 
     @cached_property
     def sh_degree(self) -> int:
         """Of all its Gaussians."""
-        block = next(block for block in self.blocks if self.store.counts(block))
-        return Gaussians(**self.store.load_names(block, PARAM_NAMES)).sh_degree
+        return Gaussians(**self._load(0, PARAM_NAMES)).sh_degree
 
     def count(self, block: int) -> int:
         """How many of the block's Gaussians are to be written."""
-        if self.store.counts(block) == 0:
-            return 0
-        found = self.store.load_names(block, ("means", "opacities"))
+        found = self._load(block, ("means", "opacities"))
         return int(self._kept(self._placed(found["means"]), found["opacities"]).sum())
 
     def gaussians(self, block: int) -> Gaussians:
         """Those Gaussians."""
-        found = Gaussians(**self.store.load_names(block, PARAM_NAMES))
+        found = Gaussians(**self._load(block, PARAM_NAMES))
         found = found[self._kept(self._placed(found.means), found.opacities)]
         if self.to is None or not len(found):
             return found
@@ -65,6 +64,15 @@ class Shown:
         self.largest = max(self.largest, float(exact.abs().max()))
         self.size = max(self.size, float((exact.amax(0) - exact.amin(0)).max()))
         return self.to.gaussians(found)
+
+    def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
+        """These parameters, the means among them, of the block and of those that wait for its next visit."""
+        found = self.store.load_names(block, names)
+        if INBOX not in self.store.blocks:
+            return found
+        inbox = self.store.load_names(INBOX, names)
+        here = self._tree.assign(inbox["means"]) == block
+        return {name: torch.cat([value, inbox[name][here]]) for name, value in found.items()}
 
     def _placed(self, means: Tensor) -> Tensor:
         return means.double() if self.to is None else self.to.points(means)

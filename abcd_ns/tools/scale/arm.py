@@ -87,10 +87,12 @@ def run(job: ArmJob, folder: Path) -> Arm:
     coordinator = _coordinator(job, land, store, rasterizer, device, folder)
     watch = _Watch(coordinator)
     cameras = {view.index: view for view in land.cameras()}
-    wanted = MONOLITHIC_STEPS if job.monolithic else None
+    # The visit to a single block lasts as long as the run.
+    wanted = MONOLITHIC_STEPS if job.tiles == 1 or job.monolithic else None
     while len(watch.visits) < job.visits if wanted is None else coordinator.state.step < wanted:
         train_step(coordinator, lambda view, crop: land.photo(cameras[view], crop))
     allocated, reserved = peak_device_bytes()
+    coordinator.close()
     visits = watch.visits[1:] or watch.visits  # the first one's time holds the planning of the sweep
     return Arm(
         tiles=job.tiles,

@@ -2,7 +2,6 @@
 
 import torch
 
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.health_record import standing
@@ -99,10 +98,7 @@ def observed(lab: Lab) -> Finding:
     same = equal(coordinator.scene.gaussians(at[0]), unseen)
     passed = same and "no view" in words[0] and "1 view" in words[1] and "2 views" in words[2]
     said = {"abcd": "; ".join(f"{count} cameras: {text}" for count, text in words.items())}
-    visits = {
-        f"visits with {count}": BlockState.from_tensors(*coordinator.scene.store.load(b)).clocks.visits
-        for count, b in at.items()
-    }
+    visits = {f"visits with {count}": coordinator.scene.clocks(b).visits for count, b in at.items()}
     mono = lab.coordinator(start, stage.views, "abcd-monolithic", budget=lab.views_drawn(100), density=STILL)
     lab.finish(mono, stage)
     below = merged(mono).means[:, 2] < -15.0

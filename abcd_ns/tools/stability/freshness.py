@@ -28,8 +28,8 @@ def is_noticed(lab: Lab, stage: Stage) -> bool:
     coordinator = lab.coordinator(stage.start(), stage.views, budget=200, blocks=3, warmup=0.0)
     lab.finish(coordinator, stage, steps=1)
     other = next(b for b in range(3) if b != coordinator.state.active.geometry.block)
-    store = coordinator.scene.store
-    store.commit({other: store.load(other)})
+    scene = coordinator.scene
+    scene.rest(scene.tree, {other: scene.state(other)}, coordinator.state.to_json())
     try:
         lab.finish(coordinator, stage, steps=1)
     except StaleLayerError:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import torch
 
-from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.compositing import composite
 from abcd_ns.engine.coordinator import Coordinator
@@ -65,7 +64,7 @@ def poison(optimizers: Optimizers, params: dict) -> None:
 def stored_soundly(trained: Trained) -> bool:
     """Whether all that the store holds, moments and statistics included, are numbers."""
     scene = trained.coordinator.scene
-    loaded = [scene.store.load(block)[0] for block in range(scene.tree.num_blocks)]
+    loaded = [scene.state(block).to_tensors()[0] for block in range(scene.tree.num_blocks)]
     return all(bool(torch.isfinite(value).all()) for tensors in loaded for value in tensors.values())
 
 
@@ -123,9 +122,9 @@ def bright_and_hidden(lab: Lab) -> Finding:
     # Behind half a pane, 1.6 is 0.8: it must not be clipped before that.
     dimmed = float(composite(replace(back, color=0.5 * back.color), torch.zeros(3)).max())
     coordinator, core = hidden_block(lab)
-    state, stored = coordinator.state, BlockState.from_tensors(*coordinator.scene.store.load(core))
+    state = coordinator.state
     words = standing(core, state.health.get(core), state.views)
-    visits = stored.clocks.visits
+    visits = coordinator.scene.clocks(core).visits
     passed = brightest > 1.5 and dimmed > 0.75 and "hidden" in words and visits == 1
     said = {"abcd": f"colour {brightest:.2f} kept; the block behind the wall is {words}"}
     return Finding(passed, said, {"brightest": brightest, "dimmed": dimmed})
