@@ -34,10 +34,10 @@ import tyro
 
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.layer_store import LayerStore
 from abcd_ns.engine.rasterizer import make_rasterizer
 from abcd_ns.engine.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.engine.visit import VisitLayers
 from tests.reference.device_counts import Counts
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
@@ -106,13 +106,13 @@ class Watch:
 
     @contextmanager
     def layers_in(self) -> Iterator[None]:
-        """Count the copies that VisitLayers makes, whoever calls it."""
-        originals = VisitLayers._keep, VisitLayers._cached
-        VisitLayers._keep, VisitLayers._cached = map(self._counted, originals)
+        """Count the copies that LayerStore makes, whoever calls it."""
+        originals = LayerStore.put, LayerStore.get
+        LayerStore.put, LayerStore.get = map(self._counted, originals)
         try:
             yield
         finally:
-            VisitLayers._keep, VisitLayers._cached = originals
+            LayerStore.put, LayerStore.get = originals
 
     def _counted(self, method: Callable[..., Any]) -> Callable[..., Any]:
         def counted(*args: Any) -> Any:
@@ -160,7 +160,7 @@ def run(args: Args, blocks: int, folder: Path) -> dict[str, Any]:
     began = time.perf_counter()
     with simulated_device() as counts, lent():
         rasterizer = make_rasterizer("auto", DEVICE)
-        options = {"steps": args.steps, "seed": args.seed, "density": GROWS, "bits": 16, "warmup": 0.0}
+        options = {"steps": args.steps, "seed": args.seed, "density": GROWS, "warmup": 0.0}
         coordinator = make_coordinator(
             folder, start, views, blocks=blocks, rasterizer=rasterizer, device=DEVICE, **options
         )

@@ -28,13 +28,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from abcd_ns.engine.storage import ParameterStore, StoreError, crash_points
 from tests.plugin.crash_training import Trainings, gaussians, run_folder
-from tests.reference.cache_file import fill_cache, look_at_cache
 from tests.reference.colmap_scene import write_scene
 from tests.reference.crash_runs import DISK_FULL, Kill, Runs, digest, lost_steps, points_reached
 
 KILLED = -signal.SIGKILL
 TRAINING_STEPS = 36
-IMPORTED = ("tests.plugin.crash_training", "tests.reference.cache_file", "tyro", "rich.progress")
+IMPORTED = ("tests.plugin.crash_training", "tyro", "rich.progress")
 """What processes import of this module's own imports, once for all of them."""
 SECONDS_BETWEEN_LINES = 10.0
 """Where the output is no terminal."""
@@ -186,16 +185,6 @@ class Bench:
             for _ in range(self.args.flips // 3):
                 bit = self.random.randrange(8 * size)
                 yield Trial("a bit flipped in a store's file", partial(self._alter, path.name, None, bit))
-        cache = self.folder / "cache"
-        fill_cache(cache)
-        for path in sorted(cache.iterdir()):
-            size = path.stat().st_size
-            for length in sorted({0, 1, size // 2, max(size - 1, 0)}):
-                yield Trial("a cache's file cut short", partial(self._spoil, cache, path.name, length, None))
-        size = (cache / "data.mdb").stat().st_size
-        for _ in range(self.args.flips // 10):
-            bit = self.random.randrange(8 * size)
-            yield Trial("a bit flipped in a cache's file", partial(self._spoil, cache, "data.mdb", None, bit))
 
     def _alter(self, name: str, length: int | None, bit: int | None) -> Outcome:
         folder = self.new_folder() / "store"
@@ -211,15 +200,6 @@ class Bench:
             noticed = name in str(error)
         shutil.rmtree(folder.parent)
         return Outcome(noticed)
-
-    def _spoil(self, cache: Path, name: str, length: int | None, bit: int | None) -> Outcome:
-        folder = self.new_folder()
-        shutil.copytree(cache, folder, dirs_exist_ok=True)
-        alter(folder / name, length, bit)
-        process = self.runs.process(look_at_cache, folder)
-        process.join()
-        shutil.rmtree(folder)
-        return Outcome(process.exitcode == 0)
 
     def trials(self) -> list[Trial]:
         """All of the engine's."""

@@ -35,7 +35,7 @@ from abcd_ns.engine.rasterizer import Rasterizer, make_rasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.plugin.config import AbcdDataManagerConfig
@@ -143,7 +143,7 @@ def begin(
     seconds: float | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> Coordinator:
-    """A coordinator at the beginning of a run, on CUDA where there is any; store and layers in `folder`."""
+    """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     tree = build_kd(capture.gaussians.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
@@ -154,7 +154,6 @@ def begin(
         Budget(steps=steps, seconds=seconds),
         StoredScene(tree, store),
         capture.views,
-        LayerCache(folder / "layers"),
         rasterizer or make_rasterizer("auto", device),
         *nothing_live(3, device),
         device=device,
@@ -198,7 +197,6 @@ def run(
     clock.seconds["layers"] = layers - began
     clock.seconds["plan and attach"] -= layers - began
     afterwards(coordinator)
-    coordinator.cache.close()
     store.close()
     return clock
 

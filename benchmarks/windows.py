@@ -101,7 +101,6 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
         scene = coordinator.scene
         parts = [scene.gaussians(block) for block in range(scene.tree.num_blocks)]
         gaussians, tree = Gaussians.cat(parts), scene.tree
-        coordinator.cache.close()
         scene.store.close()
     painter = Painter(
         MemoryScene(tree, gaussians), capture.held_out, rasterizer, ownership="fragments", pass_gaussians=0

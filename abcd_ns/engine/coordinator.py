@@ -28,6 +28,7 @@ from abcd_ns.engine.events import (
 )
 from abcd_ns.engine.health import Health
 from abcd_ns.engine.influence import influence, share_shown
+from abcd_ns.engine.layer_store import LAYER_BYTES, LayerStore
 from abcd_ns.engine.memory import check_room
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import Optimizers, Pace, Params, attach, detach, live_gaussians
@@ -49,9 +50,9 @@ from abcd_ns.engine.share import Target, Task
 from abcd_ns.engine.special_blocks import LIVE
 from abcd_ns.engine.splitting import cut_full, is_full
 from abcd_ns.engine.step_drawing import StepDrawing
-from abcd_ns.engine.storage import LayerCache, crash_points
+from abcd_ns.engine.storage import crash_points
 from abcd_ns.engine.types import View
-from abcd_ns.engine.visit import AT_HAND_BYTES, VisitLayers
+from abcd_ns.engine.visit import VisitLayers
 
 
 class Coordinator(StepDrawing):
@@ -61,8 +62,8 @@ class Coordinator(StepDrawing):
         views: the training views; `View.index` names them.
         params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
             learning rates; that of the means is the one to decay from.
-        scene_key: fingerprint of the capture, part of every layer's key.
-        at_hand_bytes: see VisitLayers.
+        layer_bytes: what a visit may keep of layers on the device.
+        layer_ram_bytes: and in RAM, of those that have no room there; see LayerStore.
         target: gives what a sample is trained on, so that helpers can share a step (see `crew`); None for
             one process.
     """
@@ -73,17 +74,16 @@ class Coordinator(StepDrawing):
         budget: Budget,
         scene: StoredScene,
         views: list[View],
-        cache: LayerCache,
         rasterizer: Rasterizer,
         params: Params,
         optimizers: Optimizers,
         *,
-        scene_key: str = "",
         device: torch.device | str = "cpu",
-        at_hand_bytes: int = AT_HAND_BYTES,
+        layer_bytes: int = LAYER_BYTES,
+        layer_ram_bytes: int = 0,
         target: Callable[[Sample], Target] | None = None,
     ) -> None:
-        self.config, self.budget, self.scene, self.cache = config, budget, scene, cache
+        self.config, self.budget, self.scene = config, budget, scene
         self.params, self.optimizers = params, optimizers
         self.views = {view.index: view for view in views}  # on the CPU, whatever the device
         self.device = torch.device(device)
@@ -91,7 +91,7 @@ class Coordinator(StepDrawing):
         self.stopwatch = Stopwatch()
         self.density = self._density_control()
         self.state = RunState()
-        self._scene_key, self._at_hand_bytes = scene_key, at_hand_bytes
+        self._layer_room = layer_bytes, layer_ram_bytes
         self._rasterizer = rasterizer
         self._planner = Planner(config, budget, scene, self.views, rasterizer, device=self.device)
         self._pace = Pace(optimizers, config.batch_power)
@@ -217,6 +217,16 @@ class Coordinator(StepDrawing):
             spent=active.done / active.steps if among_others else 0.0,
         )
 
+    @property
+    def layer_limit(self) -> int:
+        """Bytes that layers may take, on the device and in RAM."""
+        return sum(self._layer_room)
+
+    @property
+    def layer_bytes(self) -> int:
+        """Bytes that the layers of the visit that is under way take; helpers' are not among them."""
+        return self._layers.nbytes if self._layers else 0
+
     # -- at rest -------------------------------------------------------------------------------------
 
     def count(self) -> int:
@@ -338,14 +348,12 @@ class Coordinator(StepDrawing):
         )
         layers = VisitLayers(
             painter,
-            self.cache,
+            LayerStore(self.device, *(room // active.crew for room in self._layer_room)),
             active.geometry,
             self.scene.at_rest(active.geometry.block),
             self.views,
             PaintSettings(active.sh_degree, self.config.antialiased),
             window_weight=self.config.window_weight,
-            scene_key=self._scene_key,
-            at_hand_bytes=self._at_hand_bytes // active.crew,
         )
         wanted = dict.fromkeys(order[active.done * (self.batch // active.crew) :])
         for done, _ in enumerate(layers.draw(wanted), start=1):
@@ -368,8 +376,6 @@ class Coordinator(StepDrawing):
         if active.saved:
             updates[LIVE] = state.nobody
         self.scene.lift()
-        if self._layers is not None:
-            self._layers.forget()
         if self._crew is not None:
             self._crew.dismiss()
         self.state.active, self._layers, self._crew = None, None, None

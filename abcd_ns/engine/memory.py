@@ -14,7 +14,7 @@ import torch
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.painter import LEAST_PASS
 from abcd_ns.engine.schedule import views_per_step, views_per_warm_up_step
-from abcd_ns.engine.visit import AT_HAND_BYTES, BYTES_PER_PIXEL, PARTS_BYTES
+from abcd_ns.engine.visit import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.errors import UserError
 
 FLOAT = 4
@@ -25,7 +25,11 @@ PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
 DRAWN_FLOATS = 24
 """Of a pixel that is drawn into layers: colour, transmittance, depth and the last of its Gaussians, of two
-layers at once, and these on their way into the cache."""
+layers at once, and these once more while they are rounded."""
+LAYER_SHARE = 1 / 8
+"""Of the device's budget, for the layers of a visit."""
+PHOTO_SHARE = 1 / 8
+"""Of the device's budget, for photos that are kept there."""
 LIVE_COPIES = 5
 """Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
 
@@ -40,6 +44,8 @@ class DeviceNeeds:
         crop_pixels: of a view that a step trains on at most; 0 is no limit.
         levels: layers of one view that are held, at most, while the blocks around a visited one are folded:
             as many as the tree of blocks is deep, and one. 0 where a block is the whole scene.
+        keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
+            budget of its own for them.
     """
 
     pixels: int
@@ -47,6 +53,7 @@ class DeviceNeeds:
     sh_degree: int = 3
     crop_pixels: int = 0
     levels: int = 2
+    keeps: bool = True
 
     @property
     def parameter_bytes(self) -> int:
@@ -78,17 +85,28 @@ class DeviceNeeds:
 
     @property
     def fixed_bytes(self) -> int:
-        """Whatever the block: layers at hand, and what else is held in a step or while layers are drawn."""
-        at_hand = AT_HAND_BYTES if self.levels else 0
-        return at_hand + max(self.step_bytes, self.drawing_bytes)
+        """Whatever the block: what is held in a step or while layers are drawn."""
+        return max(self.step_bytes, self.drawing_bytes)
 
     def bytes_for(self, gaussians: int) -> int:
-        """The peak of a visit to a block of so many Gaussians."""
+        """The peak of a visit to a block of so many Gaussians, layers and photos that are kept left out."""
         return self.fixed_bytes + gaussians * self.gaussian_bytes
+
+    def layer_bytes(self, budget: int) -> int:
+        """What of `budget` bytes is for the layers of a visit."""
+        return int(LAYER_SHARE * budget) if self.keeps and self.levels else 0
+
+    def photo_bytes(self, budget: int) -> int:
+        """What of `budget` bytes is for photos."""
+        return int(PHOTO_SHARE * budget) if self.keeps else 0
+
+    def left(self, budget: int) -> int:
+        """What of `budget` bytes is left for training, when layers and photos have theirs."""
+        return budget - self.layer_bytes(budget) - self.photo_bytes(budget)
 
     def block_limit(self, budget: int) -> int:
         """Gaussians that a block may have for its visits to stay within `budget` bytes; may be 0 or less."""
-        return (budget - self.fixed_bytes) // self.gaussian_bytes
+        return (self.left(budget) - self.fixed_bytes) // self.gaussian_bytes
 
 
 def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:

@@ -22,7 +22,6 @@ from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.schedule import size_of_crew
 from abcd_ns.engine.share import DrawShare, Share, Target, Task, share_of
-from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visit import VisitLayers
 
@@ -37,7 +36,6 @@ class StepDrawing(ABC):
     views: dict[int, View]
     device: torch.device
     params: Params
-    cache: LayerCache
     announce: Announcer
     density: DensityControl
     health: Health
@@ -167,7 +165,7 @@ class StepDrawing(ABC):
         """What draws a helper's shares; in its own process, which alone this changes, with layers drawn."""
         order = self._order_of(active, member)
         if in_own_process:
-            self.announce, self.cache = Announcer(), self.cache.beside(f"helper-{member}")
+            self.announce = Announcer()
             self._layers = self._draw_layers(active, order)
         return partial(self._draw_share, active, member, order)
 

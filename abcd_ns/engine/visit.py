@@ -1,27 +1,22 @@
 """One visit: what a block looks like to its views, and the frozen layers around it."""
 
-import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
+from torch import Tensor
 
-from abcd_ns.engine.compositing import empty_layer
+from abcd_ns.engine.layer_store import Kept, LayerStore, packed, rounded, unpacked
 from abcd_ns.engine.painter import Loaded, Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
 from abcd_ns.engine.rasterizer import Rasterizer, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
-from abcd_ns.engine.storage import LayerCache, LayerKey, StaleLayerError, through_codec, view_fingerprint
-from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.engine.visibility import footprint
 
-Side = Literal["front", "back"]
-SIDES: tuple[Side, ...] = ("front", "back")
-"""The two layers of a view, under the names of their fields in Parts."""
-AT_HAND_BYTES = 128 << 20
-"""Size of the layers that a visit keeps at hand, at most; others are read from the cache for each step."""
 PARTS_BYTES = 256 << 20
 """Size of the layers held while units are folded, at most, unless those of a single view are larger."""
 BYTES_PER_PIXEL = 32
@@ -83,72 +78,55 @@ class Surroundings:
     window: ZWindow | None
     """Where the fragments of `near` count; None by means."""
 
-    @property
-    def nbytes(self) -> int:
-        """Its size."""
-        held = [image for side in SIDES for image in vars(getattr(self.layers, side)).values()]
-        held += [] if self.window is None else [self.window.near, self.window.far]
-        held += [] if self.near is None else [self.near.planes]
-        return sum(tensor.nbytes for tensor in held)
-
-    def part(self, whole: Crop, crop: Crop) -> "Surroundings":
-        """What is seen in a part of the crop `whole` that this is of; shares memory."""
-        if crop == whole:
-            return self
-        inside = crop.within(whole)
-        layers = Parts(self.layers.front[inside], self.layers.back[inside])
-        return Surroundings(layers, self.near, _part_of_window(self.window, crop))
-
 
 class VisitLayers:
-    """F and B for the views of one visit, drawn once and kept at hand or in the layer cache.
+    """F and B for the views of one visit. They show the frozen blocks as they were when it began.
 
     Args:
+        store: where they are kept; new for each visit.
         own: the block's Gaussians when the visit began; they decide the windows.
         window_weight: see TrainingConfig.
         views: all views, by index.
-        scene_key: fingerprint of all else that changes a pixel, for the cache's keys.
-        at_hand_bytes: see AT_HAND_BYTES.
     """
 
     def __init__(
         self,
         painter: Painter,
-        cache: LayerCache,
+        store: LayerStore,
         geometry: VisitGeometry,
         own: Gaussians,
         views: Mapping[int, View],
         settings: PaintSettings,
         *,
         window_weight: float,
-        scene_key: str,
-        at_hand_bytes: int = AT_HAND_BYTES,
     ) -> None:
-        self._painter, self._cache = painter, cache
+        self._painter, self._store = painter, store
         self._geometry, self._views, self._settings = geometry, views, settings
-        self._window_weight, self._scene_key = window_weight, scene_key
-        self._versions = self._frozen_versions()
+        self._window_weight = window_weight
         self._units = painter.units(exclude=geometry.block)
-        self._own = own if painter.ownership == "fragments" and self._units else None
+        self._own = own if painter.ownership == "fragments" else None
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
         self._seen_by = painter.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
-        self._near: dict[int, Splats | None] = {}
         self._windows: dict[int, ZWindow] = {}
-        self._at_hand: dict[int, Surroundings] = {}
-        self._room = at_hand_bytes
-        self._uses_cache = False
+        self._sum: Tensor | float = 0.0
 
-    def draw(self, views: Iterable[int]) -> Iterator[tuple[int, Surroundings]]:
-        """Draw what is missing for these views; yields each view when it is ready."""
-        missing = []
-        for view in dict.fromkeys(views):
-            found = self._found(view, self._geometry.crops[view])
-            if found is None:
-                missing.append(view)
-            else:
-                yield view, found
-        for group in self._groups(missing):
+    def draw(self, views: Iterable[int]) -> Iterator[int]:
+        """Draw F and B of these views and keep what there is room for; yields each view when it is ready.
+
+        Raises:
+            RuntimeError: when all are drawn, if some pixel is NaN or infinite.
+        """
+        for view, _ in self._draw(tuple(dict.fromkeys(views))):
+            yield view
+
+    def _draw(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
+        for group in self._groups(views):
             yield from self._draw_group(group)
+        if not math.isfinite(self._sum):  # the one look at values: a device would be waited for at each
+            block = self._geometry.block
+            raise RuntimeError(
+                f"The layers around block {block} have NaN or infinite pixels; another block has diverged."
+            )
 
     def _groups(self, views: Sequence[int]) -> Iterator[Sequence[int]]:
         """Views that are drawn together: as many as there is room for what their units are folded from."""
@@ -168,7 +146,7 @@ class VisitLayers:
         if group:
             yield group
 
-    def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Surroundings]]:
+    def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
         """All units one after the other, each for all of these views: the device holds one at a time."""
         self._find_windows(views)
         block = self._geometry.block
@@ -184,47 +162,24 @@ class VisitLayers:
                     yield view, self._keep(view, parts.pop(view))
 
     def around(self, view: int, crop: Crop | None = None) -> Surroundings:
-        """What `view` sees around the active block, in a part of the visit's crop or in all of it.
-
-        Raises:
-            StaleLayerError: a frozen block has changed since the visit began.
-        """
-        if self._frozen_versions() != self._versions:
-            raise StaleLayerError(f"a frozen block changed during the visit of block {self._geometry.block}")
+        """What `view` sees around the active block, in a part of the visit's crop or in all of it."""
         whole = self._geometry.crops[view]
-        found = self._found(view, crop or whole)
-        if found is None:  # never drawn, or the disposable cache has lost it
-            ((_, drawn),) = self.draw([view])
-            found = drawn.part(whole, crop or whole)
-        return found
+        kept = self._store.get(view)
+        if kept is None:  # there was no room for it, or nobody knew that it would be asked for
+            ((_, kept),) = self._draw([view])
+        part = crop or whole
+        layers = kept.layers[(slice(None), *part.within(whole).slices)]
+        window = self._window(view)
+        return Surroundings(
+            unpacked(layers.to(self._views[view].viewmat.dtype)),
+            kept.near,
+            window and window.on(TileGrid(part, window.grid.side)),
+        )
 
     @property
     def nbytes(self) -> int:
-        """Of the layers at hand."""
-        return sum(around.nbytes for around in self._at_hand.values())
-
-    def forget(self) -> None:
-        """Give back the room in the cache: when the block has changed, nothing of it will be found again."""
-        if self._uses_cache:
-            self._cache.drop(self._prefix)
-
-    def _found(self, view: int, crop: Crop) -> Surroundings | None:
-        whole = self._geometry.crops[view]
-        if view in self._at_hand:
-            return self._at_hand[view].part(whole, crop)
-        layers = self._cached(view, crop.within(whole))
-        if layers is None:
-            return None
-        near = self._near.get(view)
-        return Surroundings(
-            layers,
-            near and Splats(near.planes.to(self._painter.device)),
-            _part_of_window(self._window(view), crop),
-        )
-
-    def _frozen_versions(self) -> dict[int, int]:
-        scene = self._painter.scene
-        return {b: scene.version(b) for b in range(scene.tree.num_blocks) if b != self._geometry.block}
+        """Of the layers that are kept."""
+        return self._store.nbytes
 
     def _find_windows(self, views: Iterable[int]) -> None:
         if self._own is None:
@@ -254,60 +209,10 @@ class VisitLayers:
             window=self._window(view),
         )
 
-    def _keep(self, view: int, parts: dict[int, Parts | None]) -> Surroundings:
-        """Fold, and put at hand or into the cache; what comes back went through the codec either way."""
+    def _keep(self, view: int, parts: dict[int, Parts | None]) -> Kept:
         folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
-        stored = (through_codec(getattr(folded, side), self._cache.bits) for side in SIDES)
-        around = Surroundings(
-            Parts(*map(self._on_device, stored)), near=folded.inside, window=self._window(view)
-        )
-        self._near[view] = folded.inside
-        if around.nbytes <= self._room:
-            self._at_hand[view] = around
-            self._room -= around.nbytes
-        else:
-            self._near[view] = folded.inside and Splats(folded.inside.planes.cpu())
-            self._cache.put_many((self._key(view, side), getattr(folded, side)) for side in SIDES)
-            self._uses_cache = True
-        return around
-
-    def _cached(self, view: int, part: Crop) -> Parts | None:
-        if not self._units:
-            matrix = self._views[view].viewmat
-            nothing = empty_layer(part.height, part.width, self._painter.device, matrix.dtype)
-            return Parts(nothing, nothing)
-        if self._own is not None and view not in self._near:
-            return None  # after a resume: what is near was never written down
-        found = [self._cache.get(self._key(view, side)) for side in SIDES]
-        if any(layer is None for layer in found):
-            return None
-        return Parts(*(self._on_device(layer[part]) for layer in found))
-
-    def _on_device(self, layer: Layer) -> Layer:
-        dtype, device = next(iter(self._views.values())).viewmat.dtype, self._painter.device
-        return Layer(layer.color.to(device, dtype), layer.transmittance.to(device, dtype))
-
-    def _key(self, view: int, side: Side) -> LayerKey:
-        geometry, scene = self._geometry, self._painter.scene
-        window = None if self._own is None else [scene.version(geometry.block), self._window_weight]
-        cut = json.dumps([side, geometry.block, window, self._painter.ownership])
-        return LayerKey(
-            scene=self._scene_key,
-            view=view_fingerprint(self._views[view]),
-            crop=geometry.crops[view],
-            content=(cut, *self._versions.items()),
-            sh_degree=self._settings.sh_degree,
-            raster_mode="antialiased" if self._settings.antialiased else "classic",
-            rasterizer=self._painter.rasterizer.name,
-            bits=self._cache.bits,
-            prefix=self._prefix,
-        )
-
-    @property
-    def _prefix(self) -> str:
-        return f"block-{self._geometry.block}"
-
-
-def _part_of_window(window: ZWindow | None, crop: Crop) -> ZWindow | None:
-    """The window of a part of the crop that it is of."""
-    return window and window.on(TileGrid(crop, window.grid.side))
+        layers = packed(folded)
+        self._sum = self._sum + layers.sum()
+        kept = Kept(rounded(layers), folded.inside)
+        self._store.put(view, kept)
+        return kept

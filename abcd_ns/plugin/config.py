@@ -156,8 +156,6 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     ram_budget_gb: float = 0.0
     """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it.
     0 takes 8, or 40% of the machine's memory where that is less."""
-    layer_bits: Literal[16, 32] = 16
-    """Bits to which the colours and transmittances of layers are rounded."""
     max_seconds: float | None = None
     """Stop after this many seconds of training; evaluation and saving do not count."""
 
@@ -244,5 +242,6 @@ class AbcdTrainerConfig(TrainerConfig):
             pipeline.training,
             most=pipeline.training.density.limit,
             factor=parser.factor,
+            on_cpu=self.machine.device_type == "cpu",
         )
         find_room(device_budget(pipeline.device_budget_gb, self.machine.device_type), demand)

@@ -1,7 +1,7 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
-import hashlib
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.exact import ExactCoordinator
 from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
 from abcd_ns.engine.initialize import thin_out
-from abcd_ns.engine.memory import scaffold_size
+from abcd_ns.engine.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.partition import build_grid, build_kd
 from abcd_ns.engine.run_state import Budget, RunState
@@ -26,16 +26,14 @@ from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.share import Target
 from abcd_ns.engine.splitting import cut_at_rest
-from abcd_ns.engine.storage import ParameterStore, view_fingerprint
+from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.engine.visit import AT_HAND_BYTES
 from abcd_ns.plugin.datamanager import AbcdDataManager
 from abcd_ns.plugin.model import AbcdModel
 from abcd_ns.plugin.progress import ProgressReport
 from abcd_ns.plugin.ram_budget import budget_bytes, share_out
 from abcd_ns.plugin.room import FITTED, Demand, Room, device_budget, find_room
-from abcd_ns.plugin.run_folder import CACHE as CACHE
-from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, open_cache, take_over
+from abcd_ns.plugin.run_folder import STATE, MadeFor, new_store, take_over
 from abcd_ns.plugin.run_folder import STORE as STORE
 from abcd_ns.plugin.run_log import keep_log
 from abcd_ns.plugin.views import views_of
@@ -133,6 +131,7 @@ class AbcdPipeline(VanillaPipeline):
     def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Coordinator:
         config, folder = self.config, trainer.base_dir / STATE
         views = self._views()
+        self.datamanager.device_photo_bytes = 0 if self._on_cpu else int(PHOTO_SHARE * self._budget)
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
@@ -145,18 +144,31 @@ class AbcdPipeline(VanillaPipeline):
             Budget(trainer.total_steps, config.max_seconds),
             scene,
             views,
-            open_cache(folder / CACHE, self._ram.cache, config.layer_bits),
             self.model.draws_with(),
             self.model.gauss_params,
             {name: optimizers[name] for name in self.model.gauss_params},
-            scene_key=scene_fingerprint(self.datamanager.get_datapath(), views),
             device=self.device,
-            at_hand_bytes=min(self._ram.at_hand, AT_HAND_BYTES),
+            **self._room_for_layers(),
             target=self._target,
         )
         if resumed:
             coordinator.restore()
         return coordinator
+
+    @property
+    def _on_cpu(self) -> bool:
+        return torch.device(self.device).type == "cpu"
+
+    @cached_property
+    def _budget(self) -> int:
+        """Bytes of the device that training may take, of what is free when it begins."""
+        return device_budget(self.config.device_budget_gb, self.device)
+
+    def _room_for_layers(self) -> dict[str, int]:
+        """Bytes of the device and of RAM; on the CPU these are one."""
+        if self._on_cpu:
+            return {"layer_bytes": self._ram.layers}
+        return {"layer_bytes": int(LAYER_SHARE * self._budget), "layer_ram_bytes": self._ram.layers}
 
     def _processes(self) -> int:
         """As asked for; where RAM is short, one, since each reads blocks for itself."""
@@ -187,8 +199,9 @@ class AbcdPipeline(VanillaPipeline):
             most=config.training.density.limit,
             factor=self.datamanager.dataparser.factor,
             blocks=blocks,
+            on_cpu=self._on_cpu,
         )
-        return find_room(device_budget(config.device_budget_gb, self.device), demand)
+        return find_room(self._budget, demand)
 
     @property
     def _pixels(self) -> int:
@@ -264,11 +277,3 @@ def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:
         widest = max(range(3), key=lambda axis: extent[axis] / counts[axis])
         counts[widest] += 1
     return counts[0], counts[1], counts[2]
-
-
-def scene_fingerprint(data: Path, views: list[View]) -> str:
-    """Names a capture: its folder and the poses of its views."""
-    digest = hashlib.blake2b(str(Path(data).resolve()).encode(), digest_size=16)
-    for view in views:
-        digest.update(view_fingerprint(view).encode())
-    return digest.hexdigest()

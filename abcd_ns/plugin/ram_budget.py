@@ -18,17 +18,14 @@ class RamShares:
     """Decoded photos."""
     blocks: int
     """Frozen blocks, read from the store."""
-    at_hand: int
-    """Layers that are ready for use. They lie on the device, which is the RAM where there is no GPU."""
-    cache: int
-    """Layers in the cache's file, which is mapped into memory."""
+    layers: int
+    """A visit's layers; where there is a GPU, those that have no room there."""
 
 
 def share_out(budget: int) -> RamShares:
-    """A quarter of `budget` bytes for photos and one for blocks, a 64th at hand, the rest for the cache."""
+    """A quarter of `budget` bytes for photos, one for blocks, the rest for layers."""
     photos = blocks = budget // 4
-    at_hand = budget // 64
-    return RamShares(photos, blocks, at_hand, budget - photos - blocks - at_hand)
+    return RamShares(photos, blocks, budget - photos - blocks)
 
 
 def budget_bytes(gigabytes: float) -> int:

@@ -23,7 +23,7 @@ RAM_SHARE = 0.25
 LEAST_BLOCK = 1_000
 """A block with room for fewer Gaussians is not worth a visit."""
 PICTURE_SHARE = 0.75
-"""Of the budget, for a step's pictures at most; the rest is for Gaussians."""
+"""Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
 LEAST_CROP = 250_000
 """Pixels: smaller parts of a view are mostly border."""
 FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels")
@@ -108,6 +108,8 @@ class Demand:
     """By which the photos were reduced."""
     blocks: int = 1
     """That there are already."""
+    on_cpu: bool = False
+    """Whether the CPU is the device: then layers and photos are kept under another budget."""
 
     @property
     def first(self) -> int:
@@ -161,7 +163,8 @@ def _room(budget: int, demand: Demand) -> Room | None:
 
 def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
     """As many views in a step, and as much of them, as leave room for Gaussians."""
-    training, room = demand.training, PICTURE_SHARE * budget
+    training, left = demand.training, _needs(demand, 1, 0, levels_of(2)).left(budget)
+    room = PICTURE_SHARE * left
     views = list(_fewer(views_per_step(training.batch, 2, training.batch_limit)))
     if training.batch:
         views = views[:1]
@@ -181,7 +184,8 @@ def _fewer(views: int) -> Iterator[int]:
 
 
 def _needs(demand: Demand, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
-    return DeviceNeeds(demand.pixels, batch, demand.training.sh_degree, crop_pixels, levels)
+    degree, keeps = demand.training.sh_degree, not demand.on_cpu
+    return DeviceNeeds(demand.pixels, batch, degree, crop_pixels, levels, keeps)
 
 
 def _fewest(gaussians: int, limit: int, sole: int) -> int:

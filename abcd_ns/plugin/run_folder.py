@@ -4,10 +4,10 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.storage import LayerCache, ParameterStore, StoreError
+from abcd_ns.engine.storage import ParameterStore, StoreError
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from abcd_ns.plugin.config import AbcdTrainerConfig
 
 STATE = "abcd"
-"""The folder of a run, beside `nerfstudio_models`, that holds the two that follow."""
-STORE, CACHE = "store", "layers"
-"""The blocks at rest, which are precious, and layers, which are not."""
+"""The folder of a run, beside `nerfstudio_models`, that holds the one that follows."""
+STORE = "store"
+"""The blocks at rest."""
 MADE_FOR = "made for"
 """The entry of a store's header that tells what it can be trained on with."""
 
@@ -151,20 +151,6 @@ def new_store(folder: Path, header: dict[str, Any]) -> ParameterStore:
         raise UserError(
             f"{folder} holds a run already: go on with it by --load-dir {folder.parent.parent}, or choose "
             "another --timestamp."
-        ) from error
-
-
-def open_cache(folder: Path, map_size: int, bits: Literal[16, 32]) -> LayerCache:
-    """The run's layer cache.
-
-    Raises:
-        UserError: the disk refused, or another run has it.
-    """
-    try:
-        return LayerCache(folder, map_size, bits)
-    except OSError as error:
-        raise UserError(
-            f"{folder} cannot be used for layers: {error}. Free space, or mend the folder."
         ) from error
 
 

@@ -191,11 +191,11 @@ def keep_log(trainer: "AbcdTrainer", coordinator: Coordinator) -> RunLog:
     """Begin the log of a run, and write its settings beside it."""
     folder, photos = trainer.base_dir / STATE, trainer.pipeline.datamanager.train_dataset.photos
     write_settings(trainer.config, folder)
-    scene, cache = coordinator.scene, coordinator.cache
+    scene = coordinator.scene
     meters = (
         Meter("photos", lambda: photos.cached_bytes, photos.budget_bytes),
         Meter("frozen blocks", lambda: scene.cached_bytes, scene.ram_bytes),
-        Meter("layers on disk", lambda: cache.nbytes, cache.limit),
+        Meter("layers", lambda: coordinator.layer_bytes, coordinator.layer_limit),
     )
     earlier = None if trainer.resumed_from is None else trainer.resumed_from.store.parent / LOG_FILE
     return RunLog(coordinator, folder / LOG_FILE, meters, earlier)

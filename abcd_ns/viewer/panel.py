@@ -183,8 +183,7 @@ class AbcdPanel(ViewerControl):
             total = torch.cuda.get_device_properties(0).total_memory
             rows.append(("GPU, most so far", torch.cuda.max_memory_allocated(), total))
         if self._coordinator is not None:
-            cache = self._coordinator.cache
-            rows.append(("layers on disk", cache.nbytes, cache.limit))
+            rows.append(("layers", self._coordinator.layer_bytes, self._coordinator.layer_limit))
         return rows
 
     @property

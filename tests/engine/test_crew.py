@@ -15,7 +15,6 @@ from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.helper_process import can_fork
 from abcd_ns.engine.schedule import size_of_crew, view_order, views_of_member
 from abcd_ns.engine.shared_memory import SharedRows
-from abcd_ns.engine.storage import LayerCache
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
@@ -176,21 +175,18 @@ def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, opti
     assert equal(whole_scene(straight), whole_scene(resumed))
 
 
-def test_layers_that_have_no_room_at_hand_are_in_a_cache_of_each_member(make, photos, tmp_path):
-    """A helper must not touch the training process' LMDB, and finds its own layers again."""
-    at_hand, cached = (
-        make("at-hand", bits=32),
-        make("cached", at_hand_bytes=0, cache=LayerCache(tmp_path / "layers", bits=32)),
-    )
-    train(at_hand, photos)
-    alive = []
-    while not cached.finished:
-        train_step(cached, photos)
-        if cached._crew is not None:
-            alive.append(len(cached._crew.pids))
-    assert set(alive) == {1}
-    assert (tmp_path / "layers" / "helper-1" / "data.mdb").stat().st_size > 0
-    assert equal(whole_scene(at_hand), whole_scene(cached))
+def test_each_member_has_its_part_of_the_room_for_layers(make, photos):
+    """And draws anew what has no room there."""
+    roomy, tight = make("roomy"), make("tight", layer_bytes=80_000)
+    train(roomy, photos)
+    held = []
+    while not tight.finished:
+        train_step(tight, photos)
+        if tight._crew is not None:
+            assert len(tight._crew.pids) == 1
+            held.append(tight._layers.nbytes)
+    assert 0 < max(held) <= 40_000
+    assert equal(whole_scene(roomy), whole_scene(tight))
 
 
 def test_helpers_end_with_their_visit(make, photos):

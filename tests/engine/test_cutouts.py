@@ -130,12 +130,12 @@ def test_a_layer_is_cut_from_its_own_corner():
     assert torch.equal(part.transmittance, layer.transmittance[1:4, 2:6])
 
 
-@pytest.mark.parametrize("at_hand", [0, 1 << 20])
-def test_a_part_of_a_batch_shows_what_the_whole_shows_there(tmp_path, views, start, at_hand):
+@pytest.mark.parametrize("room", [0, 1 << 20])
+def test_a_part_of_a_batch_shows_what_the_whole_shows_there(tmp_path, views, start, room):
     pictures = []
     for most in (0, 700):
         (folder := tmp_path / str(most)).mkdir()
-        still = {"density": DensityConfig(strategy="off"), "at_hand_bytes": at_hand}
+        still = {"density": DensityConfig(strategy="off"), "layer_bytes": room}
         coordinator = make_coordinator(folder, start, views, blocks=4, steps=8, crop_pixels=most, **still)
         batch = coordinator.next_batch()
         pictures.append((batch.samples, coordinator.render(batch).pictures))

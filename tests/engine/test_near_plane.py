@@ -5,7 +5,6 @@ import torch
 
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.rasterizer import TorchRasterizer
-from abcd_ns.engine.storage import view_fingerprint
 from abcd_ns.engine.types import NEAR_PLANE
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -56,8 +55,3 @@ def test_a_gaussian_before_the_camera_spoils_no_picture():
     clear = draw(scene, view, sh_degree=0).color
     assert float((draw(both, view, sh_degree=0).color - clear).abs().max()) > 0.1
     assert torch.equal(draw(both, replace(view, near=0.2), sh_degree=0).color, clear)
-
-
-def test_layers_of_another_near_plane_are_other_layers():
-    (view,) = ring_of_views(1)
-    assert view_fingerprint(view) != view_fingerprint(replace(view, near=0.2))

@@ -272,12 +272,10 @@ def test_no_result_depends_on_the_ram_budget_and_none_exceeds_it(data, undisturb
 
     def measure(trainer) -> None:
         coordinator = trainer.pipeline.coordinator
-        layers, scene = coordinator._layers, coordinator.scene
+        scene = coordinator.scene
         blocks = [sum(value.nbytes for _, value in block.items()) for block in scene._ram.values()]
-        cache = max(coordinator.cache.nbytes - 16 * 4096, 0)  # LMDB needs so much when it is empty
-        held = 0 if layers is None else layers.nbytes
         photos = trainer.pipeline.datamanager.train_dataset.photos.cached_bytes
-        peaks.append(photos + held + cache + sum(blocks))
+        peaks.append(photos + coordinator.layer_bytes + sum(blocks))
         largest.append(max(blocks, default=0))
 
     trainer = run(config, after_step=measure)

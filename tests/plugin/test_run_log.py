@@ -107,7 +107,6 @@ def test_evaluation_is_no_training_time(data, tmp_path):
     trainer.pipeline.coordinator.announce.subscribe(look)
     trainer.train()
     trainer.pipeline.coordinator.scene.store.close()
-    trainer.pipeline.coordinator.cache.close()
     ((first, second),) = seen
     assert first == second
 

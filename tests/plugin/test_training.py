@@ -80,7 +80,6 @@ def run(
     finally:
         if (coordinator := getattr(trainer.pipeline, "coordinator", None)) is not None:
             coordinator.scene.store.close()
-            coordinator.cache.close()
     return trainer
 
 

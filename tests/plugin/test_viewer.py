@@ -88,7 +88,6 @@ def watched(data, tmp_path_factory):
     yield watched
     watched.browser.close()
     watched.trainer.pipeline.coordinator.scene.store.close()
-    watched.trainer.pipeline.coordinator.cache.close()
 
 
 def test_the_run_was_guarded_from_the_start(watched):
@@ -127,7 +126,7 @@ def test_the_panel_reports_the_run(watched):
     assert any("Warm-up of the whole scene" in text for text in said)
     assert any(text.startswith("**Block ") and " left" in text for text in said)
     assert any(text.startswith("Sweep ") for text in said)
-    assert any("| RAM |" in text and "| layers on disk |" in text for text in said)
+    assert any("| RAM |" in text and "| layers |" in text for text in said)
     table = [text for text in said if text.startswith("| # | state |")][-1]
     assert table.count("| done |") == BLOCKS
     assert any(text == "**Trained.**" for text in said)
@@ -291,4 +290,3 @@ def test_neither_training_nor_viewing_needs_a_network(data, tmp_path, monkeypatc
         at_home_only(socket.socket(), ("192.0.2.1", 80))
     watched.browser.close()
     watched.trainer.pipeline.coordinator.scene.store.close()
-    watched.trainer.pipeline.coordinator.cache.close()

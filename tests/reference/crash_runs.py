@@ -22,15 +22,15 @@ import torch
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Event, VisitEnded
-from abcd_ns.engine.storage import LayerCache, ParameterStore, StoreError, crash_points
+from abcd_ns.engine.storage import ParameterStore, StoreError, crash_points
 from abcd_ns.engine.training_loop import train_step
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 
 STEPS = 30
 SAVE_EVERY = 4
 """Steps between saves in the middle of visits, as nerfstudio's checkpoints are."""
-AT_HAND_BYTES = 20_000
-"""Room for some views' layers, so that the cache has others."""
+LAYER_BYTES = 10_000
+"""Room for some views' layers; others are drawn anew."""
 DISK_FULL = 3
 """Exit code of a run that the disk refused."""
 WALL_TIMES = ("seconds", "layer_seconds", "began", "since", "until")
@@ -120,20 +120,19 @@ def points_reached(folder: Path) -> dict[str, int]:
 def _train(folder: Path, commit_seconds: float = 0.0) -> None:
     views = ring_of_views(3, width=24, height=18)
     photos = Photos(random_gaussians(60, seed=7, size=0.12), views)
-    with LayerCache(folder / "layers", 1 << 22) as cache:
-        coordinator = _open(folder, views, cache, commit_seconds)
-        if commit_seconds == 0:
-            coordinator.announce.subscribe(lambda event: _note(folder, coordinator, event))
-        while not coordinator.finished:
-            train_step(coordinator, photos)
-            if coordinator.state.step % SAVE_EVERY == 0:
-                coordinator.save(pin="saved")
-                _write(folder, coordinator.state.step)
-        coordinator.save()
-        coordinator.close()
+    coordinator = _open(folder, views, commit_seconds)
+    if commit_seconds == 0:
+        coordinator.announce.subscribe(lambda event: _note(folder, coordinator, event))
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        if coordinator.state.step % SAVE_EVERY == 0:
+            coordinator.save(pin="saved")
+            _write(folder, coordinator.state.step)
+    coordinator.save()
+    coordinator.close()
 
 
-def _open(folder: Path, views: list, cache: LayerCache, commit_seconds: float) -> Coordinator:
+def _open(folder: Path, views: list, commit_seconds: float) -> Coordinator:
     """Go on from a clone of what is there, as the trainer does with --load-dir, or begin."""
     start = random_gaussians(60, seed=1, size=0.12)
     resume = begun(folder)
@@ -154,11 +153,9 @@ def _open(folder: Path, views: list, cache: LayerCache, commit_seconds: float) -
         blocks=3,
         steps=STEPS,
         resume=resume,
-        bits=16,
         scaffold=20,
         batch=2,
-        cache=cache,
-        at_hand_bytes=AT_HAND_BYTES,
+        layer_bytes=LAYER_BYTES,
         density=density,
         commit_seconds=commit_seconds,
     )

@@ -9,6 +9,7 @@ from torch import Tensor
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.layer_store import LAYER_BYTES
 from abcd_ns.engine.param_swap import nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import Rasterizer
@@ -16,9 +17,8 @@ from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.types import Crop, Gaussians, View
-from abcd_ns.engine.visit import AT_HAND_BYTES
 
 
 def random_gaussians(
@@ -89,22 +89,18 @@ def make_coordinator(
     steps: int = 40,
     tree: BlockTree | None = None,
     resume: bool = False,
-    bits: int = 32,
     scaffold: int | None = None,
     kind: type[Coordinator] = Coordinator,
     content: Callable = blocks_at_rest,
-    cache: LayerCache | None = None,
     ram_bytes: int = 2 << 30,
-    at_hand_bytes: int = AT_HAND_BYTES,
+    layer_bytes: int = LAYER_BYTES,
+    layer_ram_bytes: int = 0,
     target: Callable | None = None,
     rasterizer: Rasterizer | None = None,
     device: torch.device | str = "cpu",
     **training,
 ) -> Coordinator:
-    """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is.
-
-    Layers go into `cache`, or else into one of `bits` in memory.
-    """
+    """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is."""
     if resume:
         store = ParameterStore.open(folder / "store")
         tree = BlockTree.from_json(store.header["tree"])
@@ -118,11 +114,11 @@ def make_coordinator(
         Budget(steps=steps),
         StoredScene(tree, store, ram_bytes),
         views,
-        LayerCache(None, bits=bits) if cache is None else cache,
         rasterizer or TorchRasterizer(compile="never"),
         *nothing_live(gaussians.sh_degree, device),
         device=device,
-        at_hand_bytes=at_hand_bytes,
+        layer_bytes=layer_bytes,
+        layer_ram_bytes=layer_ram_bytes,
         target=target,
     )
     if resume:

@@ -24,7 +24,7 @@ def test_the_benchmark_counts_and_writes(tmp_path, capsys):
         assert each["bytes_to_device_per_step"] > 0
         assert each["copies_to_device_per_step"] > 0
         assert each["peak_bytes"] > 4 * 23 * 30
-    assert one["layer_copies_per_visit"] == 0 < two["layer_copies_per_visit"]
+    assert one["layer_copies_per_visit"] == two["layer_copies_per_visit"] == 0
     printed = capsys.readouterr().out
     assert "| a step | 1 block | 2 blocks |" in printed
     assert {"torch", "gsplat", "python"} == set(found["versions"])

@@ -8,9 +8,11 @@ kernels take inside, and what an allocator cannot use, is not seen here.
 import pytest
 
 from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.layer_store import LayerStore
 from abcd_ns.engine.memory import DeviceNeeds, levels_of
 from abcd_ns.engine.training_loop import train
 from tests.reference.scenes import Photos, random_gaussians, ring_of_views
+from tests.reference.simulated_device import DEVICE
 from tests.simulated.test_coordinators import on_device
 
 LAVISH = 4.0
@@ -63,7 +65,7 @@ def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat, b
         options = {"gaussians": 60, "width": width, "size": 0.2, "blocks": blocks, "pass_gaussians": 1}
         coordinator, _ = run_on(tmp_path / str(width), **options)
         layers, view = coordinator._layers, coordinator.state.active.geometry.views[0]
-        layers._at_hand.clear()
+        layers._store = LayerStore(DEVICE, 1 << 30)
         held = simulated_gsplat.live_bytes
         simulated_gsplat.reset_peak()
         list(layers.draw([view]))

@@ -47,7 +47,7 @@ def test_a_forecast_adds_up():
     assert found.seconds_per_step > 0
     low, high = found.hours
     assert low < high == pytest.approx(low * 1000 / 400)
-    needs = DeviceNeeds(48 * 36, 4, levels=3)
+    needs = DeviceNeeds(48 * 36, 4, levels=3)  # where the CPU is the device, nothing else is kept there
     assert sum(share.nbytes for share in found.device) == needs.bytes_for(250)
     assert not found.warnings
 
@@ -71,6 +71,16 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
     assert 0 < found.room.crop_pixels < 260_000
     assert sum(share.nbytes for share in found.device) <= 0.15 * GB
     assert not found.warnings
+
+
+def test_a_device_keeps_layers_and_photos_besides():
+    limit = DeviceNeeds(100, 4).block_limit(GB)
+    room = Room(blocks=2, limit=limit, sole=10**9, budget=GB, gaussians=10**9, batch=4)
+    shares = device_shares(room, DeviceNeeds(100, 4))
+    assert [share.nbytes for share in shares[2:]] == [GB // 8, GB // 8]
+    assert GB - DeviceNeeds(100, 4).gaussian_bytes < sum(share.nbytes for share in shares) <= GB
+    alone = device_shares(dataclasses.replace(room, blocks=1), DeviceNeeds(100, 1, levels=0))
+    assert [share.nbytes for share in alone[2:]] == [0, GB // 8]
 
 
 def test_disk_holds_two_generations_and_a_checkpoint():

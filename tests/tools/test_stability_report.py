@@ -104,7 +104,6 @@ def test_every_curve_has_its_points():
         "blocks",
         "visit-steps",
         "staleness",
-        "layer-bits",
         "views",
         "pose-noise",
         "exposure",

@@ -171,7 +171,7 @@ def test_words():
     assert headline("Between visits", 1.0, 0.0) == "**Trained.**"
     assert sweep_line(2, 3, 8, None) == "Sweep 2: 3 of 8"
     assert sweep_line(2, 3, 8, 61.0) == "Sweep 2: 3 of 8, 0:01:01 left"
-    assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers on disk", 2**20, 2**32)]).splitlines()[2:] == [
+    assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers", 2**20, 2**32)]).splitlines()[2:] == [
         "| RAM | 1.5 GB | 16.0 GB |",
-        "| layers on disk | 1 MB | 4.0 GB |",
+        "| layers | 1 MB | 4.0 GB |",
     ]

@@ -16,10 +16,6 @@ SHARD_DELETED = "shard deleted"
 """One of the shards that nothing names any more is gone."""
 SHARDS_LINKED = "shards linked"
 """A clone has all its shards and no manifest."""
-CACHE_OPENED = "cache opened"
-"""The layer cache's old files are gone, and it is open."""
-LAYERS_PUT = "layers put"
-"""A transaction of the layer cache holds all its layers and is not committed."""
 VISIT_TRAINED = "visit trained"
 """All steps of a visit are done; nothing of it is committed."""
 CHECKPOINT_PINNED = "checkpoint pinned"
@@ -37,8 +33,6 @@ ENGINE = (
     GENERATION_PUBLISHED,
     SHARD_DELETED,
     SHARDS_LINKED,
-    CACHE_OPENED,
-    LAYERS_PUT,
     VISIT_TRAINED,
 )
 """Those that a run of the engine reaches."""

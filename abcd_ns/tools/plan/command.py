@@ -139,7 +139,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     training = methods.abcd.config.pipeline.training
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pixels = max(view.full.pixels for view in views)
-    demand = Demand(pixels, len(points), training, most=wanted.max_gaussians or None, factor=capture.factor)
+    most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
+    demand = Demand(pixels, len(points), training, most=most, factor=capture.factor, on_cpu=on_cpu)
     room = find_room(device_budget(wanted.device_budget_gb, device), demand)
     room = replace(room, blocks=wanted.blocks or room.blocks)
     training = replace(training, **room.options)
@@ -147,7 +148,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     owner = tree.assign(points)
     seen = _said(console, "Looking which view sees which block", lambda: views_of_blocks(tree, points, views))
     batch = views_per_step(training.batch, room.blocks, training.batch_limit)
-    options = (training.sh_degree, training.crop_pixels, levels_of(room.blocks))
+    options = (training.sh_degree, training.crop_pixels, levels_of(room.blocks), not on_cpu)
     needs = DeviceNeeds(pixels, batch, *options)
     fullest = owner == owner.bincount(minlength=room.blocks).argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)

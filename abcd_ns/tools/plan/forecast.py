@@ -21,8 +21,6 @@ GENERATIONS = 2
 """Of the store on disk: the one in use, and the one that the last checkpoint pins."""
 FROZEN_BYTES = 2 << 30
 """RAM for blocks that were read, at most."""
-LAYER_CACHE_BYTES = 4 << 30
-"""LayerCache's limit."""
 TIMED_STEPS = 3
 LAYER_SHARE = 0.35
 """Time for layers by the time of steps: layers took 22 to 27% of the runs in docs/results, on a CPU."""
@@ -86,6 +84,8 @@ def device_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
     return (
         Share(f"a block of {largest:,} Gaussians in training", trained),
         Share("a step's pictures, or layers while they are drawn", needs.fixed_bytes),
+        Share("layers that are kept", needs.layer_bytes(room.budget)),
+        Share("photos that are kept", needs.photo_bytes(room.budget)),
     )
 
 
@@ -102,11 +102,9 @@ def ram_shares(room: Room, needs: DeviceNeeds, photo_bytes: int, photo_budget: i
 def disk_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
     """What a run leaves and holds on disk."""
     scene = room.gaussians * needs.parameter_bytes
-    layers = LAYER_CACHE_BYTES if room.blocks_at_the_end > 1 else 0
     return (
         Share("blocks with their optimiser's state", GENERATIONS * STATES * scene),
         Share("checkpoint", scene),
-        Share("layers without room in memory, at most", layers),
     )
 
 

@@ -69,8 +69,6 @@ class Run:
     """The most RAM that the process held until the end of training, the curve's evaluations included."""
     store_bytes: int
     """On disk: the blocks at rest, with their optimiser state."""
-    cache_bytes: int
-    """On disk: cached layers."""
     layer_seconds: float
     """Training time that went into drawing layers."""
     curve: tuple[CurvePoint, ...]

@@ -51,7 +51,6 @@ MEASURES = (
     Measure("peak GPU memory, reserved (GiB)", _in(GIB, lambda run: run.peak_reserved_bytes), 2),
     Measure("peak RAM (GiB)", _in(GIB, lambda run: run.peak_rss_bytes), 2),
     Measure("blocks on disk (MiB)", _in(MIB, lambda run: run.store_bytes), 1),
-    Measure("layers on disk (MiB)", _in(MIB, lambda run: run.cache_bytes), 1),
 )
 
 

@@ -25,7 +25,7 @@ from abcd_ns.plugin.machine import (
     without_home,
 )
 from abcd_ns.plugin.metrics import lpips_missing
-from abcd_ns.plugin.pipeline import CACHE, STORE
+from abcd_ns.plugin.pipeline import STORE
 from abcd_ns.tools.runs.configs import trainer_config
 from abcd_ns.tools.runs.evaluate import (
     draw_held_out,
@@ -135,7 +135,6 @@ def _record(
         gaussians=training.gaussians,
         **memory,
         store_bytes=disk_bytes(folder / "abcd" / STORE),
-        cache_bytes=disk_bytes(folder / "abcd" / CACHE),
         layer_seconds=training.layer_seconds,
         curve=(*training.recorder.points, end),
         views=tuple(scores),

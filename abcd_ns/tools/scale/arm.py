@@ -17,7 +17,7 @@ from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.rasterizer import make_rasterizer
 from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.plugin.machine import disk_bytes, peak_device_bytes, peak_rss_bytes
@@ -84,7 +84,7 @@ def run(job: ArmJob, folder: Path) -> Arm:
     land = Land(job.tiles, job.gaussians_per_tile, seed=job.seed)
     store = make_store(land, job.monolithic, folder / "store")
     made = time.perf_counter()
-    coordinator = _coordinator(job, land, store, rasterizer, device, folder)
+    coordinator = _coordinator(job, land, store, rasterizer, device)
     watch = _Watch(coordinator)
     cameras = {view.index: view for view in land.cameras()}
     # The visit to a single block lasts as long as the run.
@@ -128,7 +128,7 @@ def make_store(land: Land, monolithic: bool, folder: Path) -> ParameterStore:
     return store
 
 
-def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, device, folder) -> Coordinator:
+def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, device) -> Coordinator:
     tree = build_kd(torch.zeros(0, 3), 1) if job.monolithic else land.tree()
     config = TrainingConfig(
         seed=job.seed,
@@ -144,7 +144,6 @@ def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, dev
         Budget(steps=10**9),
         StoredScene(tree, store, ram_bytes=job.ram_budget_bytes),
         land.cameras(),
-        LayerCache(folder / "layers"),
         rasterizer,
         *nothing_live(3, device),
         device=device,

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.initialize import random_points
-from abcd_ns.engine.storage import view_fingerprint
 from abcd_ns.engine.types import View
 from abcd_ns.tools.stability.lab import METHODS, Lab, Method, Stage, make_stage
 from abcd_ns.tools.stability.outcome import Finding, Scenario
@@ -94,16 +93,10 @@ def sparse(lab: Lab) -> Finding:
 
 
 def inexact(lab: Lab) -> Finding:
-    """A12: poses that are off, exposures that differ; and that a pose is part of a layer's name."""
+    """A12: poses that are off, exposures that differ."""
     stage = table()
     noisy = with_noisy_poses(stage, TURN_DEGREES, SHIFT)
-    found = lost(lab, {"noisy poses": noisy, "two exposures": with_gains(stage)})
-    view = stage.views[0]
-    moved = view.viewmat.clone()
-    moved[0, 3] = torch.nextafter(moved[0, 3], torch.tensor(9.0))
-    renamed = view_fingerprint(view) != view_fingerprint(replace(view, viewmat=moved))
-    said = {**found.said, "abcd": found.said["abcd"] + f"; a moved pose renames its layers: {renamed}"}
-    return replace(found, passed=found.passed and renamed, said=said)
+    return lost(lab, {"noisy poses": noisy, "two exposures": with_gains(stage)})
 
 
 def far_shell(lab: Lab) -> Finding:
@@ -125,7 +118,7 @@ SCENARIOS = (
         "A12",
         "noisy poses, changing exposure (H3DGS #55, VastGaussian)",
         f"poses off by {TURN_DEGREES} degrees and {SHIFT:.0%}; every other photo 1.5 times as bright",
-        "PSNR falls by no more than one block's does, and 0.3 dB; no layer is found under a pose that moved",
+        "PSNR falls by no more than one block's does, and 0.3 dB",
         inexact,
         cost=5,
     ),

@@ -44,7 +44,7 @@ def stability(
     """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
 
     All methods draw the same number of views. OUT gets stability.json, table.md and charts of held-out PSNR
-    against the number of blocks, steps a visit, the age and the bits of layers, views, noise of poses and
+    against the number of blocks, steps a visit, the age of layers, views, noise of poses and
     exposure. Needs no GPU and no data; some 10 minutes on two cores.
 
     Args:

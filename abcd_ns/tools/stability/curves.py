@@ -14,7 +14,6 @@ AGES = (1, 2, 4, 8)
 """Visits after which layers are refreshed."""
 DEGREES = (0.0, 0.5, 1.0)
 GAIN_STEPS = (1.0, 1.5, 2.0)
-BITS = (16, 32)
 WITH_BLOCKS: tuple[Method, ...] = ("abcd", "abcd-ablated")
 
 Train = Callable[[Lab], float]
@@ -98,7 +97,6 @@ def _of_training(stage: Stage, one_block: Train) -> tuple[Study, ...]:
         for name, share in damped
         for age in AGES
     ]
-    bits = [("abcd", b, _call(stage, "abcd", bits=b)) for b in BITS]
     all_views = "4 blocks; the same number of views in all"
     allowed = "4 blocks, no density control; the engine itself allows 1 only"
     return (
@@ -112,7 +110,6 @@ def _of_training(stage: Stage, one_block: Train) -> tuple[Study, ...]:
             one_block,
         ),
         Study("staleness", "age of layers", "visits between refreshes", tuple(ages), allowed),
-        Study("layer-bits", "precision of layers", "bits", tuple(bits), level=one_block),
     )
 
 

@@ -27,7 +27,7 @@ from abcd_ns.engine.run_state import Budget
 from abcd_ns.engine.scaffold import blocks_at_rest
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import views_per_step, views_per_warm_up_step
-from abcd_ns.engine.storage import LayerCache, ParameterStore
+from abcd_ns.engine.storage import ParameterStore
 from abcd_ns.engine.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.tools.stability.world import TABLE, World, ring
@@ -148,7 +148,6 @@ class Lab:
         budget: int,
         blocks: int = BLOCKS,
         tree: BlockTree | None = None,
-        bits: Literal[16, 32] = 16,
         kind: type[Coordinator] = Coordinator,
         optimizers: tuple[dict[str, Parameter], Optimizers] | None = None,
         **training,
@@ -173,9 +172,9 @@ class Lab:
         keep = scaffold_size(config, largest, pixels) if warms else None
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
         params, adam = optimizers or nothing_live(start.sh_degree)
-        scene, cache = StoredScene(tree, store), LayerCache(None, bits=bits)
+        scene = StoredScene(tree, store)
         steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views)))
-        return kind(config, steps, scene, views, cache, self.rasterizer, params, adam)
+        return kind(config, steps, scene, views, self.rasterizer, params, adam)
 
     def train(
         self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options

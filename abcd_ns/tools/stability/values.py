@@ -13,11 +13,12 @@ from abcd_ns.engine.events import Mended
 from abcd_ns.engine.health_record import standing
 from abcd_ns.engine.health_rules import unsound
 from abcd_ns.engine.initialize import gaussians_from_points, random_points
+from abcd_ns.engine.layer_store import packed, rounded, unpacked
+from abcd_ns.engine.painter import Parts
 from abcd_ns.engine.param_swap import Optimizers, nothing_live
 from abcd_ns.engine.partition import build_kd
 from abcd_ns.engine.planner import NothingSeenError
 from abcd_ns.engine.rasterizer.spherical_harmonics import SH_C0
-from abcd_ns.engine.storage import through_codec
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.tools.stability.lab import (
     SH_DEGREE,
@@ -117,7 +118,7 @@ def bright_and_hidden(lab: Lab) -> Finding:
     bright = replace(stage.start(), features_dc=torch.full((len(stage.points), 3), 1.1 / SH_C0))
     bright = replace(bright, opacities=torch.full_like(bright.opacities, 4.0), scales=bright.scales + 1)
     layer = lab.rasterizer(bright, stage.views[0], sh_degree=0).layer
-    back = through_codec(layer, 16)
+    back = unpacked(rounded(packed(Parts(layer, layer))).float()).back
     brightest = float(back.color.max())
     # Behind half a pane, 1.6 is 0.8: it must not be clipped before that.
     dimmed = float(composite(replace(back, color=0.5 * back.color), torch.zeros(3)).max())
@@ -182,7 +183,7 @@ SCENARIOS = (
     Scenario(
         "A22",
         "colours over 1 clipped; transmittance saturates",
-        "a colour of 1.6 through a 16-bit layer; a block inside an opaque ball",
+        "a colour of 1.6 through a layer of half floats; a block inside an opaque ball",
         "the colour survives; the hidden block is visited once, then passed over, and said to be hidden",
         bright_and_hidden,
     ),

@@ -34,7 +34,6 @@ def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, speed: 
         "peak_device_note": "no CUDA device",
         "peak_rss_bytes": 3 << 29,
         "store_bytes": 1 << 28,
-        "cache_bytes": 1 << 29,
         "layer_seconds": 12.0,
         "curve": tuple(curve),
         "views": (ViewScore(0, "0000.png", psnr, 0.8, None, psnr, None),),

@@ -21,7 +21,7 @@ TRAINING = {
     "blocks": 3,
     "gaussians": 300,
     "limit": 1000,
-    "budgets": {"photos": 1 << 30, "layers on disk": 4 << 30},
+    "budgets": {"photos": 1 << 30, "layers": 4 << 30},
 }
 PIXEL = "data:image/png;base64,AAAA"
 
