@@ -5,8 +5,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import torch
-
 from abcd_ns.engine.compositing import empty_layer
 from abcd_ns.engine.painter import Loaded, Painter, PaintSettings, Parts
 from abcd_ns.engine.photometric_kernel import SSIM_WINDOW
@@ -62,14 +60,13 @@ def survey(
     Args:
         align: crops begin and end on multiples of this, pixels (or at the image's edge).
     """
-    crops = {}
-    with torch.no_grad():
-        for view in views:
-            seen = rasterizer.project(gaussians, view)
-            crop = footprint(seen.means2d, seen.radii, view, margin=CROP_MARGIN, align=align)
-            if crop is not None:
-                crops[view.index] = crop
-    return VisitGeometry(block, crops)
+    views = tuple(views)
+    extents = rasterizer.extents(gaussians, views).tolist() if views else []
+    crops = {
+        view.index: footprint(extent, view, margin=CROP_MARGIN, align=align)
+        for view, extent in zip(views, extents, strict=True)
+    }
+    return VisitGeometry(block, {view: crop for view, crop in crops.items() if crop is not None})
 
 
 @dataclass(frozen=True)
