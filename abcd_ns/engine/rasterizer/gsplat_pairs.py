@@ -96,8 +96,11 @@ class Sheet:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of what is drawn of each crop, px: whole tiles. Of a masked tile gsplat's kernel lets
-        the threads go that have a pixel, and the others would read the whole list."""
+        """(width, height) of what is drawn of each crop, px.
+
+        Whole tiles: of a masked one gsplat's kernel lets the threads go that have a pixel in the picture, and
+        the others would read the whole list.
+        """
         return self.shape[2] * TILE, (self.shape[1] - self.spare) * TILE
 
     @property
@@ -204,8 +207,8 @@ class Drawing:
         return inside | (self.owners < always) if always else inside
 
     def only(self, keep: Bool[Tensor, "q"]) -> "Drawing":
-        """Without some pairs: the others move up, in order, and the end of the lists belongs to the last tile, a
-        spare one. The host need not know how many there are.
+        """Without some pairs. The others move up, in order, and the end of the lists belongs to the last
+        tile, a spare one: the host need not know how many there are.
         """
         count = len(keep)
         place = torch.where(keep, keep.cumsum(0) - 1, count)  # the others: to one place, which is cut off
