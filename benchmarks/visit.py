@@ -27,7 +27,7 @@ from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.events import VisitEnded
 from abcd_ns.engine.initialize import gaussians_from_points
-from abcd_ns.engine.loss import mean_psnr
+from abcd_ns.engine.loss import psnrs
 from abcd_ns.engine.near_plane import near_plane
 from abcd_ns.engine.param_swap import nothing_live
 from abcd_ns.engine.partition import build_kd
@@ -221,7 +221,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
         for optimizer in coordinator.optimizers.values():
             optimizer.step()
     with clock.stage("density and settling"):
-        coordinator.after_step(rendered, mean_psnr(rendered.pictures, photos))
+        coordinator.after_step(rendered, psnrs(rendered.pictures, photos))
     clock.views += len(batch.samples) * crew
 
 

@@ -15,7 +15,11 @@ from abcd_ns.engine.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.painter import Parts
 from abcd_ns.engine.rasterizer import Raster, Shot, ZWindow
 from abcd_ns.engine.rasterizer.projection import Splats
+from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, View
+
+BACKGROUNDS = 1024
+"""Steps whose backgrounds are copied to a device together."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,26 @@ def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "
         drawn = random.Random(f"background {config.seed} {step} {place}").getrandbits(62)
         return torch.rand(3, generator=torch.Generator().manual_seed(drawn))
     return torch.full((3,), float(config.background == "white"))
+
+
+class Backgrounds:
+    """`background` on the device: of many steps in one copy."""
+
+    def __init__(self, config: TrainingConfig, device: torch.device) -> None:
+        self._config, self._device = config, device
+        self._tables: dict[int, tuple[int, Float[Tensor, "s 3"]]] = {}
+
+    def at(self, step: int, place: int) -> Float[Tensor, "3"]:
+        """What lies behind the scene in the sample at `place` of a step's batch."""
+        if self._device.type == "cpu":
+            return background(self._config, step, place)
+        first = step - step % BACKGROUNDS
+        known, table = self._tables.get(place, (None, None))
+        if known != first:
+            drawn = (background(self._config, first + k, place) for k in range(BACKGROUNDS))
+            table = upload(torch.stack(list(drawn)), self._device)
+            self._tables[place] = first, table
+        return table[step - first]
 
 
 def part_to_draw(config: TrainingConfig, crop: Crop, step: int, place: int) -> Crop:

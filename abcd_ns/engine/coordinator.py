@@ -6,13 +6,13 @@ everything else at rest in the store, and tells its listeners what happens.
 """
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.batch import Batch, Rendered, Sample
+from abcd_ns.engine.batch import Backgrounds, Batch, Rendered, Sample
 from abcd_ns.engine.block_state import BlockState, Clocks
 from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
@@ -97,6 +97,7 @@ class Coordinator(StepDrawing):
         self._pace = Pace(optimizers, config.batch_power)
         heals = {"may_act": config.heal and config.layers, "may_drop": config.density.strategy == "default"}
         self.health = Health(scene, params, optimizers, self.announce, **heals)
+        self._backgrounds = Backgrounds(config, self.device)
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
         self._layers: VisitLayers | None = None
@@ -154,12 +155,16 @@ class Coordinator(StepDrawing):
             return tuple(endless_order(active.views, place, self.config.seed) for place in places)
         return order[done * each : (done + 1) * each]
 
-    def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
-        """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done."""
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+        """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done.
+
+        Args:
+            psnrs: of each picture, dB; listeners are told their mean.
+        """
         active, taken = self._active, len(rendered.pictures) * self._active.crew
         self.state.step += 1
         active.done += 1
-        sound = self.health.end_step()
+        sound, psnr = self.health.end_step(psnrs)
         self._clocks = replace(self._clocks, adam_views=self._clocks.adam_views + self.batch)
         if not active.is_whole:
             self._clocks = replace(self._clocks, steps=self._clocks.steps + taken)

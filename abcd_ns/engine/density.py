@@ -8,6 +8,7 @@ step number they are given, either to gather statistics or to refine now.
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any, Literal
 
 import torch
@@ -122,6 +123,7 @@ class DensityControl:
 
     def __init__(self, config: DensityConfig) -> None:
         self.config = config
+        self._binomials = binomials()
 
     @property
     def absgrad(self) -> bool:
@@ -182,11 +184,21 @@ class DensityControl:
         with_gradient = _with_gradient(infos)
         if not with_gradient or len(means) == 0:
             return {}
-        strategy = DefaultStrategy(refine_every=REFINE, reset_every=BEFORE_RESET, absgrad=self.absgrad)
-        state: dict[str, Any] = {"grad2d": None, "count": None, "scene_scale": 1.0}
-        for info in with_gradient:
-            strategy.step_post_backward({"means": means}, {}, state, GATHER, info)
-        return {name: state[name] for name in COUNTED}
+        views = [view for info in with_gradient for view in zip(*self._norms(info), strict=True)]
+        norms, seen = (reduce(torch.add, parts) for parts in zip(*views, strict=True))
+        return dict(zip(COUNTED, (norms, seen), strict=True))
+
+    def _norms(self, info: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """What DefaultStrategy._update_state adds up: norms of the gradients in each view, and 1 where there
+        is one, [v, n]. It picks rows, whose number the host has to wait for; here the others are 0.
+        """
+        means2d = info["means2d"]
+        gradient = means2d.absgrad if self.absgrad else means2d.grad
+        width, height = (info[side] / 2.0 * info["n_cameras"] for side in ("width", "height"))
+        norms = torch.stack((gradient[..., 0] * width, gradient[..., 1] * height), dim=-1).norm(dim=-1)
+        # An accelerator may have skipped the step that these are of.
+        seen = (info["radii"] > 0) & norms.isfinite()
+        return torch.where(seen, norms, 0.0), seen.to(norms.dtype)
 
     def after_step(
         self,
@@ -207,6 +219,13 @@ class DensityControl:
         """
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth
+        if self.config.strategy == "default":
+            if clock.progress >= self.config.refine_stop:
+                return growth
+            infos = _with_gradient(infos)
+            growth = added(growth, self.count(params["means"], infos))
+            if not (self.refines(clock, infos) or self.resets(clock)):
+                return growth
         device = params["means"].device
         cuda = [device] if device.type == "cuda" else []
         with torch.random.fork_rng(devices=cuda), _operators_for(device):
@@ -225,10 +244,6 @@ class DensityControl:
         clock: DensityClock,
     ) -> dict[str, Tensor]:
         config = self.config
-        infos = _with_gradient(infos)
-        if clock.progress >= config.refine_stop:
-            return growth
-        growth = added(growth, self.count(params["means"], infos))
         has_reset = 0 < config.reset_every < clock.steps
         strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
@@ -261,7 +276,10 @@ class DensityControl:
         )
         step = REFINE if self.is_due(clock) else GATHER
         learning_rate = optimizers["means"].param_groups[0]["lr"]
-        strategy.step_post_backward(params, optimizers, {"binoms": binomials()}, step, {}, lr=learning_rate)
+        self._binomials = self._binomials.to(params["means"].device)
+        strategy.step_post_backward(
+            params, optimizers, {"binoms": self._binomials}, step, {}, lr=learning_rate
+        )
 
 
 def _with_gradient(infos: Infos) -> Infos:
@@ -285,13 +303,17 @@ def _threshold_within(growth: dict[str, Tensor], threshold: float, room: int | N
 
 @contextmanager
 def _operators_for(device: torch.device) -> Iterator[None]:
-    """gsplat 1.4.0's MCMC calls two CUDA operators by name; elsewhere, lend it torch ones for the call."""
-    if device.type == "cuda":
-        yield
-        return
-    originals = gsplat_ops.compute_relocation, gsplat_ops.quat_scale_to_covar_preci
-    gsplat_ops.compute_relocation, gsplat_ops.quat_scale_to_covar_preci = compute_relocation, covariances
+    """gsplat 1.4.0's MCMC calls two CUDA operators by name; elsewhere, lend it torch ones for the call. And
+    it gives back the allocator's memory after each refinement, only to ask for it anew: it had better not."""
+    lent: list[tuple[Any, str, Any]] = [(torch.cuda, "empty_cache", lambda: None)]
+    if device.type != "cuda":
+        lent.append((gsplat_ops, "compute_relocation", compute_relocation))
+        lent.append((gsplat_ops, "quat_scale_to_covar_preci", covariances))
+    originals = [(owner, name, getattr(owner, name)) for owner, name, _ in lent]
     try:
+        for each in lent:
+            setattr(*each)
         yield
     finally:
-        gsplat_ops.compute_relocation, gsplat_ops.quat_scale_to_covar_preci = originals
+        for each in originals:
+            setattr(*each)

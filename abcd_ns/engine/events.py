@@ -34,7 +34,8 @@ class StepTaken:
     visit: int
     visit_step: int
     psnr: float
-    """Of the crop that was trained on, dB."""
+    """Of the crop that was trained on, dB. On an accelerator of the visit's step before, NaN in its first:
+    the device is still at work on this one."""
 
 
 @dataclass(frozen=True)

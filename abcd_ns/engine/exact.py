@@ -15,7 +15,7 @@ way to the device and back.
 """
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -126,7 +126,7 @@ class ExactCoordinator(Coordinator):
         clamped = tuple(picture.clamp(0, 1) for picture in self._pictures)
         return Rendered(clamped, tuple(whole.transmittance for whole in wholes), ())
 
-    def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
         """Pass 2, and a step of every block's optimizers."""
         gradients, taken = self.gradients(), len(rendered.pictures)
         self.state.step += 1
@@ -140,7 +140,7 @@ class ExactCoordinator(Coordinator):
         self._all = joined[order.argsort()] if kept else joined
         self._lay_over()
         self._pictures, self._layers_of = [], []
-        self.health.end_step()
+        _, psnr = self.health.end_step(psnrs)
         self.announce(StepTaken(self.state.step, 0, self.state.step, psnr))
         if self.finished:
             self.save()

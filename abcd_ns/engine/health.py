@@ -31,6 +31,8 @@ from abcd_ns.engine.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.run_state import ActiveVisit
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.settle import at_rest
+from abcd_ns.engine.step_guard import StepGuard
+from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Gaussians, View
 
 LEAST_DAMPING = 1 / 16
@@ -66,6 +68,9 @@ class Health:
         self._bad: Tensor | None = None
         self._losses: list[tuple[int, Tensor]] = []
         self._shares: list[Tensor] = []
+        self._numbers = StepNumbers(params["means"].device)
+        self._guard = StepGuard(optimizers) if self._numbers.are_late else None
+        self._skips, self._psnr = True, math.nan
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
 
@@ -88,6 +93,7 @@ class Health:
         self._active, self._ledger = active, ledger
         self._attached, self._bad, self._shares = self._params["means"], None, []
         self._resumed = active.saved
+        self._skips, self._psnr = True, math.nan
 
     def see(self, share: Float[Tensor, ""]) -> None:
         """Take note of how large a part of a picture the live block was."""
@@ -98,16 +104,24 @@ class Health:
         """Remember the loss of each view in this step: (view, loss) pairs."""
         self._losses = list(losses) if self.acts else []
 
-    def end_step(self) -> bool:
-        """Call after the optimizers stepped; whether the step's gradients were all numbers."""
-        self._read_losses()
-        self._read_shares()
+    def end_step(self, psnrs: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
+        """Call after the optimizers stepped.
+
+        Args:
+            psnrs: of what the step drew, dB.
+
+        Returns:
+            Whether the step's gradients were all numbers, as far as is known; and the mean PSNR, dB: on an
+            accelerator of the step before, NaN in a visit's first.
+        """
+        self._send(psnrs)
+        self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
-            return True
+            return True, self._psnr
         self._count("gradients", int(self._bad.sum()))
         self._bad = None
         self._mend()
-        return False
+        return False, self._psnr
 
     @torch.no_grad()
     def hold_back_giants(self, views: Iterable[View]) -> None:
@@ -162,6 +176,7 @@ class Health:
 
     def look_over(self) -> None:
         """Mend all that is no number in the live block; call when a visit ends, and before saving."""
+        self._read()
         self._mend()
 
     def _undo(
@@ -177,6 +192,9 @@ class Health:
     # -- numbers -------------------------------------------------------------------------------------
 
     def _clean_gradients(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:  # noqa: ARG002
+        if self._guard is not None and self._skips and self._guard.works:
+            self._guard.tell(optimizer)
+            return
         for parameter in optimizer.param_groups[0]["params"]:
             if parameter.grad is None:
                 continue
@@ -231,21 +249,40 @@ class Health:
 
     # -- accounts ------------------------------------------------------------------------------------
 
-    def _read_losses(self) -> None:
+    def _send(self, psnrs: Sequence[Float[Tensor, ""]]) -> None:
+        """All that the step tells, as one small tensor."""
         losses, self._losses = self._losses, []
-        if self._active is None or not losses:
-            return
-        values = torch.stack([loss for _, loss in losses]).tolist()
-        for (view, _), loss in zip(losses, values, strict=True):
+        shares, self._shares = self._shares, []
+        if self._active is None:
+            losses = []
+        if self._active is None or self._active.shown:
+            shares = []
+        parts = {"losses": [loss for _, loss in losses], "shares": shares, "psnrs": list(psnrs)}
+        if self._guard is not None:
+            parts["bad"], self._guard.found = self._guard.found, []
+        self._numbers.send([view for view, _ in losses], parts)
+
+    def _read(self, all_but: int = 0) -> None:
+        """Take note of what steps told, but for the last so many."""
+        for views, numbers in self._numbers.read(all_but):
+            self._note_losses(views, numbers["losses"])
+            if self._active is not None and not self._active.shown and numbers["shares"]:
+                self._active.shown = float(torch.tensor(numbers["shares"]).max()) > HIDDEN
+            psnrs = numbers["psnrs"]
+            self._psnr = sum(psnrs) / len(psnrs) if psnrs else math.nan
+            skipped = int(sum(numbers.get("bad", ())))
+            if skipped and self._skips:  # from now on row by row, so that the others are trained
+                self._skips = False
+                self._guard.stop()
+                self._mend()
+            self._count("gradients", skipped)
+
+    def _note_losses(self, views: Sequence[int], losses: Sequence[float]) -> None:
+        for view, loss in zip(views, losses, strict=True):
             if math.isfinite(loss):
                 first = self._active.objective.get(view, [loss])[0]
                 seen = view in self._active.objective
                 self._active.objective[view] = [first, loss] if seen else [first]
-
-    def _read_shares(self) -> None:
-        shares, self._shares = self._shares, []
-        if self._active is not None and not self._active.shown and shares:
-            self._active.shown = float(torch.stack(shares).max()) > HIDDEN
 
     @property
     def _record(self) -> BlockHealth:

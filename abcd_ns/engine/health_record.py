@@ -14,7 +14,8 @@ class BlockHealth:
     visits: int = 0
     """That ended, undone ones included."""
     gradients: int = 0
-    """Rows of gradients that were no numbers and were set to zero."""
+    """Rows of gradients that were no numbers and were set to zero. On an accelerator the first steps that
+    have any are skipped, and count as a row each."""
     moments: int = 0
     """Rows of Adam's moments likewise."""
     values: int = 0

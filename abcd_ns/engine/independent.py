@@ -17,6 +17,7 @@ schedule runs over that visit. The store also holds each block as it began, unde
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -172,9 +173,9 @@ class IndependentCoordinator(Coordinator):
             wanted.append(target * counts)
         return super().loss(batch, shown, wanted)
 
-    def after_step(self, rendered: Rendered, psnr: float = float("nan")) -> None:
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
         """As Coordinator's; the visit ends when its share of the budget is used up."""
-        super().after_step(rendered, psnr)
+        super().after_step(rendered, psnrs)
         if self.state.active is not None and self.progress >= self._active.until:
             self._end_visit()
 

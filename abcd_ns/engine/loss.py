@@ -1,5 +1,6 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -54,10 +55,17 @@ def photometric_loss(
     if not has_windows:
         return by_pixel * _by_pixels(rendered, photo, pixel_loss)
     in_kernel = by_pixel if pixel_loss == "l1" else 0.0
-    weights = rendered.new_tensor([in_kernel, ssim_lambda / (3 * full_windows)])
+    weights = _pair(in_kernel, ssim_lambda / (3 * full_windows), rendered.dtype, rendered.device)
     planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
     loss = _Photometric.apply(*planes, weights)
     return loss if pixel_loss == "l1" else loss + by_pixel * _by_pixels(rendered, photo, pixel_loss)
+
+
+@functools.lru_cache(maxsize=1024)
+def _pair(first: float, second: float, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2"]:
+    """Two numbers on the device, without a copy."""
+    with torch.inference_mode(False):  # they outlive this call
+        return torch.stack([torch.full((), x, dtype=dtype, device=device) for x in (first, second)])
 
 
 def _by_pixels(
@@ -78,6 +86,8 @@ def psnr(rendered: Float[Tensor, "..."], photo: Float[Tensor, "..."]) -> Float[T
 
 
 @torch.no_grad()
-def mean_psnr(rendered: Sequence[Float[Tensor, "..."]], photos: Sequence[Float[Tensor, "..."]]) -> float:
-    """The mean PSNR of pairs, dB."""
-    return sum(float(psnr(a, b)) for a, b in zip(rendered, photos, strict=True)) / len(rendered)
+def psnrs(
+    rendered: Sequence[Float[Tensor, "..."]], photos: Sequence[Float[Tensor, "..."]]
+) -> list[Float[Tensor, ""]]:
+    """The PSNR of each pair, dB."""
+    return [psnr(a, b) for a, b in zip(rendered, photos, strict=True)]

@@ -6,6 +6,9 @@ taken as one long row of pixels, as loops that end with each row spend much of t
 """
 
 import math
+import warnings
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,6 +25,7 @@ SSIM_SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 _BELL = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SSIM_SIGMA**2)) for k in range(SSIM_WINDOW)]
 _TAPS = [tap / sum(_BELL) for tap in _BELL]
+Step = Callable[..., tuple[Tensor, ...]]
 
 
 def slide_rows(pixels: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n-10"]]:
@@ -85,6 +89,29 @@ COMBINE = Kernel("combine", combine, ("9 h+10 w", "3 h w", "3 h w", "2"))
 PHOTOMETRIC_KERNELS = (SLIDE_ROWS, DISSIMILARITY, COMBINE)
 
 
+class Compiled:
+    """A function that torch.compile makes a few kernels of when it is first called, for all sizes; where that
+    fails, the function as it is."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._run: Callable[..., Any] | None = None
+
+    def __call__(self, *tensors: Tensor) -> Any:
+        if self._run is None:
+            self._run = torch.compile(self._function, dynamic=True)
+        try:
+            return self._run(*tensors)
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, ImportError, OSError) as error:
+            if self._run is self._function:
+                raise
+            warnings.warn(f"The loss runs uncompiled, so steps take longer: {error}", stacklevel=2)
+            self._run = self._function
+            return self._function(*tensors)
+
+
 def photometric_sums(
     rendered: Float[Tensor, "3 h w"], photo: Float[Tensor, "3 h w"], weights: Float[Tensor, "2"]
 ) -> tuple[Float[Tensor, "2"], Float[Tensor, "3 h w"]]:
@@ -92,15 +119,35 @@ def photometric_sums(
 
     Images are at least as large as the window.
     """
+    if rendered.device.type == "cuda":
+        return _ON_CUDA(rendered, photo, weights)
+    return _sums(rendered, photo, weights, SLIDE_ROWS, DISSIMILARITY, COMBINE)
+
+
+def _uncompiled(rendered: Tensor, photo: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    return _sums(rendered, photo, weights, slide_rows, dissimilarity, combine)
+
+
+_ON_CUDA = Compiled(_uncompiled)
+
+
+def _sums(
+    rendered: Float[Tensor, "3 h w"],
+    photo: Float[Tensor, "3 h w"],
+    weights: Float[Tensor, "2"],
+    slide_rows: Step,
+    dissimilarity: Step,
+    combine: Step,
+) -> tuple[Float[Tensor, "2"], Float[Tensor, "3 h w"]]:
     _, height, width = rendered.shape
     moments = (rendered, photo, rendered * rendered, photo * photo, rendered * photo)
-    (rows,) = SLIDE_ROWS(torch.cat([*map(torch.flatten, moments), rendered.new_zeros(REACH)]))
+    (rows,) = slide_rows(torch.cat([*map(torch.flatten, moments), rendered.new_zeros(REACH)]))
     inside = rendered.new_zeros((height - REACH, width))
     inside[:, : width - REACH] = 1.0
-    unlike, by_moment = DISSIMILARITY(rows.view(15, height, width), inside)
+    unlike, by_moment = dissimilarity(rows.view(15, height, width), inside)
     # The way back. Columns that were void are 0 and keep rows apart, rows of zeros keep images apart.
     spread = rendered.new_zeros(REACH + 9 * (height + REACH) * width)
     spread[REACH:].view(9, -1, width)[:, REACH:height].copy_(by_moment)
-    (rows,) = SLIDE_ROWS(spread)
-    difference, gradient = COMBINE(rows.view(9, -1, width), rendered, photo, weights)
+    (rows,) = slide_rows(spread)
+    difference, gradient = combine(rows.view(9, -1, width), rendered, photo, weights)
     return torch.stack((difference, unlike)), gradient

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.batch import Batch, Rendered, Sample, background, part_to_draw
+from abcd_ns.engine.batch import Backgrounds, Batch, Rendered, Sample, part_to_draw
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.crew import Crew
 from abcd_ns.engine.density import DensityControl
@@ -44,6 +44,7 @@ class StepDrawing(ABC):
     sh_degree: int
     """The degree of spherical harmonics in use."""
     _rasterizer: Rasterizer
+    _backgrounds: Backgrounds
     _target: Callable[[Sample], Target] | None
     _layers: VisitLayers | None
     _crew: Crew | None
@@ -89,7 +90,7 @@ class StepDrawing(ABC):
             layers=around and around.layers,
             near=around and around.near,
             window=around and around.window,
-            background=background(self.config, step, place).to(self.device),
+            background=self._backgrounds.at(step, place),
         )
 
     @property
@@ -132,7 +133,7 @@ class StepDrawing(ABC):
         triples = zip(batch.samples, pictures, photos, strict=True)
         losses = [sample.loss(picture, photo, self.config) for sample, picture, photo in triples]
         members = 1 if self._crew is None else self._active.crew
-        photometric = sum(losses, start=torch.zeros((), device=self.device)) / (len(losses) * members)
+        photometric = sum(losses[1:], start=losses[0]) / (len(losses) * members)
         known = [(s.view.index, loss.detach()) for s, loss in zip(batch.samples, losses, strict=True)]
         if self._crew is not None:
             photometric, drawn = photometric + self._crew.loss(), self._crew.drawn()

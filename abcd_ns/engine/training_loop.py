@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.loss import mean_psnr
+from abcd_ns.engine.loss import psnrs
 from abcd_ns.engine.types import Crop
 
 PhotoReader = Callable[[int, Crop], Float[Tensor, "h w 3"]]
@@ -24,7 +24,8 @@ def train(coordinator: Coordinator, photo: PhotoReader, steps: int | None = None
 def train_step(coordinator: Coordinator, photo: PhotoReader) -> None:
     """Render a batch, take its loss' gradient, step every optimizer, report back."""
     batch = coordinator.next_batch()
-    photos = [photo(sample.view.index, sample.crop).to(coordinator.device) for sample in batch.samples]
+    read = (photo(sample.view.index, sample.crop) for sample in batch.samples)
+    photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
     rendered = coordinator.render(batch)
     loss = coordinator.loss(batch, rendered.pictures, photos)
     for optimizer in coordinator.optimizers.values():
@@ -33,4 +34,4 @@ def train_step(coordinator: Coordinator, photo: PhotoReader) -> None:
         loss.backward()
     for optimizer in coordinator.optimizers.values():
         optimizer.step()
-    coordinator.after_step(rendered, mean_psnr(rendered.pictures, photos))
+    coordinator.after_step(rendered, psnrs(rendered.pictures, photos))

@@ -1,9 +1,10 @@
 """What of a block can be seen where: footprints in the image, and reach into cells."""
 
 import math
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Real
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.blocks import Box
@@ -19,14 +20,11 @@ BLUR_PIXELS = DRAWN_SIGMAS * math.sqrt(BLUR_VARIANCE)
 """How far out it is drawn on that account alone, px."""
 
 
-def footprint(
-    means2d: Float[Tensor, "n 2"], radii: Real[Tensor, "n"], view: View, margin: int = 0, align: int = 16
-) -> Crop | None:
-    """The smallest aligned crop that holds everything that these projected Gaussians can draw.
+def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int = 16) -> Crop | None:
+    """The smallest aligned crop that holds everything that some projected Gaussians can draw.
 
     Args:
-        means2d: centres in the full image, px.
-        radii: half the sides of their squares, px; 0 where culled.
+        extent: where that is: (left, top, right, bottom), px; see Rasterizer.extents.
         margin: grow by this many px (a loss that looks at neighbouring pixels needs it).
         align: move the edges outward to multiples of this many px, or to the image's border. With the
             rasterizer's tile size (gsplat's is 16) no pixel is missed: it draws a Gaussian on all of
@@ -37,12 +35,9 @@ def footprint(
     """
     if margin < 0 or align < 1:
         raise ValueError(f"a footprint needs margin >= 0 and align >= 1, got {margin} and {align}")
-    size = means2d.new_tensor([view.width, view.height])
-    low, high = means2d - radii[:, None], means2d + radii[:, None]
-    visible = (radii > 0) & (high > 0).all(dim=1) & (low < size).all(dim=1)
-    if not bool(visible.any()):
+    x0, y0, x1, y1 = extent
+    if x0 > x1:
         return None
-    (x0, y0), (x1, y1) = low[visible].amin(dim=0).tolist(), high[visible].amax(dim=0).tolist()
     x, width = _aligned_span(x0, x1, view.width, margin, align)
     y, height = _aligned_span(y0, y1, view.height, margin, align)
     return Crop(x, y, width, height)

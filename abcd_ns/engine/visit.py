@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from abcd_ns.engine.layer_store import Kept, LayerStore, packed, rounded, unpacked
@@ -57,14 +56,13 @@ def survey(
     Args:
         align: crops begin and end on multiples of this, pixels (or at the image's edge).
     """
-    crops = {}
-    with torch.no_grad():
-        for view in views:
-            seen = rasterizer.project(gaussians, view)
-            crop = footprint(seen.means2d, seen.radii, view, margin=CROP_MARGIN, align=align)
-            if crop is not None:
-                crops[view.index] = crop
-    return VisitGeometry(block, crops)
+    views = tuple(views)
+    extents = rasterizer.extents(gaussians, views).tolist() if views else []
+    crops = {
+        view.index: footprint(extent, view, margin=CROP_MARGIN, align=align)
+        for view, extent in zip(views, extents, strict=True)
+    }
+    return VisitGeometry(block, {view: crop for view, crop in crops.items() if crop is not None})
 
 
 @dataclass(frozen=True)

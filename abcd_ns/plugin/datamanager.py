@@ -1,7 +1,7 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -9,6 +9,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
 from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
 from abcd_ns.plugin.data.dataset import AbcdDataset
 
@@ -26,8 +27,13 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     train_dataset: AbcdDataset
     eval_dataset: AbcdDataset
 
+    device_photo_bytes: int = 0
+    """Of decoded training photos and masks that may be kept on the device; of the others, crops are copied
+    there for each step. Of no use on the CPU."""
+
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._coordinator: Coordinator | None = None
+        self._on_device: dict[tuple[str, int], torch.Tensor] = {}
         super().__init__(*args, **kwargs)
         self._eval_order = random.Random(0)
 
@@ -52,12 +58,27 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def photo(self, row: int, crop: Crop) -> torch.Tensor:
         """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""
-        return self.train_dataset.photos.crop(row, crop).to(self.device).float() / 255
+        return self._pixels("photo", row, self.train_dataset.photos.image, crop).float() / 255
 
     def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
         """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""
-        mask = self.train_dataset.photos.mask(row)
-        return None if mask is None else mask[crop.slices].to(self.device)
+        return self._pixels("mask", row, self.train_dataset.photos.mask, crop)
+
+    def _pixels(
+        self, kind: str, row: int, read: Callable[[int], torch.Tensor | None], crop: Crop
+    ) -> torch.Tensor | None:
+        """A crop on the device, of what is kept there, or copied while the device goes on."""
+        kept = self._on_device.get((kind, row))
+        if kept is not None:
+            return kept[crop.slices]
+        whole, device = read(row), torch.device(self.device)
+        if whole is None:
+            return None
+        used = sum(each.nbytes for each in self._on_device.values())
+        if device.type == "cpu" or used + whole.nbytes > self.device_photo_bytes:
+            return upload(whole[crop.slices], device)
+        kept = self._on_device[kind, row] = upload(whole, device)
+        return kept[crop.slices]
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
         """The next batch: its first camera with all of it in the metadata, and the crops of the photos."""

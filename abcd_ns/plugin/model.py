@@ -17,7 +17,7 @@ from abcd_ns.engine.blocks import BlockTree
 from abcd_ns.engine.config import TrainingConfig
 from abcd_ns.engine.coordinator import Batch, Coordinator
 from abcd_ns.engine.initialize import gaussians_from_points, random_points
-from abcd_ns.engine.loss import mean_psnr, photometric_loss, ssim_windows
+from abcd_ns.engine.loss import photometric_loss, psnrs, ssim_windows
 from abcd_ns.engine.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.painter import Ownership, Painter, PaintSettings, default_pass
 from abcd_ns.engine.param_swap import live_gaussians
@@ -272,9 +272,13 @@ class AbcdModel(SplatfactoModel):
     # -- loss and metrics ----------------------------------------------------------------------------
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
-        """PSNR of what was drawn, a batch's mean, and the number of Gaussians in the scene."""
+        """PSNR of what was drawn, a batch's mean, and the number of Gaussians in the scene.
+
+        The PSNR of each picture is left in `outputs`, for the pipeline to take.
+        """
         pictures, photos = self._pairs(outputs, batch)
-        return {"psnr": mean_psnr(pictures, photos), "gaussian_count": self._count()}
+        outputs["psnrs"] = psnrs(pictures, photos)
+        return {"psnr": torch.stack(outputs["psnrs"]).mean(), "gaussian_count": self._count()}
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None

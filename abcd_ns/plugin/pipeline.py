@@ -98,7 +98,7 @@ class AbcdPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's, but keeps what the coordinator must be told after the step."""
         outputs, losses, metrics = super().get_train_loss_dict(step)
-        self._rendered, self._quality = outputs.pop("rendered"), float(metrics["psnr"])
+        self._rendered, self._psnrs = outputs.pop("rendered"), outputs.pop("psnrs")
         return outputs, losses, metrics
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -121,7 +121,7 @@ class AbcdPipeline(VanillaPipeline):
     def _after_step(self, trainer: "AbcdTrainer") -> None:
         if self._coordinator is None:
             raise RuntimeError("training has not begun")
-        self._coordinator.after_step(self._rendered, self._quality)
+        self._coordinator.after_step(self._rendered, self._psnrs)
         self._rendered = None
         if self._coordinator.finished:
             trainer.stop_training = True

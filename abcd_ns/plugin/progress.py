@@ -1,5 +1,6 @@
 """Where the training stands, in the terminal: sweep, block, steps, PSNR, Gaussians, memory, time left."""
 
+import math
 import time
 from datetime import timedelta
 
@@ -83,8 +84,9 @@ class ProgressReport:
             CONSOLE.print(f"  {line}", highlight=False)
 
     def _take_step(self, event: StepTaken) -> None:
-        before = event.psnr if self._psnr is None else self._psnr
-        self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
+        if math.isfinite(event.psnr):
+            before = event.psnr if self._psnr is None else self._psnr
+            self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
         steps = self._visit.steps if self._visit else 0
         endless = not 0 < steps < UNLIMITED or (self._visit is not None and self._visit.block is None)
         self._show(f"step {event.visit_step}" if endless else f"step {event.visit_step}/{steps}")

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from abcd_ns.engine.density import DensityConfig, DensityControl
-from abcd_ns.engine.rasterizer import Shot, TorchRasterizer, ZWindow, self_check
+from abcd_ns.engine.rasterizer import Rasterizer, Shot, TorchRasterizer, ZWindow, gsplat_backend, self_check
 from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
-from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.engine.rasterizer_scenes import (
     as_leaves,
     gradients,
@@ -123,6 +123,69 @@ def test_a_window_masks_what_is_frozen_where_anything_is(backend):
     beside = backend(gaussians, VIEW, sh_degree=0, frozen=frozen, z_window=nothing)
     assert bool((alone.transmittance == 1).all())
     assert torch.equal(stacked(beside), stacked(backend(gaussians, VIEW, sh_degree=0)))
+
+
+def moved(view: View, by: float, **changes) -> View:
+    viewmat = view.viewmat.clone()
+    viewmat[0, 3] += by
+    return replace(view, viewmat=viewmat, **changes)
+
+
+def several_shots(backend, windowed: bool, with_frozen: bool) -> list[Shot]:
+    """Of different sizes and near planes, with crops anywhere; some with frozen splats, none, or without."""
+    views = [
+        VIEW,
+        moved(VIEW, 0.2),
+        moved(VIEW, -0.3),
+        moved(VIEW, 0.1, width=64),
+        moved(VIEW, 0.3, near=2.5),
+    ]
+    crops = [Crop(19, 5, 30, 31), Crop(0, 0, 17, 40), Crop(53, 16, 17, 29), Crop(32, 32, 32, 13), VIEW.full]
+    shots = []
+    for k, (view, crop) in enumerate(zip(views, crops, strict=True)):
+        frozen = random_gaussians((0, 9, 12, 5, 3)[k], seed=k)
+        seen = backend.project(frozen, view) if with_frozen and k < 4 else None
+        shots.append(Shot(view, crop, seen, window_for(crop, k) if windowed and k != 2 else None))
+    return shots
+
+
+@pytest.mark.parametrize("windowed", [False, True])
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, windowed, with_frozen):
+    found = []
+    for draws in (backend, TILED):
+        leaves, shots = as_leaves(random_gaussians(40)), several_shots(TILED, windowed, with_frozen)
+        rasters = draws.draw(leaves, shots, sh_degree=2, absgrad=True)
+        infos = {id(raster.info): raster.info for raster in rasters}
+        assert {info["n_cameras"] for info in infos.values()} == {len(shots)}
+        for info in infos.values():
+            info["means2d"].retain_grad()
+        sum((stacked(r) * probe(*r.transmittance.shape)).sum() for r in rasters).backward()
+        # One info for each size and near plane, or one for all: in the order of their cameras.
+        places = [(id(raster.info), k) for k, raster in enumerate(rasters)]
+        order = [k for info in infos for which, k in places if which == info]
+        assert sum(len(info["radii"]) for info in infos.values()) == len(shots)
+        values = {"picture": torch.cat([stacked(raster).flatten() for raster in rasters])}
+        values |= {name: value.grad for name, value in leaves.items()}
+        for name in ("grad", "absgrad"):
+            rows = torch.cat([getattr(info["means2d"], name) for info in infos.values()])
+            values[name] = rows[torch.tensor(order).argsort()]
+        found.append(values)
+    for name, value in found[0].items():
+        assert relative_error(value.detach(), found[1][name].detach()) < 1e-8, name
+
+
+def test_where_many_views_see_gaussians_is_what_each_says(backend, monkeypatch):
+    monkeypatch.setattr(gsplat_backend, "SURVEY_BYTES", 2 * gsplat_backend.SURVEYED_BYTES * 12)
+    gaussians = random_gaussians(12)
+    gaussians.means[0] -= 100
+    views = [moved(VIEW, 2.0 * k, width=(70, 50)[k % 2], near=(0.01, 2.0)[k % 3 == 0]) for k in range(-9, 10)]
+    found = backend.extents(gaussians, views)
+    torch.testing.assert_close(found, TILED.extents(gaussians, views))
+    assert torch.equal(found, Rasterizer.extents(backend, gaussians, views))
+    assert bool(found.isinf().any(dim=1).any())
+    nobody = backend.extents(Gaussians.empty(dtype=torch.float64), views)
+    assert bool((nobody[:, :2] > nobody[:, 2:]).all())
 
 
 @pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])

@@ -4,7 +4,7 @@
         GsplatRasterizer()...  # on CPU tensors, or on the simulated device, where each counts as one launch
 
 Gradients are right, `absgrad` included. As in CUDA, what is not drawn is left uninitialised: it is NaN here.
-Only what this package uses is there: no packed layouts, no masks, no backgrounds.
+Only what this package uses is there: projection by cameras, lists and pictures packed, no backgrounds.
 """
 
 import math
@@ -145,31 +145,33 @@ def isect_tiles(
     camera_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """tiles per Gaussian [C, N], isect_ids [pairs] (camera | tile << 32 | bits of the depth), flatten_ids."""
-    assert not packed
-    assert n_cameras is camera_ids is gaussian_ids is None
+    """tiles per splat [nnz], isect_ids [pairs] (camera | tile << 32 | bits of the depth), flatten_ids."""
+    assert packed
+    assert n_cameras is not None
+    assert camera_ids.shape == gaussian_ids.shape == radii.shape == depths.shape == means2d.shape[:1]
+    assert camera_ids.dtype == torch.int64
+    assert radii.dtype == torch.int32
     most = torch.tensor([tile_width, tile_height])
 
-    def _isect_tiles(means2d: Tensor, radii: Tensor, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        drawn, reach = radii > 0, radii[..., None].to(means2d)
-        middle = torch.where(drawn[..., None], means2d, 0.0)
+    def _isect_tiles(means2d: Tensor, radii: Tensor, depths: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
+        drawn, reach = radii > 0, radii[:, None].to(means2d)
+        middle = torch.where(drawn[:, None], means2d, 0.0)
         first = ((middle - reach) / tile_size).floor().clamp_min(0).minimum(most).long()
         end = ((middle + reach) / tile_size).ceil().clamp_min(0).minimum(most).long()
-        size = (end - first) * drawn[..., None]
+        size = (end - first) * drawn[:, None]
         counts = size.prod(dim=-1)
-        flatten_ids = torch.repeat_interleave(counts.flatten())
-        place = torch.arange(len(flatten_ids)) - (counts.flatten().cumsum(0) - counts.flatten())[flatten_ids]
-        (x, y), width = first.flatten(0, -2)[flatten_ids].T, size[..., 0].flatten()[flatten_ids]
+        flatten_ids = torch.repeat_interleave(counts)
+        place = torch.arange(len(flatten_ids)) - (counts.cumsum(0) - counts)[flatten_ids]
+        (x, y), width = first[flatten_ids].T, size[:, 0][flatten_ids]
         tile = (y + place // width.clamp_min(1)) * tile_width + x + place % width.clamp_min(1)
-        bits = depths.float().flatten()[flatten_ids].view(torch.int32).long()
-        camera = (flatten_ids // radii.shape[1]) << _bits(tile_width, tile_height)
-        isect_ids = (camera | tile) << 32 | bits
+        bits = depths.float()[flatten_ids].view(torch.int32).long()
+        isect_ids = (camera[flatten_ids] << _bits(tile_width, tile_height) | tile) << 32 | bits
         if sort:
             isect_ids, order = isect_ids.sort(stable=True)
             flatten_ids = flatten_ids[order]
         return counts.int(), isect_ids, flatten_ids.int()
 
-    return kernel(_isect_tiles, means2d, radii, depths, waits=1)
+    return kernel(_isect_tiles, means2d, radii, depths, camera_ids, waits=1)
 
 
 def _bits(tile_width: int, tile_height: int) -> int:
@@ -205,16 +207,45 @@ def rasterize_to_pixels(
     packed: bool = False,
     absgrad: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Colours [C, h, w, channels] and alphas [C, h, w, 1], from any lists of pairs."""
+    """Colours [C, h, w, channels] and alphas [C, h, w, 1], from any lists of pairs.
+
+    The last list ends where the pairs do. Of a tile that is masked colours are 0, and alphas are not written.
+    """
     assert backgrounds is None
-    assert masks is None
-    assert not packed
+    assert packed
+    assert means2d.shape == (len(opacities), 2)
+    assert conics.shape == (len(opacities), 3)
+    assert len(colors) == len(opacities)
+    assert flatten_ids.dtype == isect_offsets.dtype == torch.int32
     assert isect_offsets.shape[1] * tile_size >= image_height
     assert isect_offsets.shape[2] * tile_size >= image_width
+    if masks is None:
+        masks = torch.ones_like(isect_offsets, dtype=torch.bool)
+    assert masks.shape == isect_offsets.shape
     size = image_width, image_height, tile_size
-    tensors = means2d, conics, colors, opacities, isect_offsets, flatten_ids
+    tensors = means2d, conics, colors, opacities, isect_offsets, flatten_ids, masks
     image = _Rasterize.apply(size, absgrad, *tensors)
     return image[..., :-1], image[..., -1:]
+
+
+def _in_image(offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
+    """Which tiles have a pixel in the image: [rows, cols]."""
+    width, height, side = size
+    rows, cols = (torch.arange(count) * side for count in offsets.shape[1:])
+    return (rows < height)[:, None] & (cols < width)
+
+
+def _drawn_lists(
+    offsets: Tensor, flatten_ids: Tensor, masks: Tensor, size: tuple[int, int, int]
+) -> tuple[Tensor, Tensor]:
+    """The same lists, but for tiles that are masked or have no pixel in the image: these draw nothing."""
+    counts = torch.cat((offsets.flatten(), torch.tensor([len(flatten_ids)]))).diff()
+    assert bool((counts >= 0).all())
+    drawn = (masks & _in_image(offsets, size)).flatten()
+    first = int(offsets.flatten()[0])
+    kept = flatten_ids[first:][torch.repeat_interleave(drawn, counts)]
+    counts = counts * drawn
+    return (counts.cumsum(0) - counts).view_as(offsets), kept
 
 
 class _Rasterize(torch.autograd.Function):
@@ -226,8 +257,11 @@ class _Rasterize(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
 
         def _rasterize(*tensors: Tensor) -> Tensor:
-            parts = [_tiles(p, b, tensors, size[2])[0] for p, b in _parts(*tensors[4:])]
-            return _image(torch.cat(parts), tensors[4], size).to(tensors[2])
+            *inputs, offsets, flatten_ids, masks = tensors
+            lists = _drawn_lists(offsets, flatten_ids, masks, size)
+            parts = torch.cat([_tiles(p, b, (*inputs, *lists), size[2])[0] for p, b in _parts(*lists)])
+            parts[~masks.flatten(), :, -1] = torch.nan
+            return _image(parts, offsets, size).to(tensors[2])
 
         return kernel(_rasterize, *tensors)
 
@@ -237,7 +271,7 @@ class _Rasterize(torch.autograd.Function):
         *gradients, absolute = kernel(partial(_gradients, ctx.size), *ctx.saved_tensors, upstream)
         if ctx.absgrad:
             means2d.absgrad = absolute
-        return None, None, *gradients, None, None
+        return None, None, *gradients, None, None, None
 
 
 def _parts(offsets: Tensor, flatten_ids: Tensor) -> Iterator[tuple[range, list[int]]]:
@@ -269,7 +303,7 @@ def _tiles(
     pixel = torch.arange(side * side)
     centers = torch.stack((pixel % side, pixel // side), dim=1) + 0.5
     # float64: transmittances are differences of logarithms, summed over all tiles.
-    values = [x.detach().flatten(0, 1)[rows].double() for x in (means2d, conics, colors, opacities)]
+    values = [x.detach()[rows].double() for x in (means2d, conics, colors, opacities)]
     values[0] = (values[0] - origin)[:, None] - centers
     values = [x.requires_grad_(wants_gradient) for x in values]
     (dx, dy), (a, b, c) = values[0].unbind(2), values[1][:, None].unbind(2)
@@ -307,16 +341,17 @@ def _by_tiles(image: Tensor, offsets: Tensor, side: int) -> Tensor:
 
 def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
     """Of means2d, conics, colours and opacities, and the sum of the means' absolute ones over pixels."""
-    *inputs, offsets, _, upstream = tensors
+    *inputs, offsets, flatten_ids, masks, upstream = tensors
+    lists = _drawn_lists(offsets, flatten_ids, masks, size)
     upstream = _by_tiles(upstream, offsets, size[2]).double()
-    sums = [torch.zeros_like(x.flatten(0, 1), dtype=torch.float64) for x in (*inputs, inputs[0])]
-    for tiles, starts in _parts(*tensors[4:6]):
+    sums = [torch.zeros_like(x, dtype=torch.float64) for x in (*inputs, inputs[0])]
+    for tiles, starts in _parts(*lists):
         with torch.enable_grad():
-            picture, values, rows = _tiles(tiles, starts, tensors[:6], size[2], wants_gradient=True)
+            picture, values, rows = _tiles(tiles, starts, (*inputs, *lists), size[2], wants_gradient=True)
             found = torch.autograd.grad(picture, values, upstream[tiles.start : tiles.stop])
         for total, part in zip(sums, (found[0].sum(1), *found[1:], found[0].abs().sum(1)), strict=True):
             total.index_add_(0, rows, part)
-    return [total.view_as(x).to(x) for total, x in zip(sums, (*inputs, inputs[0]), strict=True)]
+    return [total.to(x) for total, x in zip(sums, (*inputs, inputs[0]), strict=True)]
 
 
 @contextmanager

@@ -23,7 +23,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -39,6 +39,26 @@ _setup_privateuseone_for_python_backend("simulated")
 DEVICE = torch.device("simulated", 0)
 # Asked for wherever torch.autocast is named, though it be disabled.
 torch.get_device_module(DEVICE).get_amp_supported_dtype = lambda: [torch.float16, torch.bfloat16]
+
+
+class Event:
+    """A place in the order of what the device does. What is copied to the host without waiting is void until
+    an event that was recorded after it has been waited for."""
+
+    _underway: ClassVar[list[tuple[Tensor, Tensor]]] = []
+
+    def record(self) -> None:
+        """Here."""
+        self._before, Event._underway = Event._underway, []
+
+    def synchronize(self) -> None:
+        """Wait until the device has come here."""
+        _counts.wait("event")
+        for there, values in self._before:
+            there.copy_(values)
+
+
+torch.get_device_module(DEVICE).Event = Event
 
 WAITS = {
     "_linalg_check_errors",
@@ -262,7 +282,10 @@ def _to_copy(
     copied = func(_inner(source), **rest)
     to_device = isinstance(source, OnDevice) if device is None else _is_device(device)
     if to_device != isinstance(source, OnDevice):
-        _counts.move(copied, to_device=to_device, blocks=not (to_device and non_blocking))
+        _counts.move(copied, to_device=to_device, blocks=not non_blocking)
+        if non_blocking and not to_device:
+            values, copied = copied, torch.full_like(copied, torch.nan if copied.is_floating_point() else -1)
+            Event._underway.append((copied, values))
     elif to_device:
         _counts.launches += 1
     return OnDevice(copied) if to_device else copied

@@ -24,28 +24,35 @@ def projected(count: int = 30, channels: int = 4) -> dict[str, torch.Tensor]:
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
     return {
-        "means2d": uniform(1, count, 2) * torch.tensor(SIZE),
+        "means2d": uniform(count, 2) * torch.tensor(SIZE),
         "conics": torch.cat(
             (
-                0.01 + 0.05 * uniform(1, count, 1),
-                0.01 * uniform(1, count, 1),
-                0.01 + 0.05 * uniform(1, count, 1),
+                0.01 + 0.05 * uniform(count, 1),
+                0.01 * uniform(count, 1),
+                0.01 + 0.05 * uniform(count, 1),
             ),
-            dim=2,
+            dim=1,
         ),
-        "colors": uniform(1, count, channels),
-        "opacities": 0.3 + 0.5 * uniform(1, count),
+        "colors": uniform(count, channels),
+        "opacities": 0.3 + 0.5 * uniform(count),
     }
 
 
-def lists(splats, sort=True):
-    radii = torch.full((1, splats["means2d"].shape[1]), 20, dtype=torch.int32)
-    depths = 1 + torch.rand(radii.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return stand_ins.isect_tiles(splats["means2d"], radii, depths, TILE, COLS, ROWS, sort)
+def lists(splats, cameras=1, rows=ROWS):
+    """Of the splats, dealt out to cameras."""
+    count = len(splats["means2d"])
+    radii = torch.full((count,), 20, dtype=torch.int32)
+    radii[:2] = 0
+    depths = 1 + torch.rand(count, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    camera = torch.arange(cameras).repeat_interleave(count // cameras)
+    args = splats["means2d"], radii, depths, TILE, COLS, rows
+    return stand_ins.isect_tiles(
+        *args, packed=True, n_cameras=cameras, camera_ids=camera, gaussian_ids=camera
+    ), args
 
 
 def drawn(splats, offsets, ids, **options):
-    return stand_ins.rasterize_to_pixels(*splats.values(), *SIZE, TILE, offsets, ids, **options)
+    return stand_ins.rasterize_to_pixels(*splats.values(), *SIZE, TILE, offsets, ids, packed=True, **options)
 
 
 @pytest.mark.parametrize("name", stand_ins.NAMES)
@@ -54,21 +61,41 @@ def test_signatures_are_gsplats(name):
     assert [(p.name, p.default) for p in mine.values()] == [(p.name, p.default) for p in theirs.values()]
 
 
-def test_lists_are_gsplats():
-    splats = projected()
-    found = lists(splats)
-    radii = torch.full((1, 30), 20, dtype=torch.int32)
-    radii[0, :4] = 0
-    depths = torch.rand(1, 30, generator=torch.Generator().manual_seed(2))
-    args = splats["means2d"].float(), radii, depths, TILE, COLS, ROWS
-    found, expected = stand_ins.isect_tiles(*args), _torch_impl._isect_tiles(*args)
-    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+def test_lists_are_gsplats(cameras):
+    found, args = lists(projected(), cameras)
+    means2d, radii, depths = (x.view(cameras, 30 // cameras, *x.shape[1:]) for x in args[:3])
+    expected = _torch_impl._isect_tiles(means2d.float(), radii, depths.float(), *args[3:])
+    assert torch.equal(found[0].view(cameras, -1), expected[0])
+    assert all(torch.equal(a, b) for a, b in zip(found[1:], expected[1:], strict=True))
     kept = found[1][::3]
-    encoded = stand_ins.isect_offset_encode(kept, 1, COLS, ROWS)
-    assert torch.equal(encoded, _torch_impl._isect_offset_encode(kept, 1, COLS, ROWS))
-    nothing = stand_ins.isect_offset_encode(kept[:0], 1, COLS, ROWS)
-    assert nothing.shape == (1, ROWS, COLS)
+    encoded = stand_ins.isect_offset_encode(kept, cameras, COLS, ROWS)
+    assert torch.equal(encoded, _torch_impl._isect_offset_encode(kept, cameras, COLS, ROWS))
+    nothing = stand_ins.isect_offset_encode(kept[:0], cameras, COLS, ROWS)
+    assert nothing.shape == (cameras, ROWS, COLS)
     assert not nothing.any()
+
+
+def test_what_is_masked_or_beyond_the_picture_is_not_drawn():
+    """As in the kernels: the last list ends where the pairs do, tiles below the picture show nothing, and of
+    a masked tile the alphas are not even written."""
+    splats = {name: x.requires_grad_() for name, x in projected().items()}
+    (_, ids, rows), _ = lists(splats, rows=ROWS + 1)
+    offsets = stand_ins.isect_offset_encode(ids, 1, COLS, ROWS + 1)
+    tail = torch.cat((rows, torch.zeros(500, dtype=torch.int32)))
+    masks = torch.ones(1, ROWS + 1, COLS, dtype=torch.bool)
+    masks[0, 1, 2] = False
+    color, alpha = drawn(splats, offsets, tail, masks=masks)
+    whole, through = drawn(splats, offsets, rows)
+    hidden = torch.zeros(1, SIZE[1], SIZE[0], 1, dtype=torch.bool)
+    hidden[:, TILE : 2 * TILE, 2 * TILE : 3 * TILE] = True
+    assert torch.equal(alpha.isnan(), hidden)
+    torch.testing.assert_close(torch.where(hidden, whole, color), whole)
+    torch.testing.assert_close(torch.where(hidden, through, alpha), through)
+    assert not color[hidden.expand_as(color)].any()
+    (gradient,) = torch.autograd.grad(color.sum(), splats["opacities"])
+    (expected,) = torch.autograd.grad(torch.where(hidden, 0.0, whole).sum(), splats["opacities"])
+    torch.testing.assert_close(gradient, expected)
 
 
 @pytest.mark.parametrize("channels", [1, 4])
@@ -76,7 +103,7 @@ def test_lists_are_gsplats():
 def test_gradients_are_those_of_the_picture(channels, keep, monkeypatch):
     monkeypatch.setattr(stand_ins, "PAIRS_AT_ONCE", 40)
     splats = projected(8, channels)
-    _, ids, rows = lists(splats)
+    (_, ids, rows), _ = lists(splats)
     ids, rows = ids[::keep], rows[::keep]
     offsets = stand_ins.isect_offset_encode(ids, 1, COLS, ROWS)
     weights = torch.rand(1, SIZE[1], SIZE[0], channels + 1, dtype=torch.float64)
@@ -92,7 +119,7 @@ def test_gradients_are_those_of_the_picture(channels, keep, monkeypatch):
 
 def test_absolute_gradients_are_summed_over_pixels():
     splats = projected()
-    _, ids, rows = lists(splats)
+    (_, ids, rows), _ = lists(splats)
     offsets = stand_ins.isect_offset_encode(ids, 1, COLS, ROWS)
     splats = {name: x.requires_grad_() for name, x in splats.items()}
     color, _ = drawn(splats, offsets, rows, absgrad=True)

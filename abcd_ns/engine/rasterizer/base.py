@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from abcd_ns.engine.rasterizer.extents import extents_of
 from abcd_ns.engine.rasterizer.projection import Splats
 from abcd_ns.engine.rasterizer.tile_grid import TileGrid
 from abcd_ns.engine.rasterizer.z_window import ZWindow
@@ -86,6 +88,11 @@ class Rasterizer(Protocol):
             ValueError: `sh_degree` is above what the Gaussians hold.
         """
         ...
+
+    def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
+        """Where in each view's image Gaussians may be drawn, on the CPU; see `extents_of`."""
+        seen = ((self.project(gaussians, view), view) for view in views)
+        return torch.stack([extents_of(splats.means2d, splats.radii, view) for splats, view in seen]).cpu()
 
     def draw(
         self,

@@ -1,154 +1,30 @@
 """The gsplat rasterizer: gsplat 1.4.0's CUDA kernels, unmodified, with crops, frozen Gaussians and z windows.
 
-gsplat draws from a sorted list of (tile, depth) keys, each with the Gaussian that it belongs to. Leaving out
-those whose depth is not within the tile's window is all that a z window takes.
-
 Importing this module imports gsplat, which compiles its CUDA extension at the first call if need be.
 """
 
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import gsplat
 import torch
-from gsplat.cuda._wrapper import (
-    fully_fused_projection,
-    isect_offset_encode,
-    isect_tiles,
-    rasterize_to_pixels,
-    spherical_harmonics,
-)
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.rasterizer.base import Cut, Raster, Rasterizer, Shot
+from abcd_ns.engine.rasterizer.extents import extents_of
+from abcd_ns.engine.rasterizer.gsplat_pairs import TILE, Drawing, Packed
+from abcd_ns.engine.rasterizer.gsplat_projection import Cameras, Projected, place_on_screen, project
 from abcd_ns.engine.rasterizer.projection import Splats, check_degree
-from abcd_ns.engine.rasterizer.splat_kernels import (
-    CONIC_XX,
-    DEPTH,
-    GRADED,
-    OPACITY,
-    RADIUS,
-    RED,
-    SPLAT_ROWS,
-)
-from abcd_ns.engine.rasterizer.tile_grid import TileGrid
+from abcd_ns.engine.rasterizer.splat_kernels import SPLAT_ROWS
 from abcd_ns.engine.rasterizer.z_window import ZWindow, showing
-from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+from abcd_ns.engine.types import Crop, Gaussians, View
 
-TILE = 16
-"""gsplat's tile size, pixels."""
-
-
-@dataclass(frozen=True)
-class _Projected:
-    """n Gaussians in one camera, in gsplat's shapes."""
-
-    radii: Int[Tensor, "1 n"]
-    means2d: Float[Tensor, "1 n 2"]
-    depths: Float[Tensor, "1 n"]
-    conics: Float[Tensor, "1 n 3"]
-    opacities: Float[Tensor, "1 n"]
-    features: Float[Tensor, "1 n 4"]
-    """Colour, then depth: what is composited."""
-
-
-@dataclass(frozen=True)
-class _Pairs:
-    """The (Gaussian, tile) pairs of a crop as gsplat sorts them: by tile, then by depth.
-
-    Crops begin where a tile of the full image does, so their tiles are those of a TileGrid, in its order.
-    """
-
-    grid: TileGrid
-    ids: Int[Tensor, "q"]
-    """The keys: tile << 32 | bits of the depth."""
-    gaussians: Int[Tensor, "q"]
-    """Whose they are."""
-
-    @property
-    def tile(self) -> Int[Tensor, "q"]:
-        """Number of each pair's tile."""
-        return self.ids >> 32
-
-    def __getitem__(self, keep: Bool[Tensor, "q"]) -> "_Pairs":
-        """Some of them, in order."""
-        kept = keep.nonzero()[:, 0]  # one wait, and not one for each list
-        return _Pairs(self.grid, self.ids.index_select(0, kept), self.gaussians.index_select(0, kept))
-
-    def offsets(self) -> Int[Tensor, "1 r c"]:
-        """Where each tile's pairs begin."""
-        return isect_offset_encode(self.ids, 1, self.grid.cols, self.grid.rows)
-
-
-def _project(gaussians: Gaussians, view: View, sh_degree: int, antialiased: bool) -> _Projected:
-    """The first half of gsplat's `rasterization(packed=False)`, for the full image."""
-    viewmat, K = view.viewmat.to(gaussians.means), view.K.to(gaussians.means)
-    radii, means2d, depths, conics, compensations = fully_fused_projection(
-        gaussians.means,
-        None,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        viewmat[None],
-        K[None],
-        view.width,
-        view.height,
-        near_plane=view.near,
-        packed=False,
-        calc_compensations=antialiased,
-    )
-    opacities = gaussians.opacities[:, 0].sigmoid()[None]
-    if compensations is not None:
-        opacities = opacities * compensations
-    used = (sh_degree + 1) ** 2
-    coefficients = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)[:, :used]
-    directions = gaussians.means - view.center.to(gaussians.means)
-    colors = spherical_harmonics(sh_degree, directions[None], coefficients[None], masks=radii > 0)
-    features = torch.cat((torch.clamp_min(colors + 0.5, 0.0), depths[..., None]), dim=-1)
-    return _Projected(radii, means2d, depths, conics, opacities, features)
-
-
-def _join(own: _Projected, frozen: _Projected) -> _Projected:
-    pairs = ((getattr(own, name), getattr(frozen, name)) for name in _Projected.__dataclass_fields__)
-    return _Projected(*(torch.cat(pair, dim=1) for pair in pairs))
-
-
-def _aligned(crop: Crop) -> Crop:
-    """The crop, grown up and left to gsplat's tiles: then its tiles are those of the full image."""
-    x, y = crop.x - crop.x % TILE, crop.y - crop.y % TILE
-    return Crop(x, y, crop.x + crop.width - x, crop.y + crop.height - y)
-
-
-def _shift_into(crop: Crop, means2d: Tensor, radii: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres relative to the crop, and radii with 0 for what misses it.
-
-    Shifting the principal point instead would change the picture: the projection's clamp depends on it.
-    """
-    shifted = means2d - means2d.new_tensor([crop.x, crop.y]) if crop.x or crop.y else means2d
-    center = shifted.detach()
-    size = center.new_tensor([crop.width, crop.height])
-    # A tile's width of slack: gsplat draws on whole tiles, so a Gaussian beside the crop may still count.
-    reach = radii[..., None] + TILE
-    touches = ((center + reach > 0) & (center - reach < size)).all(dim=-1)
-    return shifted, torch.where(touches, radii, torch.zeros_like(radii))
-
-
-def _forward_absgrad(means2d: Tensor, drawn: Tensor) -> None:
-    """Have gsplat's `absgrad`, which it leaves on the tensor it drew from, appear on `means2d` too.
-
-    The hook holds `means2d` weakly, and `means2d` holds `drawn`: otherwise the graph would hold itself.
-    """
-    means2d.drawn_from = drawn
-    reference = weakref.ref(means2d)
-
-    def copy(_: Tensor) -> None:
-        target = reference()
-        if target is not None:
-            target.absgrad = target.drawn_from.absgrad[:, : target.shape[1]]
-
-    means2d.register_hook(copy)
+SURVEY_BYTES = 256 << 20
+"""Of what is projected into several views at once, to see where they see it."""
+SURVEYED_BYTES = 100
+"""Of a Gaussian in a view meanwhile."""
 
 
 class GsplatRasterizer(Rasterizer):
@@ -158,6 +34,7 @@ class GsplatRasterizer(Rasterizer):
 
     def __init__(self) -> None:
         self.name = f"gsplat-{gsplat.__version__}"
+        self._cameras = Cameras()
 
     def warm_up(self) -> None:
         """Nothing: gsplat compiles when it is imported, at the latest for the self-check."""
@@ -168,14 +45,25 @@ class GsplatRasterizer(Rasterizer):
     ) -> Splats:
         """See Rasterizer.project."""
         check_degree(gaussians, sh_degree)
-        planes = gaussians.means.new_zeros((SPLAT_ROWS, len(gaussians)))  # covariances stay 0
         if len(gaussians) == 0:
-            return Splats(planes)
-        seen = _project(gaussians, view, sh_degree, antialiased)
-        planes[:DEPTH], planes[DEPTH] = seen.means2d[0].T, seen.depths[0]
-        planes[CONIC_XX:OPACITY], planes[OPACITY] = seen.conics[0].T, seen.opacities[0]
-        planes[RED:GRADED], planes[RADIUS] = seen.features[0, :, :3].T, seen.radii[0]
-        return Splats(planes)
+            return Splats(gaussians.means.new_zeros((SPLAT_ROWS, 0)))
+        return project(gaussians, [view], self._cameras, sh_degree, antialiased).splats(0)
+
+    @torch.no_grad()
+    def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
+        """See Rasterizer.extents. Views are projected together, and all that is found is copied at once."""
+        if len(gaussians) == 0:
+            return super().extents(gaussians, views)
+        most = max(SURVEY_BYTES // (SURVEYED_BYTES * len(gaussians)), 1)
+        found: list[Tensor] = [torch.empty(0)] * len(views)
+        for places in _alike([(view.width, view.height, view.near) for view in views]):
+            for k in range(0, len(places), most):
+                part = places[k : k + most]
+                seen = [views[place] for place in part]
+                radii, means2d, *_ = place_on_screen(gaussians, seen, self._cameras)
+                for place, extent in zip(part, extents_of(means2d, radii, seen[0]), strict=True):
+                    found[place] = extent
+        return torch.stack(found).cpu()
 
     def draw(
         self,
@@ -186,12 +74,17 @@ class GsplatRasterizer(Rasterizer):
         antialiased: bool = False,
         absgrad: bool = False,
     ) -> tuple[Raster, ...]:
-        """See Rasterizer.draw. One call of gsplat for each shot."""
+        """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
         check_degree(gaussians, sh_degree)
-        rasters = [_draw_shot(gaussians, shot, sh_degree, antialiased, absgrad) for shot in shots]
-        for raster in rasters:
+        rasters: dict[int, Raster] = {}
+        # Windows mask what is frozen, or the Gaussians: no list has both.
+        kinds = [(s.view.width, s.view.height, s.view.near, s.frozen is None) for s in shots]
+        for places in _alike(kinds):
+            drawn = self._draw_alike(gaussians, [shots[k] for k in places], sh_degree, antialiased, absgrad)
+            rasters.update(zip(places, drawn, strict=True))
+        for raster in rasters.values():
             raster.info["n_cameras"] = len(shots)
-        return tuple(rasters)
+        return tuple(rasters[k] for k in range(len(shots)))
 
     @torch.no_grad()
     def cut(
@@ -208,9 +101,9 @@ class GsplatRasterizer(Rasterizer):
     ) -> Cut:
         """See Rasterizer.cut. Projected and sorted once."""
         splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
-        drawing = _Drawing.of(_projected(splats), crop)
-        members = drawing.within(inside).pairs.gaussians.unique().long()
-        layers = (drawing.within(window).layer() for window in (front, back))
+        drawing = self._drawing_of(splats, crop, windowed=True)
+        members = drawing.members(drawing.inside([inside]))
+        layers = (drawing.only(drawing.inside([window])).layer() for window in (front, back))
         return Cut(*layers, splats[members], members)
 
     @torch.no_grad()
@@ -218,136 +111,81 @@ class GsplatRasterizer(Rasterizer):
         self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
     ) -> ZWindow:
         """See Rasterizer.depth_window."""
-        drawing = _Drawing.of(_projected(self.project(gaussians, view, antialiased=antialiased)), crop)
-        return showing(drawing.pairs.grid, drawing.pairs.tile, drawing.z, drawing.weights(), visible)
+        drawing = self._drawing_of(self.project(gaussians, view, antialiased=antialiased), crop)
+        return showing(drawing.sheet.grids[0], drawing.tile, drawing.z, drawing.weights(), visible)
+
+    def _drawing_of(self, splats: Splats, crop: Crop, windowed: bool = False) -> Drawing:
+        return Drawing.of(Packed.of_splats([(0, splats)]), [crop], self._cameras, windowed=windowed)
+
+    def _draw_alike(
+        self, gaussians: Gaussians, shots: Sequence[Shot], sh_degree: int, antialiased: bool, absgrad: bool
+    ) -> list[Raster]:
+        views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
+        frozen = [
+            (k, shot.frozen) for k, shot in enumerate(shots) if shot.frozen is not None and len(shot.frozen)
+        ]
+        if len(gaussians) == 0 and not frozen:
+            return _nothing(gaussians, shots)
+        own = project(gaussians, views, self._cameras, sh_degree, antialiased)
+        everyone = Packed.of(own)
+        if frozen:
+            everyone = everyone.and_then(Packed.of_splats(frozen))
+        windows = [shot.z_window for shot in shots]
+        windowed = any(window is not None for window in windows)
+        drawing = Drawing.of(everyone, crops, self._cameras, windowed=windowed)
+        if windowed:
+            always = 0 if shots[0].frozen is None else own.radii.numel()
+            drawing = drawing.only(drawing.inside(windows, always))
+        if absgrad and own.means2d.requires_grad:
+            _forward_absgrad(own.means2d, drawing.means2d)
+        info = _info(own, views[0])
+        return [
+            Raster(features[..., :3], transmittance, features[..., 3], info)
+            for features, transmittance in drawing.draw(absgrad)
+        ]
 
 
-def _draw_shot(gaussians: Gaussians, shot: Shot, sh_degree: int, antialiased: bool, absgrad: bool) -> Raster:
-    view, crop, frozen = shot.view, shot.crop, shot.frozen
-    if len(gaussians) + (0 if frozen is None else len(frozen)) == 0:
-        return _nothing(gaussians, view, crop)
-    own = _project(gaussians, view, sh_degree, antialiased)
-    everyone = own if frozen is None or len(frozen) == 0 else _join(own, _projected(frozen))
-    drawing = _Drawing.of(everyone, crop)
-    if shot.z_window is not None:
-        drawing = drawing.within(shot.z_window, always=0 if frozen is None else len(gaussians))
-    if absgrad and own.means2d.requires_grad and drawing.means2d is not own.means2d:
-        _forward_absgrad(own.means2d, drawing.means2d)
-    features, transmittance = drawing.draw(absgrad)
-    return Raster(features[..., :3], transmittance, features[..., 3], _info(own, view))
+def _alike(kinds: Sequence[object]) -> list[list[int]]:
+    """Places of equal kinds."""
+    return [[k for k, each in enumerate(kinds) if each == kind] for kind in dict.fromkeys(kinds)]
 
 
-def _projected(splats: Splats) -> _Projected:
-    """In gsplat's shapes."""
-    features = torch.cat((splats.colors, splats.depths[:, None]), dim=-1)
-    values = (splats.radii, splats.means2d, splats.depths, splats.conics, splats.opacities, features)
-    return _Projected(*(value[None].contiguous() for value in values))
+def _forward_absgrad(means2d: Float[Tensor, "c n 2"], drawn: Float[Tensor, "m 2"]) -> None:
+    """Have gsplat's `absgrad`, which it leaves on the tensor it drew from, appear on `means2d` too.
+
+    The hook holds `means2d` weakly, and `means2d` holds `drawn`: otherwise the graph would hold itself.
+    """
+    means2d.drawn_from = drawn
+    reference = weakref.ref(means2d)
+
+    def copy(_: Tensor) -> None:
+        target = reference()
+        if target is not None:
+            target.absgrad = target.drawn_from.absgrad[: target.numel() // 2].view_as(target)
+
+    means2d.register_hook(copy)
 
 
-@dataclass(frozen=True)
-class _Drawing:
-    """Second half of gsplat's `rasterization`, for the tiles of a crop."""
-
-    everyone: _Projected
-    means2d: Float[Tensor, "1 n 2"]
-    """Relative to the upper left tile."""
-    crop: Crop
-    pairs: _Pairs
-
-    @staticmethod
-    def of(everyone: _Projected, crop: Crop) -> "_Drawing":
-        """What may be drawn in a crop."""
-        grid, tiled = TileGrid(crop, TILE), _aligned(crop)
-        means2d, radii = _shift_into(tiled, everyone.means2d, everyone.radii)
-        means2d = means2d.contiguous()
-        if means2d.shape[1] == 0:
-            nothing = radii.new_zeros(0)
-            return _Drawing(everyone, means2d, crop, _Pairs(grid, nothing.long(), nothing))
-        _, ids, gaussians = isect_tiles(means2d, radii, everyone.depths, TILE, grid.cols, grid.rows)
-        return _Drawing(everyone, means2d, crop, _Pairs(grid, ids, gaussians))
-
-    @property
-    def z(self) -> Float[Tensor, "q"]:
-        """Camera z of each pair's Gaussian."""
-        return self.everyone.depths[0].index_select(0, self.pairs.gaussians)
-
-    def within(self, window: ZWindow, always: int = 0) -> "_Drawing":
-        """Without the pairs that lie outside of their tile's window.
-
-        Args:
-            always: the first so many Gaussians are not masked.
-        """
-        inside = window.on(self.pairs.grid).holds(self.pairs.tile, self.z)
-        if always:
-            inside |= self.pairs.gaussians < always
-        return replace(self, pairs=self.pairs[inside])
-
-    def draw(self, absgrad: bool = False) -> tuple[Float[Tensor, "h w 4"], Float[Tensor, "h w"]]:
-        """(features, transmittance) of the crop."""
-        everyone, crop = self.everyone, self.crop
-        tiled = _aligned(crop)
-        features, alphas = rasterize_to_pixels(
-            self.means2d,
-            everyone.conics,
-            everyone.features,
-            everyone.opacities,
-            tiled.width,
-            tiled.height,
-            TILE,
-            self.pairs.offsets(),
-            self.pairs.gaussians,
-            absgrad=absgrad,
-        )
-        rows, cols = Crop(crop.x - tiled.x, crop.y - tiled.y, crop.width, crop.height).slices
-        return features[0, rows, cols], 1.0 - alphas[0, rows, cols, 0]
-
-    def layer(self) -> Layer:
-        """What it looks like."""
-        features, transmittance = self.draw()
-        return Layer(features[..., :3], transmittance)
-
-    def weights(self) -> Float[Tensor, "q"]:
-        """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels in the crop.
-
-        Each pair is drawn as if it were a Gaussian of its own: the gradient of the picture's sum by its
-        colour, of which one channel will do, is its weight.
-        """
-        owner, everyone = self.pairs.gaussians, self.everyone
-        if len(owner) == 0:
-            return self.z
-        parts = (self.means2d, everyone.conics, everyone.opacities)
-        means2d, conics, opacities = (part.index_select(1, owner) for part in parts)
-        dark = means2d.new_zeros((1, len(owner), 1)).requires_grad_()
-        tiled, offsets = _aligned(self.crop), self.pairs.offsets()
-        each = torch.arange(len(owner), device=owner.device, dtype=owner.dtype)
-        with torch.enable_grad():
-            picture, _ = rasterize_to_pixels(
-                means2d, conics, dark, opacities, tiled.width, tiled.height, TILE, offsets, each
-            )
-            rows = slice(self.crop.y - tiled.y, None)
-            cols = slice(self.crop.x - tiled.x, None)
-            (found,) = torch.autograd.grad(picture[0, rows, cols].sum(), dark)
-        return found[0, :, 0]
-
-
-def _info(own: _Projected, view: View) -> dict[str, Any]:
+def _info(own: Projected, view: View) -> dict[str, Any]:
     names = ("means2d", "radii", "depths", "conics", "opacities")
     info: dict[str, Any] = {name: getattr(own, name) for name in names}
     return info | {
         "width": view.width,
         "height": view.height,
-        "n_cameras": 1,
+        "n_cameras": len(own.radii),
         "camera_ids": None,
         "gaussian_ids": None,
     }
 
 
-def _nothing(gaussians: Gaussians, view: View, crop: Crop) -> Raster:
-    """An empty drawing; gsplat is not asked. In the graph like any other, so that a loss has a gradient."""
-    means, opacities = gaussians.means, gaussians.opacities[:, 0][None]
-    empty = _Projected(
-        opacities.int(), means[None, :, :2], opacities, means[None], opacities, means.new_zeros((1, 0, 4))
+def _nothing(gaussians: Gaussians, shots: Sequence[Shot]) -> list[Raster]:
+    """Empty drawings; gsplat is not asked. In the graph like any other, so that a loss has a gradient."""
+    means, opacities = (
+        gaussians.means.expand(len(shots), -1, -1),
+        gaussians.opacities[:, 0].expand(len(shots), -1),
     )
-    zero = empty.means2d.sum()
-    color = zero.expand(crop.height, crop.width, 3)
-    return Raster(color, 1.0 - color[..., 0], color[..., 0], _info(empty, view))
+    features = means.new_zeros((len(shots), 0, 4))
+    empty = Projected(opacities.int(), means[..., :2], opacities, means, opacities, features)
+    zero, info = empty.means2d.sum(), _info(empty, shots[0].view)
+    colors = [zero.expand(shot.crop.height, shot.crop.width, 3) for shot in shots]
+    return [Raster(color, 1.0 - color[..., 0], color[..., 0], info) for color in colors]
