@@ -57,8 +57,9 @@ class TrainingConfig:
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
     first_passes: int = 4
     """Uses of each of these views in a visit of the first sweep."""
-    last_passes: int = 8
-    """Uses of each of these views in a visit of late sweeps; one more with each sweep until then."""
+    last_passes: int = 0
+    """Uses of each of these views in a visit of late sweeps; one more with each sweep until then. 0 takes as
+    many as leave a tenth of the time for drawing layers, by the Gaussians of a block and around it."""
     visit_steps: int = 0
     """Steps of every visit, whatever the views that see its block, as the paper has; 0 shares steps out by
     views."""

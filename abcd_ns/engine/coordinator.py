@@ -363,6 +363,9 @@ class Coordinator(StepDrawing):
         wanted = dict.fromkeys(order[active.done * (self.batch // active.crew) :])
         for done, _ in enumerate(layers.draw(wanted), start=1):
             self.announce(LayersDrawn(active.number, done, len(wanted)))
+        if active.done == 0:
+            self.state.trained += len(self.params["means"])
+            self.state.frozen += layers.frozen
         return layers
 
     def _end_visit(self) -> None:

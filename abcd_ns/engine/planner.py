@@ -13,6 +13,7 @@ from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, Budget, RunState
 from abcd_ns.engine.scene import StoredScene
 from abcd_ns.engine.schedule import (
     VisitPlan,
+    passes_for_layers,
     passes_of_sweep,
     plan_sweep,
     views_per_step,
@@ -139,7 +140,9 @@ class Planner:
             else:
                 state.sweep += 1
             remaining = None if self._budget.steps is None else self._budget.steps - state.step
-            passes = passes_of_sweep(state.sweep, config.first_passes, config.last_passes)
+            last = config.last_passes or passes_for_layers(state.trained, state.frozen)
+            state.trained = state.frozen = 0
+            passes = passes_of_sweep(state.sweep, config.first_passes, last)
             used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
             batch = views_per_step(config.batch, self._scene.tree.num_blocks, config.batch_limit)
             steps = (passes / batch, remaining, config.seed, config.visit_steps)
@@ -149,8 +152,12 @@ class Planner:
         return state.queue.pop(0)
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
-        blocks = range(self._scene.tree.num_blocks)
-        return {b: len(self._worth_training(state, self._survey(b))) for b in blocks}
+        """As far as influences are known they tell; a visit looks again."""
+        views, share = {}, self._config.influence_share
+        for block in range(self._scene.tree.num_blocks):
+            known = state.influence.get(block) if share < 1 else None
+            views[block] = len(worth_training(known, share) if known else self._survey(block).views)
+        return views
 
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""

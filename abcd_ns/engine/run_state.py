@@ -97,6 +97,10 @@ class RunState:
     """By block, how many views were worth training it on when last looked at; 0 means that none is."""
     influence: Influence = field(default_factory=dict)
     """As far as known; blocks that are missing are trained on all views that see them."""
+    trained: int = 0
+    """Gaussians of the blocks that were visited in this sweep, when their visits began."""
+    frozen: int = 0
+    """Gaussians that were drawn around them."""
     health: Ledger = field(default_factory=dict)
     """What had to be mended, by block."""
     active: ActiveVisit | None = None

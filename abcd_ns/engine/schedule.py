@@ -18,6 +18,11 @@ WARM_UP_BATCH = 2
 """Views in a step of the warm-up, at most: as many as the processors of a small machine, for more of them
 leave less room for Gaussians."""
 
+LAYER_SHARE = 0.1
+"""Of a visit's time, for its layers, where visits are as long as they should be."""
+FROZEN_COST, WINDOW_COST = 0.3, 0.4
+"""Of drawing a Gaussian into a layer, and of finding its block's window; a training step draws one for 1."""
+
 
 @dataclass(frozen=True)
 class VisitPlan:
@@ -30,6 +35,22 @@ class VisitPlan:
 def passes_of_sweep(sweep: int, first: int, last: int) -> int:
     """How often each view of a block is used in a visit of this sweep: from `first` up by one to `last`."""
     return min(first + sweep, max(first, last))
+
+
+def passes_for_layers(trained: int, frozen: int) -> int:
+    """Uses of each view in a visit such that its layers take LAYER_SHARE of the visit's time.
+
+    A step draws a block forward and backward. A layer draws what is around the block forward, and its window
+    needs the weights of the block. What these cost was measured (docs/performance.md); it is counted in
+    Gaussians, not in seconds, so that a run is the same on every machine.
+
+    Args:
+        trained, frozen: Gaussians of blocks, and around them, over some visits.
+    """
+    if trained == 0:
+        return 0
+    layers = FROZEN_COST * frozen / trained + WINDOW_COST
+    return math.ceil(layers * (1 - LAYER_SHARE) / LAYER_SHARE)
 
 
 def plan_sweep(

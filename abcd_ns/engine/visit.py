@@ -106,6 +106,7 @@ class VisitLayers:
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
         self._seen_by = painter.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
         self._windows: dict[int, ZWindow] = {}
+        self._loaded: dict[int, int] = {}
         self._sum: Tensor | float = 0.0
 
     def draw(self, views: Iterable[int]) -> Iterator[int]:
@@ -153,6 +154,7 @@ class VisitLayers:
         parts: dict[int, dict[int, Parts | None]] = {view: dict(own_place) for view in views}
         for unit in self._units:
             loaded = self._painter.load(unit, exclude=block, seen_by=self._seen_by)
+            self._loaded[unit] = len(loaded.gaussians)
             for view in views:
                 parts[view][unit] = self._paint(unit, loaded, view)
                 self._painter.fold_up(parts[view], unit, self._views[view])
@@ -173,6 +175,11 @@ class VisitLayers:
             kept.near,
             window and window.on(TileGrid(part, window.grid.side)),
         )
+
+    @property
+    def frozen(self) -> int:
+        """Gaussians that are drawn for each view."""
+        return sum(self._loaded.values())
 
     @property
     def nbytes(self) -> int:

@@ -7,7 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.schedule import (
+    FROZEN_COST,
+    LAYER_SHARE,
+    WINDOW_COST,
     exponential_decay,
+    passes_for_layers,
     passes_of_sweep,
     plan_sweep,
     sh_degree_at,
@@ -62,6 +66,14 @@ def test_orders_differ_between_visits_and_seeds():
 def test_passes_grow_by_one_a_sweep():
     assert [passes_of_sweep(sweep, 1, 4) for sweep in range(6)] == [1, 2, 3, 4, 4, 4]
     assert passes_of_sweep(0, 3, 1) == 3
+
+
+@pytest.mark.parametrize("frozen", [0, 500, 7_000, 63_000])
+def test_passes_leave_a_tenth_of_the_time_for_layers(frozen):
+    passes, trained = passes_for_layers(1_000, frozen), 1_000
+    layers = FROZEN_COST * frozen + WINDOW_COST * trained
+    assert layers / (layers + passes * trained) <= LAYER_SHARE < layers / (layers + (passes - 1) * trained)
+    assert passes_for_layers(0, 0) == 0
 
 
 def test_learning_rate_decays_exponentially():
