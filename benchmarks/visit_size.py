@@ -1,0 +1,158 @@
+"""What a visit costs by the size of its block and pictures: survey, layers, steps, and its end.
+
+    python -m benchmarks.visit_size --gaussians 20000 --width 160
+    python -m benchmarks.visit_size --gaussians 1000000 --width 1600 --views 2 --steps 1
+
+A ball of random Gaussians, seen from a ring of cameras, cut into blocks; one block is visited, after another
+one whose visit warms everything up. Photos are noise: what is measured does not depend on what is learnt. The
+last lines say what a visit comes to when it is as long as the program makes it: each of its layers drawn once,
+and each view used as often as leaves a tenth of the time for that, by `passes_for_layers`.
+"""
+
+import os
+import platform
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from torch import Tensor
+
+from abcd_ns.engine.config import TrainingConfig
+from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.param_swap import nothing_live
+from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.rasterizer import make_rasterizer
+from abcd_ns.engine.run_state import Budget
+from abcd_ns.engine.scaffold import blocks_at_rest
+from abcd_ns.engine.scene import StoredScene
+from abcd_ns.engine.schedule import passes_for_layers
+from abcd_ns.engine.storage import ParameterStore
+from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.types import Crop
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+STAGES = ("survey", "attach", "layers", "steps", "end")
+
+
+@dataclass
+class Args:
+    """What to measure."""
+
+    gaussians: int = 20_000
+    """Of each block."""
+    blocks: int = 8
+    """All of which see each other."""
+    width: int = 160
+    """Of the pictures; two thirds of it high."""
+    views: int = 8
+    """That a visit uses."""
+    steps: int = 8
+    """Of the visit, of 4 views each, or of as many as there are."""
+    commits: bool = True
+    """Write the block to disk when the visit ends, and wait for that; in training a thread does it."""
+    seed: int = 0
+    """Of the Gaussians."""
+
+
+def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], Tensor]]:
+    """A run of two visits, and its photos."""
+    count = args.gaussians * args.blocks
+    size = 1.2 * count ** (-1 / 3)  # neighbours touch, whatever their number
+    gaussians = random_gaussians(count, seed=args.seed, size=size, sh_degree=3)
+    views = ring_of_views(args.views, width=args.width, height=2 * args.width // 3)
+    noise = torch.rand(views[0].height, views[0].width, 3, generator=torch.Generator().manual_seed(args.seed))
+    tree = build_kd(gaussians.means, args.blocks)
+    store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
+    store.commit(blocks_at_rest(tree, gaussians))
+    config = TrainingConfig(
+        warmup=0.0,
+        processes=1,
+        sh_ramp=0.0,
+        visit_steps=args.steps,
+        visit_views=args.views,
+        commit_seconds=0.0 if args.commits else 1e9,
+        density=DensityConfig(strategy="off"),
+    )
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    coordinator = Coordinator(
+        config,
+        Budget(steps=1_000_000),
+        StoredScene(tree, store, 16 << 30),
+        views,
+        make_rasterizer("auto", device),
+        *nothing_live(3, device),
+        device=device,
+    )
+    return coordinator, lambda _, crop: noise[crop.slices]
+
+
+def timed(seconds: Counter, stage: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    """The method, with its time added to a stage."""
+
+    def run(*args: Any, **options: Any) -> Any:
+        began = time.perf_counter()
+        try:
+            return method(*args, **options)
+        finally:
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            seconds[stage] += time.perf_counter() - began
+
+    return run
+
+
+def measure(args: Args, folder: Path) -> tuple[Counter, dict[str, float]]:
+    """(seconds by stage, what else is known) of the second visit."""
+    coordinator, photo = begin(args, folder)
+    seconds, events = Counter(), []
+    coordinator.announce.subscribe(
+        lambda event: events.append(event) if isinstance(event, VisitBegan) else None
+    )
+    coordinator._planner.next_visit = timed(seconds, "survey", coordinator._planner.next_visit)
+    coordinator._draw_layers = timed(seconds, "layers", coordinator._draw_layers)
+    coordinator._attach = timed(seconds, "attach", coordinator._attach)
+    coordinator._end_visit = timed(seconds, "end", coordinator._end_visit)
+    whole = timed(seconds, "steps", train_step)
+    layers = 0
+    while coordinator.state.visit < 2 or coordinator.state.active is not None:
+        if coordinator.state.visit == 1 and coordinator.state.active is None:
+            seconds.clear()
+        whole(coordinator, photo)
+        if coordinator._layers is not None:
+            layers = coordinator._layers.nbytes
+    seconds["steps"] -= seconds["survey"] + seconds["attach"] + seconds["end"]
+    seconds["attach"] -= seconds["layers"]
+    state, drawn = coordinator.state, coordinator.batch * args.steps
+    known = {"views": events[-1].views, "drawn": drawn, "layer_bytes": layers}
+    known |= {"passes": passes_for_layers(state.trained, state.frozen)}
+    coordinator.close()
+    return seconds, known
+
+
+def main(args: Args) -> None:
+    """Measure once, and print the table."""
+    with tempfile.TemporaryDirectory() as folder:
+        seconds, known = measure(args, Path(folder))
+    views, drawn, passes = known["views"], known["drawn"], known["passes"]
+    each = {stage: seconds[stage] / (drawn if stage == "steps" else views) for stage in STAGES}
+    rows = "".join(f"| {stage} | {seconds[stage]:.2f} | {1e3 * each[stage]:.1f} |\n" for stage in STAGES)
+    model = platform.processor() or platform.machine()
+    print(f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} threads, torch {torch.__version__}")
+    print(f"{args.blocks} blocks of {args.gaussians:,} Gaussians, {views} views {args.width} px wide\n")
+    print("| stage | s | ms a view (steps: a view drawn) |\n| --- | ---: | ---: |\n" + rows)
+    around = sum(each[stage] for stage in STAGES if stage != "steps")
+    print(f"Layers: {known['layer_bytes'] / views / 2**20:.1f} MiB a view.")
+    share = around / (around + passes * each["steps"])
+    print(f"Passes by the count of Gaussians: {passes}; all but steps: {share:.1%}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
