@@ -5,7 +5,7 @@
 
 A ball of random Gaussians, seen from a ring of cameras, cut into blocks; one block is visited, after another
 one whose visit warms everything up. Photos are noise: what is measured does not depend on what is learnt. The
-last lines say what a visit comes to when it is as long as the program makes it: each of its layers drawn once,
+last lines say what a visit comes to when it is as long as the program makes it: layers drawn once,
 and each view used as often as leaves a tenth of the time for that, by `passes_for_layers`.
 """
 
