@@ -262,7 +262,8 @@ def _to_copy(
     copied = func(_inner(source), **rest)
     to_device = isinstance(source, OnDevice) if device is None else _is_device(device)
     if to_device != isinstance(source, OnDevice):
-        _counts.move(copied, to_device=to_device, blocks=not (to_device and non_blocking))
+        # Without waiting, a copy to the host is one into pinned memory.
+        _counts.move(copied, to_device=to_device, blocks=not non_blocking)
     elif to_device:
         _counts.launches += 1
     return OnDevice(copied) if to_device else copied
