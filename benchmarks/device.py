@@ -173,7 +173,7 @@ def run(args: Args, blocks: int, folder: Path) -> dict[str, Any]:
         found = summary(watch, visits)
         found |= {"gaussians": coordinator.count(), "views_in_a_step": coordinator.batch}
         found |= {"peak_bytes": counts.peak_bytes, "ownership": coordinator.config.ownership}
-        coordinator.scene.store.close()
+        coordinator.close()
     return {"blocks": blocks, **found, "host_seconds": round(time.perf_counter() - began, 1)}
 
 

@@ -175,7 +175,7 @@ def run(
     """
     options = {"seconds": args.seconds, "seed": args.seed, "processes": args.processes}
     coordinator = begin(capture, blocks, folder, **options)
-    store = coordinator.scene.store
+    scene = coordinator.scene
     clock, layers = StageClock(), 0.0
 
     def note(event: object) -> None:
@@ -183,12 +183,12 @@ def run(
         if isinstance(event, VisitEnded):
             layers += event.layer_seconds
 
-    def commit(*blocks: Any, **options: Any) -> int:
-        with clock.stage("commit"):
-            return to_disk(*blocks, **options)
+    def rest(*changed: Any) -> None:
+        with clock.stage("commit"):  # as far as the training waits for it
+            to_rest(*changed)
 
     coordinator.announce.subscribe(note)
-    to_disk, store.commit = store.commit, commit
+    to_rest, scene.rest = scene.rest, rest
     began = 0.0
     while not coordinator.finished:
         if coordinator.progress < 0.5:
@@ -197,7 +197,7 @@ def run(
     clock.seconds["layers"] = layers - began
     clock.seconds["plan and attach"] -= layers - began
     afterwards(coordinator)
-    store.close()
+    coordinator.close()
     return clock
 
 

@@ -58,7 +58,7 @@ class WriteBehind:
         self._waiting: Snapshot | None = None
         self._due, self._began = math.inf, time.monotonic()
         self._chore: Callable[[], object] | None = None
-        self._error: Exception | None = None
+        self._error: BaseException | None = None
         self._busy = False
         self._thread: threading.Thread | None = None
         _all.add(self)
@@ -140,10 +140,12 @@ class WriteBehind:
         blocks = {number: state.to_tensors() for number, state in snapshot.blocks.items()}
         try:
             self._store.commit(blocks, header=snapshot.header, state=snapshot.state)
-        except Exception as error:  # whatever it is, it is for the thread that trains
+        except BaseException as error:  # whatever it is, it is for the thread that trains
             with self.lock:
                 self._waiting = snapshot if self._waiting is None else self._waiting.after(snapshot)
                 self._due, self._error = math.inf, error
+            if not isinstance(error, Exception):
+                raise
         else:
             self._written(snapshot)
 

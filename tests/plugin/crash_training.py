@@ -15,17 +15,26 @@ from tests.reference.crash_runs import Kill, Runs, killer
 STEPS_PER_SAVE = 10
 
 
-def train(data: Path, out: Path, kill: Kill | None = None, kill_at_step: int | None = None, **options: Any):
+def train(
+    data: Path,
+    out: Path,
+    kill: Kill | None = None,
+    kill_at_step: int | None = None,
+    commit_seconds: float = 60.0,
+    **options: Any,
+):
     """Train as `ns-train` does; the body of a process.
 
     Args:
         kill, kill_at_step: where it kills itself.
+        commit_seconds: as of TrainingConfig.
         options: of the trainer's config.
     """
     torch.set_num_threads(1)
     if kill is not None:
         crash_points.reached = killer(kill)
     config = configure(data, out, **options)
+    config.pipeline.training.commit_seconds = commit_seconds
     config.set_timestamp()
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)

@@ -66,7 +66,8 @@ def refusal(config, capsys) -> str:
 
 def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, data, undisturbed, tmp_path):
     killed_at = STEPS_PER_SAVE
-    assert trainings.finish(data, tmp_path / "killed", kill_at_step=killed_at) == -signal.SIGKILL
+    options = {"kill_at_step": killed_at, "commit_seconds": 0.0}
+    assert trainings.finish(data, tmp_path / "killed", **options) == -signal.SIGKILL
     killed = run_folder(tmp_path / "killed")
     assert not list(killed.rglob("*.ckpt"))
     for name, load_dir in (("models", killed / "nerfstudio_models"), ("run", killed)):
@@ -273,9 +274,9 @@ def test_no_result_depends_on_the_ram_budget_and_none_exceeds_it(data, undisturb
     def measure(trainer) -> None:
         coordinator = trainer.pipeline.coordinator
         scene = coordinator.scene
-        blocks = [sum(value.nbytes for _, value in block.items()) for block in scene._ram.values()]
+        blocks = [gaussians.nbytes for gaussians in scene._memory._gaussians.values()]
         photos = trainer.pipeline.datamanager.train_dataset.photos.cached_bytes
-        peaks.append(photos + coordinator.layer_bytes + sum(blocks))
+        peaks.append(photos + coordinator.layer_bytes + scene.cached_bytes)
         largest.append(max(blocks, default=0))
 
     trainer = run(config, after_step=measure)
