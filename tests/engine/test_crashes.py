@@ -39,7 +39,6 @@ def test_a_run_killed_at_any_time_ends_as_it_would_have(runs, undisturbed, tmp_p
     [
         Kill(crash_points.SHARDS_IN_PLACE, 4),
         Kill(crash_points.GENERATION_PUBLISHED, 6),
-        Kill(crash_points.LAYERS_PUT, 3),
         Kill(crash_points.VISIT_TRAINED, 2),
     ],
     ids=lambda kill: kill.point,
