@@ -147,7 +147,8 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     allows, one where the scene fits, and cuts blocks that outgrow it in two."""
     device_budget_gb: float = 0.0
     """Memory of the device that training may take, GB, by which `blocks` 0 is decided; 0 takes 0.9 of what is
-    free on a GPU, and a quarter of the machine's RAM on a CPU."""
+    free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
+    eighth for photos."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
     near_plane: float = 0.0

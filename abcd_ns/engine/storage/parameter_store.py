@@ -249,7 +249,7 @@ class ParameterStore:
         """Make what is pinned under `name` a new generation; return its number. The pin stays.
 
         Blocks keep the versions they were pinned with. The number still grows, so that no version is ever
-        given to two different contents, and a layer of the abandoned generations never looks fresh.
+        given to two different contents, and no block of the abandoned generations looks fresh.
 
         Raises:
             StoreError: read-only store, no such pin, or a write that failed.
