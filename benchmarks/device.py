@@ -10,8 +10,8 @@ that it was given, so each costs what the device has left to do; copies that blo
 events by which a step's numbers are read while the next one runs, though these may find the device done. A
 launch is one operation of torch's, or one function of gsplat's, which may be several kernels on CUDA. Steps
 are those within a visit, plain ones those of them that neither grow nor prune; what is done when a visit
-begins (survey, attach, layers) and ends (settle, commit) is counted apart, a visit at a time. Layer copies are
-those that are made while layers are kept and read back. Peak bytes are those of live tensors.
+begins (survey, attach, layers) and ends (settle, commit) is counted apart, a visit at a time. Layer copies
+are those that are made while layers are kept and read back. Peak bytes are those of live tensors.
 
 What they do not mean: there are no seconds of an accelerator here, no speed of its memory, and no fraction of
 its cores that such small pictures would keep busy. Counts of waits and launches hardly depend on the scene's
