@@ -87,10 +87,9 @@ def test_absgrad_and_means2d_gradient(rasterizer, scene, crop):
 @pytest.mark.parametrize("windowed", [False, True])
 def test_shots_that_are_drawn_together_are_the_torch_backends(rasterizer, scene, windowed, device):
     """Of different sizes, with crops anywhere: the list's end, which no tile is to draw, included."""
-    views = [
-        replace(view(), viewmat=view().viewmat + 0.1 * k * torch.eye(4)[:, 3:].roll(1)) for k in range(3)
-    ]
-    views.append(replace(view(), width=120))
+    views = [view(), view(), view(), replace(view(), width=120)]
+    for k, each in enumerate(views):
+        each.viewmat[0, 3] += 0.1 * k
     crops = [CROPS[1], CROPS[2], Crop(133, 80, 17, 20), Crop(0, 0, 40, 100)]
     found = []
     for backend in (rasterizer, TorchRasterizer("never", tile_side=16)):
