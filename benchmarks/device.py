@@ -6,11 +6,12 @@ Trains a small procedural scene by the engine, with gsplat's rasterizer, on a de
 tests/reference/simulated_device.py), and counts. Nothing is downloaded and no GPU is needed.
 
 What the figures mean: a wait is a point where the host can launch nothing before the device has done all
-that it was given, so each costs what the device has left to do; copies that block are waits, too. A launch is
-one operation of torch's, or one function of gsplat's, which may be several kernels on CUDA. Steps are those
-within a visit; what is done when a visit begins (survey, attach, layers) and ends (settle, commit) is counted
-apart, a visit at a time. Layer copies are those that are made while layers are kept and read back. Peak bytes
-are those of live tensors.
+that it was given, so each costs what the device has left to do; copies that block are waits, too. So are the
+events by which a step's numbers are read while the next one runs, though these may find the device done. A
+launch is one operation of torch's, or one function of gsplat's, which may be several kernels on CUDA. Steps
+are those within a visit, plain ones those of them that neither grow nor prune; what is done when a visit
+begins (survey, attach, layers) and ends (settle, commit) is counted apart, a visit at a time. Layer copies
+are those that are made while layers are kept and read back. Peak bytes are those of live tensors.
 
 What they do not mean: there are no seconds of an accelerator here, no speed of its memory, and no fraction of
 its cores that such small pictures would keep busy. Counts of waits and launches hardly depend on the scene's
@@ -33,7 +34,7 @@ import torch
 import tyro
 
 from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.density import DensityConfig, DensityControl
 from abcd_ns.engine.layer_store import LayerStore
 from abcd_ns.engine.rasterizer import make_rasterizer
 from abcd_ns.engine.training_loop import train_step
@@ -87,6 +88,7 @@ class Tally:
         times, counts = max(self.times, 1), self.counts
         values = {
             "waits": counts.waited,
+            "waits_in_isect_tiles": counts.waits["isect_tiles"],
             "copies_to_host": counts.copies_to_host,
             "copies_to_device": counts.copies_to_device,
             "bytes_to_host": counts.bytes_to_host,
@@ -101,8 +103,8 @@ class Watch:
 
     def __init__(self, counts: Counts) -> None:
         self._counts = counts
-        self.steps, self.visits, self.layers = Tally(), Tally(), Tally()
-        self._drawing = False
+        self.steps, self.plain, self.visits, self.layers = Tally(), Tally(), Tally(), Tally()
+        self._refined = False
 
     @contextmanager
     def layers_in(self) -> Iterator[None]:
@@ -137,7 +139,7 @@ class Watch:
             lambda: apart(originals[0]),
             lambda: apart(originals[1]),
         )
-        before = self._counts.copy()
+        before, self._refined = self._counts.copy(), False
         train_step(coordinator, photos)
         coordinator._begin_visit, coordinator._end_visit = originals
         taken = self._counts.since(before)
@@ -145,6 +147,23 @@ class Watch:
             taken = taken.since(edge)
             self.visits.add(edge)
         self.steps.add(taken)
+        if not self._refined:
+            self.plain.add(taken)
+
+    @contextmanager
+    def refinements_in(self) -> Iterator[None]:
+        """Notice which steps refine, or reset opacities."""
+        original = DensityControl._step_default
+
+        def noticed(*args: Any) -> Any:
+            self._refined = True
+            return original(*args)
+
+        DensityControl._step_default = noticed
+        try:
+            yield
+        finally:
+            DensityControl._step_default = original
 
 
 def scene(args: Args) -> tuple[Gaussians, list[View], Photos]:
@@ -166,7 +185,7 @@ def run(args: Args, blocks: int, folder: Path) -> dict[str, Any]:
         )
         watch = Watch(counts)
         counts.reset_peak()
-        with watch.layers_in():
+        with watch.layers_in(), watch.refinements_in():
             while not coordinator.finished:
                 watch.take_step(coordinator, photos)
         visits = max(coordinator.state.visit, 1)
@@ -185,6 +204,8 @@ def summary(watch: Watch, visits: int) -> dict[str, Any]:
         "steps": steps.times,
         "visits": visits,
         **steps.each("step"),
+        "plain_steps": watch.plain.times,
+        **watch.plain.each("plain_step"),
         **at_edges.each("visit"),
         "layer_copies_per_visit": round((layers.copies_to_host + layers.copies_to_device) / visits, 2),
         "waits_per_step_by_operation": by_step(steps.counts.waits.most_common(), steps.times),
@@ -208,6 +229,8 @@ def commit() -> str:
 
 COLUMNS = {
     "waits_per_step": "waits",
+    "waits_per_plain_step": "waits where nothing is refined",
+    "waits_in_isect_tiles_per_plain_step": "of these in isect_tiles",
     "launches_per_step": "launches",
     "copies_to_host_per_step": "copies to host",
     "copies_to_device_per_step": "copies to device",

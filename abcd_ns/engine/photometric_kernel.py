@@ -119,16 +119,11 @@ def photometric_sums(
 
     Images are at least as large as the window.
     """
-    if rendered.device.type == "cuda":
-        return _ON_CUDA(rendered, photo, weights)
-    return _sums(rendered, photo, weights, SLIDE_ROWS, DISSIMILARITY, COMBINE)
+    steps = _ON_CUDA if rendered.device.type == "cuda" else PHOTOMETRIC_KERNELS
+    return _sums(rendered, photo, weights, *steps)
 
 
-def _uncompiled(rendered: Tensor, photo: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    return _sums(rendered, photo, weights, slide_rows, dissimilarity, combine)
-
-
-_ON_CUDA = Compiled(_uncompiled)
+_ON_CUDA = (Compiled(slide_rows), Compiled(dissimilarity), Compiled(combine))
 
 
 def _sums(

@@ -86,7 +86,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
             raise RuntimeError("training samples come from a coordinator: call follow() first")
         samples = self._coordinator.next_batch()
         rows = [sample.view.index for sample in samples.samples]
-        camera = self.train_dataset.cameras[rows[0] : rows[0] + 1].to(self.device)
+        camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
         crops = [sample.crop for sample in samples.samples]
         photos = [self.photo(row, crop) for row, crop in zip(rows, crops, strict=True)]

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import pytest
 import torch
+from gsplat.strategy import DefaultStrategy
 
 from abcd_ns.engine.block_state import BlockState
 from abcd_ns.engine.density import DensityClock, DensityConfig, DensityControl, for_blocks
@@ -214,3 +215,65 @@ def test_refining_needs_gradients():
     assert not control.refines(due, ())
     assert not control.refines(clock(steps=101), (fake_info(3, 1.0),))
     assert DensityControl(DensityConfig("mcmc")).refines(due, ())
+
+
+def drawn_info(views: int, count: int, seed: int, size) -> dict:
+    """What a drawing leaves behind: not every view sees every Gaussian."""
+    generator = torch.Generator().manual_seed(seed)
+    means2d = torch.zeros(views, count, 2, requires_grad=True)
+    radii = torch.randint(0, 3, (views, count), generator=generator, dtype=torch.int32)
+    unseen = (radii == 0)[..., None]
+    means2d.grad = (torch.randn(views, count, 2, generator=generator) * 1e-4).masked_fill(unseen, 0.0)
+    means2d.absgrad = means2d.grad.abs() * 3
+    return {"means2d": means2d, "radii": radii, "n_cameras": 5, "gaussian_ids": None, **size}
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 37, 1000])
+@pytest.mark.parametrize("views", [1, 2, 4, 33])
+def test_statistics_are_gsplats_to_the_last_bit(views, count, absgrad):
+    sizes = torch.arange(2 * views).view(2, views, 1) + 40
+    infos = (
+        drawn_info(views, count, 0, {"width": 641, "height": 427}),
+        drawn_info(views, count, 1, {"width": sizes[0], "height": sizes[1]}),
+    )
+    control = DensityControl(DensityConfig(use_absgrad=absgrad))
+    state: dict = {"grad2d": None, "count": None}
+    strategy = DefaultStrategy(absgrad=absgrad)
+    for info in infos:
+        strategy._update_state({"means": torch.zeros(count, 3)}, state, info)
+    found = control.count(torch.zeros(count, 3), infos)
+    assert {name: value.dtype for name, value in found.items()} == dict.fromkeys(state, torch.float32)
+    assert all(torch.equal(found[name], value) for name, value in state.items())
+
+
+def test_statistics_pass_over_what_is_no_number():
+    info = fake_info(4, 1.0)
+    info["means2d"].absgrad[0, 2] = math.nan
+    found = DensityControl(DensityConfig()).count(torch.zeros(4, 3), (info,))
+    assert found["count"].tolist() == [1, 1, 0, 1]
+    assert float(found["grad2d"][2]) == 0
+
+
+def test_random_numbers_are_forked_only_where_any_are_drawn(monkeypatch):
+    """It takes a wait on a device."""
+    forks, fork = [], torch.random.fork_rng
+    monkeypatch.setattr(torch.random, "fork_rng", lambda **options: forks.append(1) or fork(**options))
+    params, optimizers = live(random_gaussians(8))
+    control = DensityControl(DensityConfig())
+    growth = control.after_step(params, optimizers, {}, (fake_info(8, 1.0),), clock(steps=7))
+    assert forks == []
+    control.after_step(params, optimizers, growth, (fake_info(8, 1.0),), clock())
+    assert forks == [1]
+
+
+def test_a_refinement_leaves_the_allocator_its_memory(monkeypatch):
+    emptied = []
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(1))
+    lent = torch.cuda.empty_cache
+    params, optimizers = live(random_gaussians(8, size=0.001))
+    control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
+    control.after_step(params, optimizers, {}, (fake_info(8, 1.0),), clock())
+    assert len(params["means"]) == 16
+    assert emptied == []
+    assert torch.cuda.empty_cache is lent

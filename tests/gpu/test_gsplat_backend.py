@@ -3,6 +3,8 @@
 Cameras are on the CPU, as everywhere in the engine.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -80,6 +82,40 @@ def test_absgrad_and_means2d_gradient(rasterizer, scene, crop):
     assert infos[0].absgrad.shape == infos[1].absgrad.shape == (1, 200, 2)
     assert relative_error(infos[0].absgrad, infos[1].absgrad) < 1e-2
     assert relative_error(infos[0].grad, infos[1].grad) < 1e-2
+
+
+@pytest.mark.parametrize("windowed", [False, True])
+def test_shots_that_are_drawn_together_are_the_torch_backends(rasterizer, scene, windowed, device):
+    """Of different sizes, with crops anywhere: the list's end, which no tile is to draw, included."""
+    views = [view(), view(), view(), replace(view(), width=120)]
+    for k, each in enumerate(views):
+        each.viewmat[0, 3] += 0.1 * k
+    crops = [CROPS[1], CROPS[2], Crop(133, 80, 17, 20), Crop(0, 0, 40, 100)]
+    found = []
+    for backend in (rasterizer, TorchRasterizer("never", tile_side=16)):
+        leaves, shots = as_leaves(scene(300)), []
+        for k, (each, crop) in enumerate(zip(views, crops, strict=True)):
+            grid = rasterizer.window_grid(crop)
+            near = 3.0 + torch.sin(torch.arange(grid.tiles, device=device, dtype=torch.float32))
+            window = ZWindow(grid, near, near + 1.5) if windowed else None
+            shots.append(Shot(each, crop, backend.project(scene(60, seed=k + 1), each), window))
+        rasters = backend.draw(leaves, shots, sh_degree=1)
+        weights = [probe(*r.transmittance.shape, dtype=torch.float32).to(device) for r in rasters]
+        sum((stacked(r) * w).sum() for r, w in zip(rasters, weights, strict=True)).backward()
+        picture = torch.cat([stacked(raster).detach().flatten() for raster in rasters])
+        found.append((picture, {name: getattr(leaves, name).grad for name in PARAM_NAMES}))
+    difference = (found[0][0] - found[1][0]).abs() / found[1][0].abs().amax()
+    assert difference.mean() < 1e-5
+    for name in PARAM_NAMES:
+        assert relative_error(found[0][1][name], found[1][1][name]) < 1e-2, name
+
+
+def test_extents_are_the_torch_backends(rasterizer, scene):
+    gaussians = scene(200)
+    views = [view(), replace(view(), width=120), replace(view(), near=5.0)]
+    found, expected = (draw.extents(gaussians, views) for draw in (rasterizer, TorchRasterizer("never")))
+    assert found.device.type == "cpu"
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1.1)  # a radius may be rounded up elsewhere
 
 
 def test_graph_is_freed_without_a_backward_pass(rasterizer, scene, device):

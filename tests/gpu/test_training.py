@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from abcd_ns.engine.density import DensityConfig
-from abcd_ns.engine.events import StepTaken, VisitEnded
-from abcd_ns.engine.rasterizer import TorchRasterizer
+from abcd_ns.engine.events import Mended, StepTaken, VisitEnded
+from abcd_ns.engine.rasterizer import TorchRasterizer, gsplat_pairs
 from abcd_ns.engine.training_loop import train, train_step
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
@@ -67,9 +67,59 @@ def test_steps_on_the_device_make_the_photos_more_alike(tmp_path, begin, views, 
     before = mean_error(coordinator, views, photos)
     train(coordinator, photos)
     assert len(seen) == STEPS
-    assert all(math.isfinite(event.psnr) for event in seen)
+    assert all(math.isfinite(event.psnr) for event in seen if event.visit_step > 1)  # told a step late
     assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
     assert mean_error(coordinator, views, photos) < 0.9 * before
+
+
+def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, begin, photos, device):
+    """CUDA's fused Adam is told by a tensor that it is to do nothing."""
+    if device.type != "cuda":
+        pytest.skip("on the CPU rows are cleaned at once")
+    coordinator = begin(tmp_path, blocks=1, density=DensityConfig(strategy="off"))
+    told = []
+    coordinator.announce.subscribe(lambda event: told.append(event) if isinstance(event, Mended) else None)
+    train(coordinator, photos, steps=2)
+    optimizer, before = coordinator.optimizers["means"], coordinator.params["means"].detach().clone()
+
+    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
+        optimizer.param_groups[0]["params"][0].grad[2] = math.nan
+
+    handle = optimizer.register_step_pre_hook(spoil)
+    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
+    train(coordinator, photos, steps=1)
+    handle.remove()
+    assert torch.equal(before, coordinator.params["means"])
+    train(coordinator, photos, steps=1)
+    assert not torch.equal(before, coordinator.params["means"])
+    assert [(event.what, event.count) for event in told] == [("gradients", 1)]
+
+
+@pytest.mark.filterwarnings("ignore:Synchronization debug mode")
+def test_a_step_makes_the_host_wait_for_lists_and_numbers_alone(tmp_path, begin, photos, device, monkeypatch):
+    """As tests/simulated counts it. Every other operation that synchronises raises."""
+    if device.type != "cuda":
+        pytest.skip("only CUDA tells what synchronises")
+    never = {"refine_every": 10**6, "reset_every": 0}
+    coordinator = begin(tmp_path, blocks=4, density=DensityConfig(**never), steps=200)
+    train(coordinator, photos, steps=2)
+
+    def allowed(*args, **options):
+        torch.cuda.set_sync_debug_mode("default")
+        found = isect_tiles(*args, **options)
+        torch.cuda.set_sync_debug_mode("error")
+        return found
+
+    isect_tiles = gsplat_pairs.isect_tiles
+    monkeypatch.setattr(gsplat_pairs, "isect_tiles", allowed)
+    steps_left = coordinator.state.active.steps - coordinator.state.active.done
+    assert steps_left > 1
+    for _ in range(steps_left - 1):
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            train_step(coordinator, photos)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.parametrize("blocks", [1, 4])

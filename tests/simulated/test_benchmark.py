@@ -16,7 +16,10 @@ def test_the_benchmark_counts_and_writes(tmp_path, capsys):
     assert one["steps"] == two["steps"] == 4
     for each in (one, two):
         assert each["launches_per_step"] > 50
-        assert each["waits_per_step"] > each["copies_to_host_per_step"] >= 0
+        assert each["waits_per_step"] >= each["waits_per_plain_step"] > 0
+        assert each["copies_to_host_per_step"] > 0
+        assert each["waits_in_isect_tiles_per_step"] == 1
+        assert 0 < each["plain_steps"] <= each["steps"]
         assert each["waits_per_step"] == pytest.approx(
             sum(each["waits_per_step_by_operation"].values()), abs=0.1
         )

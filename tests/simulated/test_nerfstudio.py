@@ -7,6 +7,7 @@ from nerfstudio.utils.eval_utils import eval_load_checkpoint
 
 from abcd_ns import methods
 from abcd_ns.engine.storage import ParameterStore
+from abcd_ns.engine.types import Crop
 from abcd_ns.viewer.pictures import Choice, Show
 from tests.plugin.test_training import configure, run
 from tests.reference.colmap_scene import HEIGHT, WIDTH, write_scene
@@ -104,3 +105,20 @@ def test_a_run_is_gone_on_with(data, tmp_path, trained):
 def test_the_other_methods_train(data, tmp_path, method):
     trainer = run(on_device(data, tmp_path, method, steps=4))
     assert trainer.pipeline.coordinator.state.step == 4
+
+
+def test_photos_are_copied_once_while_there_is_room_and_else_as_bytes(trained, counts):
+    manager = trained.pipeline.datamanager
+    crop, rows = Crop(3, 2, 10, 8), range(len(manager.train_dataset))
+    whole = manager.train_dataset.photos.image(0)
+    expected = [manager.train_dataset.photos.crop(row, crop).float() / 255 for row in rows]
+    manager.device_photo_bytes = whole.nbytes  # room for one
+    for copies, size in (
+        (len(rows), whole.nbytes + (len(rows) - 1) * 240),
+        (len(rows) - 1, 240 * (len(rows) - 1)),
+    ):
+        before = counts.copy()
+        found = [manager.photo(row, crop) for row in rows]
+        taken = counts.since(before)
+        assert (taken.copies_to_device, taken.bytes_to_device, taken.waited) == (copies, size, 0)
+        assert all(torch.equal(pixels.cpu(), wanted) for pixels, wanted in zip(found, expected, strict=True))

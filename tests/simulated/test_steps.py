@@ -1,0 +1,151 @@
+"""What a step on a device waits for and copies, and what it tells a step late."""
+
+import math
+
+import pytest
+import torch
+
+from abcd_ns.engine.density import DensityConfig
+from abcd_ns.engine.events import Mended, StepTaken
+from abcd_ns.engine.param_swap import PARAM_NAMES
+from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer
+from abcd_ns.engine.training_loop import train, train_step
+from abcd_ns.engine.transfer import StepNumbers
+from benchmarks.device import Watch
+from tests.reference.scenes import make_coordinator, whole_scene
+from tests.reference.simulated_device import DEVICE
+
+GATHERING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=10**6, reset_every=0)
+STILL = DensityConfig(strategy="off")
+
+
+def listen(coordinator, kind) -> list:
+    found = []
+    coordinator.announce.subscribe(lambda event: found.append(event) if isinstance(event, kind) else None)
+    return found
+
+
+@pytest.mark.parametrize(("blocks", "parts"), [(1, 0), (8, 0), (8, 300)])
+def test_a_step_waits_once_and_copies_its_photos_alone(
+    tmp_path, start, views, photos, simulated_gsplat, blocks, parts
+):
+    """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
+    counts = simulated_gsplat
+    coordinator = make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=blocks,
+        steps=3 * blocks,
+        density=GATHERING,
+        crop_pixels=parts,
+        rasterizer=make_rasterizer("auto", DEVICE),
+        device=DEVICE,
+    )
+    watch = Watch(counts)
+    watch.take_step(coordinator, photos)  # the first one uploads cameras and backgrounds
+    while not coordinator.finished:
+        before = watch.steps.counts.copy()
+        watch.take_step(coordinator, photos)
+        taken = watch.steps.counts.since(before)
+        apart = taken.waits.pop("isect_tiles")
+        assert apart == 1
+        assert dict(+taken.waits) in ({}, {"event": 1}), taken.places
+        assert taken.copies_to_device == coordinator.batch
+        assert taken.copies_to_host == 1
+        assert taken.bytes_to_host < 100
+
+
+def test_numbers_of_a_step_are_there_a_step_later(counts):
+    numbers = StepNumbers(DEVICE)
+    assert numbers.are_late
+    for step in range(3):
+        given = [torch.full((), float(step), device=DEVICE), torch.full((), 0.5, device=DEVICE)]
+        numbers.send(step, {"losses": given, "bad": []})
+        found = list(numbers.read(all_but=1))
+        assert found == ([(step - 1, {"losses": [step - 1.0, 0.5], "bad": []})] if step else [])
+    assert [about for about, _ in numbers.read()] == [2]
+    assert (counts.copies_to_host, counts.waits["event"]) == (3, 3)
+    at_once = StepNumbers(torch.device("cpu"))
+    at_once.send("this", {"losses": [torch.tensor(2.0)]})
+    assert list(at_once.read(all_but=int(at_once.are_late))) == [("this", {"losses": [2.0]})]
+
+
+def test_listeners_hear_of_a_step_when_the_next_is_taken(tmp_path, start, views, photos, counts):  # noqa: ARG001
+    heard = {}
+    for device in ("cpu", DEVICE):
+        folder = tmp_path / str(device).replace(":", "")
+        folder.mkdir()
+        coordinator = make_coordinator(
+            folder, start, views, blocks=2, steps=6, density=STILL, device=device, ownership="means"
+        )
+        heard[str(device)] = listen(coordinator, StepTaken)
+        train(coordinator, photos)
+        assert coordinator.state.health
+    now, late = heard["cpu"], heard[str(DEVICE)]
+    assert [event.visit_step for event in now] == [event.visit_step for event in late]
+    for k, event in enumerate(late):
+        if event.visit_step == 1:
+            assert math.isnan(event.psnr)
+        else:
+            assert event.psnr == pytest.approx(now[k - 1].psnr, abs=1e-3)
+
+
+def spoil_once(coordinator, step: int) -> None:
+    """One row's gradient is no number in one step."""
+
+    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
+        if coordinator.state.step == step:
+            optimizer.param_groups[0]["params"][0].grad[2] = math.nan
+
+    optimizer = coordinator.optimizers["means"]
+    handle = optimizer.register_step_pre_hook(spoil)
+    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
+
+
+def values(coordinator) -> dict[str, torch.Tensor]:
+    return {name: coordinator.params[name].detach().clone() for name in PARAM_NAMES}
+
+
+def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, start, views, photos, counts):  # noqa: ARG001
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=1, steps=12, density=GATHERING, device=DEVICE
+    )
+    told = listen(coordinator, Mended)
+    spoil_once(coordinator, 3)
+    spoil_once(coordinator, 6)
+    train(coordinator, photos, steps=3)
+    before = values(coordinator)
+    adam = coordinator.optimizers["means"].state[coordinator.params["means"]]
+    clock = float(adam["step"])
+    train_step(coordinator, photos)
+    assert all(torch.equal(before[name].cpu(), value.cpu()) for name, value in values(coordinator).items())
+    assert float(adam["step"]) == clock
+    assert told == []  # nobody knows yet
+    train_step(coordinator, photos)
+    assert not torch.equal(before["means"].cpu(), coordinator.params["means"].detach().cpu())
+    assert [(event.what, event.count) for event in told] == [("gradients", 1)]
+    # From then on one row is cleaned, and the others are trained.
+    train_step(coordinator, photos)
+    before = values(coordinator)
+    train_step(coordinator, photos)
+    moved = (before["means"] != coordinator.params["means"].detach()).any(dim=1).cpu()
+    assert bool(moved.any())
+    assert [(event.what, event.count) for event in told] == [("gradients", 1)] * 2
+    train(coordinator, photos)
+    assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
+    assert bool(coordinator._growth["grad2d"].isfinite().all())
+
+
+def test_the_torch_rasterizer_is_what_it_is_on_the_cpu(tmp_path, start, views, photos, counts):  # noqa: ARG001
+    """Statistics of density control included."""
+    grown = {}
+    for device in ("cpu", DEVICE):
+        folder = tmp_path / str(device).replace(":", "")
+        folder.mkdir()
+        options = {"rasterizer": TorchRasterizer("never"), "density": GATHERING, "device": device}
+        coordinator = make_coordinator(folder, start, views, blocks=1, steps=4, **options)
+        train(coordinator, photos, steps=3)
+        grown[str(device)] = {name: value.cpu() for name, value in coordinator._growth.items()}
+    for name, value in grown["cpu"].items():
+        torch.testing.assert_close(grown[str(DEVICE)][name], value, rtol=1e-3, atol=1e-6)
