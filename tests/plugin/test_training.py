@@ -88,6 +88,11 @@ def trained(data, tmp_path_factory) -> AbcdTrainer:
     return run(configure(data, tmp_path_factory.mktemp("out")))
 
 
+def test_on_the_cpu_layers_and_photos_have_room_under_the_ram_budget_alone(trained):
+    assert trained.pipeline.datamanager.device_photo_bytes == 0
+    assert trained.pipeline.coordinator.layer_limit == trained.pipeline._ram.layers
+
+
 def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
     (checkpoint,) = trained.checkpoint_dir.iterdir()
     assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"

@@ -70,6 +70,12 @@ def loaded(folder):
     return pipeline
 
 
+def test_layers_and_photos_have_an_eighth_of_the_device_each(trained):
+    pipeline = trained.pipeline
+    assert pipeline.datamanager.device_photo_bytes == pipeline._budget // 8 > 0
+    assert pipeline.coordinator.layer_limit == pipeline._budget // 8 + pipeline._ram.layers
+
+
 def test_a_run_is_on_the_device_and_leaves_a_checkpoint(trained):
     assert trained.pipeline.device == DEVICE
     assert trained.pipeline.model.draws_with().name.startswith("gsplat")
