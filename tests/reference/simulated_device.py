@@ -43,7 +43,7 @@ torch.get_device_module(DEVICE).get_amp_supported_dtype = lambda: [torch.float16
 
 class Event:
     """A place in the order of what the device does. What is copied to the host without waiting is void until
-    an event that was recorded after it has been waited for."""
+    an event that was recorded after it has been waited for, or a later copy that blocks."""
 
     _underway: ClassVar[list[tuple[Tensor, Tensor]]] = []
 
@@ -54,8 +54,13 @@ class Event:
     def synchronize(self) -> None:
         """Wait until the device has come here."""
         _counts.wait("event")
-        for there, values in self._before:
-            there.copy_(values)
+        _arrive(self._before)
+
+
+def _arrive(copies: list[tuple[Tensor, Tensor]]) -> None:
+    for there, values in copies:
+        there.copy_(values)
+    copies.clear()
 
 
 torch.get_device_module(DEVICE).Event = Event
@@ -286,6 +291,8 @@ def _to_copy(
         if non_blocking and not to_device:
             values, copied = copied, torch.full_like(copied, torch.nan if copied.is_floating_point() else -1)
             Event._underway.append((copied, values))
+        elif not to_device:
+            _arrive(Event._underway)  # the device works in order
     elif to_device:
         _counts.launches += 1
     return OnDevice(copied) if to_device else copied

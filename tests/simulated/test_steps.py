@@ -11,7 +11,9 @@ from abcd_ns.engine.param_swap import PARAM_NAMES
 from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer
 from abcd_ns.engine.training_loop import train, train_step
 from abcd_ns.engine.transfer import StepNumbers
+from abcd_ns.engine.types import Crop
 from benchmarks.device import Watch
+from tests.engine.rasterizer_scenes import as_leaves
 from tests.reference.scenes import make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 
@@ -54,6 +56,20 @@ def test_a_step_waits_once_and_copies_its_photos_alone(
         assert taken.copies_to_device == coordinator.batch
         assert taken.copies_to_host == 1
         assert taken.bytes_to_host < 100
+
+
+@pytest.mark.parametrize("crop", [None, Crop(16, 0, 20, 20)])
+def test_a_drawing_leaves_nothing_behind(start, views, simulated_gsplat, crop):
+    rasterizer, live = make_rasterizer("auto", DEVICE), []
+    leaves = as_leaves(start.to(DEVICE))
+    for _ in range(3):
+        raster = rasterizer(leaves, views[0], sh_degree=1, crop=crop, absgrad=True)
+        raster.info["means2d"].retain_grad()
+        raster.color.sum().backward()
+        assert bool(raster.info["means2d"].absgrad.any())
+        del raster
+        live.append(simulated_gsplat.live_bytes)
+    assert live[1] == live[2]
 
 
 def test_numbers_of_a_step_are_there_a_step_later(counts):

@@ -162,11 +162,10 @@ class Drawing:
             windowed: leave room for what windows are going to leave out.
         """
         sheet = Sheet(tuple(crops), windowed)
-        means2d = splats.means2d
         # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
-        if any(crop.x or crop.y for crop in sheet.tiled):
-            corners = cameras.corners(sheet.tiled, means2d)
-            means2d = means2d - (corners if len(crops) == 1 else corners.index_select(0, splats.cameras))
+        # By 0 too: a view would hold on to what it is of, which holds on to this (see _forward_absgrad).
+        corners = cameras.corners(sheet.tiled, splats.means2d)
+        means2d = splats.means2d - (corners if len(crops) == 1 else corners.index_select(0, splats.cameras))
         if len(splats) == 0:
             return Drawing(splats, means2d, sheet, splats.cameras, splats.cameras.int())
         _, rows, cols = sheet.shape
