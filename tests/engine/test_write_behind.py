@@ -133,7 +133,7 @@ def test_the_thread_ends_when_all_is_written(scene):
 def test_a_write_that_failed_is_told_once_and_made_good_by_the_next(scene):
     disk = Disk(scene.store)
     disk.refuses = True
-    scene.rest(scene.tree, {0: moved(scene.state(0), 1)}, {"step": 1}, within=1e-6)
+    scene.rest(scene.tree, {0: moved(scene.state(0), 1)}, {"step": 1}, within=PATIENCE)
     with pytest.raises(StoreError, match="full"):
         scene.flush()
     with pytest.raises(StoreError, match="full"):
@@ -226,7 +226,9 @@ def reads(monkeypatch) -> list[str]:
 def test_a_block_is_read_ahead(scene, monkeypatch):
     found = reads(monkeypatch)
     scene.read_ahead(2)
-    scene.flush()
+    deadline = time.monotonic() + PATIENCE
+    while not found and time.monotonic() < deadline:
+        time.sleep(0.01)
     assert len(found) == 1
     assert len(scene.state(2)) == 10
     scene.read_ahead(2)
