@@ -27,7 +27,7 @@ from abcd_ns.engine.events import (
     VisitEnded,
 )
 from abcd_ns.engine.health import Health
-from abcd_ns.engine.influence import influence, share_shown
+from abcd_ns.engine.influence import influence
 from abcd_ns.engine.layer_store import LAYER_BYTES, LayerStore
 from abcd_ns.engine.memory import check_room
 from abcd_ns.engine.painter import Painter, PaintSettings, default_pass
@@ -307,29 +307,19 @@ class Coordinator(StepDrawing):
         self._growth, self._clocks = {n: value.clone() for n, value in rest.growth.items()}, rest.clocks
         if active.done == 0 and not active.is_whole:
             self._hold_back_giants()
-        block = None if active.is_whole else active.geometry.block
+        block, seen = None if active.is_whole else active.geometry.block, len(active.geometry.views)
         self.scene.lay_over(block, lambda: live_gaussians(self.params))
         self._order = self._order_of(active)
-        seen = len(active.geometry.views)
         self.announce(VisitBegan(active.number, self.state.sweep, block, active.steps, seen, len(rest)))
         before = self.stopwatch.seconds
         self._crew = self._gather_crew(active)
         self._layers = self._draw_layers(active, self._order)
         active.layer_seconds += self.stopwatch.seconds - before
-        if active.done == 0:
-            self._measure_influence(active)
+        if active.done == 0 and active.looked_at:
+            shown = self._shown_in(active.looked_at, self.state.step)
+            self.state.influence[active.geometry.block].update(shown)
         for plan in self.state.queue[:1]:
             self.scene.read_ahead(plan.block)
-
-    def _measure_influence(self, active: ActiveVisit) -> None:
-        """Find out how much the doubtful views show of the block by now."""
-        for view in active.looked_at:
-            crop, live = active.geometry.crops[view], live_gaussians(self.params)
-            sample = self._sample_of(view, crop, 0, self.state.step)
-            before = sample.layers and sample.layers.front.transmittance
-            self.state.influence[active.geometry.block][view] = share_shown(
-                live, self._rasterizer, sample.shot, before, antialiased=self.config.antialiased
-            )
 
     def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:
         taken = 0 if active.is_alone else active.steps * (self.batch // active.crew)
@@ -364,8 +354,7 @@ class Coordinator(StepDrawing):
         for done, _ in enumerate(layers.draw(wanted), start=1):
             self.announce(LayersDrawn(active.number, done, len(wanted)))
         if active.done == 0:
-            self.state.trained += len(self.params["means"])
-            self.state.frozen += layers.frozen
+            self.state.count_drawn(len(self.params["means"]), layers.frozen)
         return layers
 
     def _end_visit(self) -> None:

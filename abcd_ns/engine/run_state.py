@@ -107,6 +107,10 @@ class RunState:
     seconds: float = 0.0
     """Training time up to the last save."""
 
+    def count_drawn(self, trained: int, frozen: int) -> None:
+        """A visit has drawn its layers."""
+        self.trained, self.frozen = self.trained + trained, self.frozen + frozen
+
     def inherit(self, new: int, parent: int) -> None:
         """`new` was a part of `parent`: what is known of that holds for it too; it is visited next to it."""
         for known in (self.views, self.influence):

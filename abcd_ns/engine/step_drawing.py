@@ -17,6 +17,7 @@ from abcd_ns.engine.events import Announcer
 from abcd_ns.engine.health import Health
 from abcd_ns.engine.health_rules import share_of_picture
 from abcd_ns.engine.helper_process import can_fork
+from abcd_ns.engine.influence import share_shown
 from abcd_ns.engine.param_swap import Params, live_gaussians
 from abcd_ns.engine.rasterizer import Rasterizer
 from abcd_ns.engine.run_state import ActiveVisit
@@ -92,6 +93,17 @@ class StepDrawing(ABC):
             window=around and around.window,
             background=self._backgrounds.at(step, place),
         )
+
+    def _shown_in(self, views: Sequence[int], step: int) -> dict[int, float]:
+        """The influence that the block has on each of these views by now."""
+        shown, live = {}, live_gaussians(self.params)
+        for view in views:
+            sample = self._sample_of(view, self._active.geometry.crops[view], 0, step)
+            before = sample.layers and sample.layers.front.transmittance
+            shown[view] = share_shown(
+                live, self._rasterizer, sample.shot, before, antialiased=self.config.antialiased
+            )
+        return shown
 
     @property
     def _degree_drawn(self) -> int:
