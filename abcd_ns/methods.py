@@ -3,9 +3,9 @@
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.param_swap import LEARNING_RATES
-from abcd_ns.plugin.config import AbcdPipelineConfig, AbcdTrainerConfig, FusedAdamConfig
+from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.nerfstudio.config import AbcdPipelineConfig, AbcdTrainerConfig, FusedAdamConfig
 from abcd_ns.viewer.rules import THIS_MACHINE
 
 PAPER = TrainingConfig(

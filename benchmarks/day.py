@@ -25,8 +25,8 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.plugin.machine import describe_machine, describe_versions
-from abcd_ns.tools.runs.style import in_style, save
+from abcd_ns.lab.runs.style import in_style, save
+from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
 
 BIN = Path(sys.executable).parent
 SECONDS_BETWEEN_LOOKS = 0.2

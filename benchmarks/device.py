@@ -33,11 +33,11 @@ import gsplat
 import torch
 import tyro
 
-from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.density import DensityConfig, DensityControl
-from abcd_ns.engine.layer_store import LayerStore
-from abcd_ns.engine.rasterizer import make_rasterizer
-from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.layers.layer_store import LayerStore
+from abcd_ns.engine.render import make_rasterizer
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
 from tests.reference.device_counts import Counts
 from tests.reference.gsplat_stand_ins import lent

@@ -26,14 +26,14 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from abcd_ns.engine.storage import ParameterStore, StoreError, crash_points
-from tests.plugin.crash_training import Trainings, gaussians, run_folder
+from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
+from tests.nerfstudio.crash_training import Trainings, gaussians, run_folder
 from tests.reference.colmap_scene import write_scene
 from tests.reference.crash_runs import DISK_FULL, Kill, Runs, digest, lost_steps, points_reached
 
 KILLED = -signal.SIGKILL
 TRAINING_STEPS = 36
-IMPORTED = ("tests.plugin.crash_training", "tyro", "rich.progress")
+IMPORTED = ("tests.nerfstudio.crash_training", "tyro", "rich.progress")
 """What processes import of this module's own imports, once for all of them."""
 SECONDS_BETWEEN_LINES = 10.0
 """Where the output is no terminal."""

@@ -18,13 +18,11 @@ import tyro
 from torch import Tensor
 
 from abcd_ns.engine.kernels import can_build
-from abcd_ns.engine.rasterizer import TorchRasterizer
-from abcd_ns.engine.rasterizer import torch_backend as backend
-from abcd_ns.engine.rasterizer.binning import bin_splats
-from abcd_ns.engine.rasterizer.chunk_kernels import ChunkKernels
-from abcd_ns.engine.rasterizer.projection import project
-from abcd_ns.engine.rasterizer.tile_grid import TileGrid
-from abcd_ns.engine.rasterizer.torch_kernels import (
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.cpu import backend
+from abcd_ns.engine.render.cpu.binning import bin_splats
+from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels
+from abcd_ns.engine.render.cpu.torch_kernels import (
     ALWAYS,
     BLUE,
     CONIC_XX,
@@ -38,6 +36,8 @@ from abcd_ns.engine.rasterizer.torch_kernels import (
     X,
     Y,
 )
+from abcd_ns.engine.render.projection import project
+from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.types import Gaussians, View
 
 SIZES = ((160, 106), (320, 213))

@@ -23,25 +23,25 @@ import torch
 import tyro
 from torch.profiler import ProfilerActivity
 
-from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.coordinator import Coordinator
+from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.engine.events import VisitEnded
-from abcd_ns.engine.initialize import gaussians_from_points
-from abcd_ns.engine.loss import psnrs
-from abcd_ns.engine.near_plane import near_plane
-from abcd_ns.engine.param_swap import nothing_live
-from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.rasterizer import Rasterizer, make_rasterizer
-from abcd_ns.engine.run_state import Budget
-from abcd_ns.engine.scaffold import blocks_at_rest
-from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.storage import ParameterStore
-from abcd_ns.engine.training_loop import PhotoReader
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.render import Rasterizer, make_rasterizer
+from abcd_ns.engine.render.loss import psnrs
+from abcd_ns.engine.space.near_plane import near_plane
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.plugin.config import AbcdDataManagerConfig
-from abcd_ns.plugin.data.dataset import AbcdDataset
-from abcd_ns.plugin.dataparser import AbcdDataParserConfig
-from abcd_ns.plugin.views import views_of
+from abcd_ns.nerfstudio.config import AbcdDataManagerConfig
+from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.views import views_of
 
 STAGES = (
     "plan and attach",

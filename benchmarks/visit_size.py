@@ -23,19 +23,19 @@ import torch
 import tyro
 from torch import Tensor
 
-from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import VisitBegan
-from abcd_ns.engine.param_swap import nothing_live
-from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.rasterizer import make_rasterizer
-from abcd_ns.engine.run_state import Budget
-from abcd_ns.engine.scaffold import blocks_at_rest
-from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.schedule import passes_for_layers
-from abcd_ns.engine.storage import ParameterStore
-from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.render import make_rasterizer
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.schedule import passes_for_layers
+from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop
 from tests.reference.scenes import random_gaussians, ring_of_views
 

@@ -20,17 +20,17 @@ from pathlib import Path
 import torch
 import tyro
 
-from abcd_ns.engine.batch import Sample
-from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.painter import Painter, PaintSettings
-from abcd_ns.engine.param_swap import live_gaussians
-from abcd_ns.engine.rasterizer import TorchRasterizer
-from abcd_ns.engine.rasterizer.binning import bin_splats
-from abcd_ns.engine.rasterizer.tile_grid import TileGrid
-from abcd_ns.engine.scene import MemoryScene
-from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.cpu.binning import bin_splats
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.train.batch import Sample
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.plugin.machine import describe_machine, describe_versions
+from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
 from benchmarks.visit import Capture, begin, read
 
 COUNTED = 10

@@ -113,7 +113,7 @@ build_kernels() {
   "$VENV_PYTHON" -c '
 from abcd_ns.engine.build_kernels import all_kernels
 from abcd_ns.engine.kernels.build import build_kernels
-from abcd_ns.engine.rasterizer.torch_backend import CHUNK, TILE_SIDE
+from abcd_ns.engine.render.cpu.backend import CHUNK, TILE_SIDE
 build_kernels(all_kernels(TILE_SIDE, CHUNK), TILE_SIDE, CHUNK)'
 }
 

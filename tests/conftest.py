@@ -7,9 +7,9 @@ import torch
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-# Shapes and dtypes in the engine's signatures are checked on every call. The hook only works on modules
+# Shapes and dtypes in these packages' signatures are checked on every call. The hook only works on modules
 # that are not imported yet, hence here and not in a fixture.
-install_import_hook("abcd_ns.engine", "beartype.beartype")
+install_import_hook(["abcd_ns.engine", "abcd_ns.peers"], "beartype.beartype")
 
 # The same sums in the same order on any machine, and room for other processes.
 torch.set_num_threads(1)

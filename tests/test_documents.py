@@ -15,8 +15,9 @@ from nerfstudio.scripts.exporter import Commands as Export
 from nerfstudio.scripts.render import Commands as Render
 from nerfstudio.scripts.viewer.run_viewer import RunViewer
 
+from abcd_ns.cli import main as cli
+from abcd_ns.cli import train
 from abcd_ns.errors import UserError
-from abcd_ns.tools import cli, train
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from abcd_ns.engine.memory import DeviceNeeds
+from abcd_ns.engine.train.memory import DeviceNeeds
 
 TUTORIAL = Path(__file__).resolve().parent.parent / "docs" / "tutorial.md"
 BUDGETS = (4, 6, 8, 12, 24)

@@ -4,9 +4,9 @@ import sys
 
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.kernels.build import compile_all
-from abcd_ns.engine.photometric_kernel import PHOTOMETRIC_KERNELS
-from abcd_ns.engine.rasterizer.chunk_kernels import chunk_kernels
-from abcd_ns.engine.rasterizer.splat_kernels import SPLAT_KERNELS
+from abcd_ns.engine.kernels.photometric import PHOTOMETRIC_KERNELS
+from abcd_ns.engine.render.cpu.chunk_kernels import chunk_kernels
+from abcd_ns.engine.render.splat_kernels import SPLAT_KERNELS
 
 
 def all_kernels(side: int, chunk: int) -> tuple[Kernel, ...]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
-from abcd_ns.engine.run_state import UNLIMITED, RunState
+from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 
 FEW_VIEWS = 3
 """A block that fewer views are worth training on is under-observed."""

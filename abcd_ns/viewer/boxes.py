@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float, UInt32
 from torch import Tensor
 
-from abcd_ns.engine.blocks import BlockTree, Box
+from abcd_ns.engine.space.tree import BlockTree, Box
 
 SCENE_SCALE = 10.0
 """Units of nerfstudio's viewer in a world unit."""

@@ -11,12 +11,12 @@ import torch
 import viser
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
-from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.coordinator import Coordinator
 from abcd_ns.engine.events import Event, LayersDrawn, SweepEnded, VisitBegan, VisitEnded
-from abcd_ns.engine.influence import worth_training
-from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit
-from abcd_ns.engine.scene import BlockScene
+from abcd_ns.engine.space.influence import worth_training
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.types import View
 from abcd_ns.viewer.board import BlockRow, Board, Status, seconds_left, sweep_share
 from abcd_ns.viewer.boxes import boxes_of, bulk

@@ -9,13 +9,13 @@ from enum import Enum
 import torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
-from abcd_ns.engine.blocks import Box
-from abcd_ns.engine.compositing import empty_layer, over
-from abcd_ns.engine.influence import coarser
-from abcd_ns.engine.painter import Painter, PaintSettings, Parts
-from abcd_ns.engine.rasterizer import Raster, Shot, ZWindow
-from abcd_ns.engine.rasterizer.projection import Splats
-from abcd_ns.engine.scene import BlockScene
+from abcd_ns.engine.layers.compositing import empty_layer, over
+from abcd_ns.engine.layers.painter import Painter, PaintSettings, Parts
+from abcd_ns.engine.render import Raster, Shot, ZWindow
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.space.influence import coarser
+from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Gaussians, Layer, View
 
 MOST_PIXELS = 2048 * 2048

@@ -10,7 +10,7 @@ import viser.transforms as vtf
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.blocks import Box
+from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.types import View
 from abcd_ns.viewer.board import Status
 from abcd_ns.viewer.boxes import SCENE_SCALE, center, frame_mesh

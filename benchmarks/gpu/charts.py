@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from abcd_ns.tools.runs.records import decode
-from abcd_ns.tools.runs.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
-from abcd_ns.tools.runs.tables import GIB, NOTHING, print_rows
-from abcd_ns.tools.scale.chart import draw as draw_scale
-from abcd_ns.tools.scale.results import ScaleResults, notes_of, rows_of
+from abcd_ns.lab.runs.records import decode
+from abcd_ns.lab.runs.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
+from abcd_ns.lab.runs.tables import GIB, NOTHING, print_rows
+from abcd_ns.lab.scale.chart import draw as draw_scale
+from abcd_ns.lab.scale.results import ScaleResults, notes_of, rows_of
 
 Record = dict[str, Any]
 SHADES = ("#0072B2", "#56A0D3", "#003A5D")

@@ -19,17 +19,17 @@ from xml.etree import ElementTree
 import torch
 from rich.console import Console
 
-from abcd_ns.engine.rasterizer import make_rasterizer, self_check
-from abcd_ns.plugin.machine import describe_machine, describe_versions
-from abcd_ns.tools.compare.command import without_impossible
-from abcd_ns.tools.compare.protocol import Options, make_plan
-from abcd_ns.tools.doctor.hardware import look_at_hardware
-from abcd_ns.tools.runs.job import Change, Job, Settings, Variant
-from abcd_ns.tools.runs.records import decode, encode, read_json, write_json
-from abcd_ns.tools.runs.run import Run
-from abcd_ns.tools.runs.runner import claim, run_jobs
-from abcd_ns.tools.scale import command as scale
-from abcd_ns.tools.scale.arm import ArmJob
+from abcd_ns.cli.doctor.hardware import look_at_hardware
+from abcd_ns.engine.render import make_rasterizer, self_check
+from abcd_ns.lab.compare.command import without_impossible
+from abcd_ns.lab.compare.protocol import Options, make_plan
+from abcd_ns.lab.runs.job import Change, Job, Settings, Variant
+from abcd_ns.lab.runs.records import decode, encode, read_json, write_json
+from abcd_ns.lab.runs.run import Run
+from abcd_ns.lab.runs.runner import claim, run_jobs
+from abcd_ns.lab.scale import command as scale
+from abcd_ns.lab.scale.arm import ArmJob
+from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
 from benchmarks import visit
 
 ROOT = Path(__file__).resolve().parents[2]

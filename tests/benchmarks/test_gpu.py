@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from abcd_ns.errors import UserError
-from abcd_ns.tools.runs.records import encode, read_json, write_json
+from abcd_ns.lab.runs.records import encode, read_json, write_json
 from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part
 from benchmarks.gpu.charts import draw
 from benchmarks.gpu.parts import count_tests
 from benchmarks.visit import STAGES
+from tests.lab.compare.records import made_up_run
 from tests.reference.colmap_scene import write_scene
-from tests.tools.compare.records import made_up_run
 
 GIB = 2**30
 WHOLE = {

@@ -9,7 +9,7 @@ import os
 import pytest
 import torch
 
-from abcd_ns.engine.rasterizer import Rasterizer, TorchRasterizer, make_rasterizer
+from abcd_ns.engine.render import Rasterizer, TorchRasterizer, make_rasterizer
 
 
 @pytest.fixture(scope="session")

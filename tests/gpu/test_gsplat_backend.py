@@ -8,13 +8,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.compositing import fold, sandwich
-from abcd_ns.engine.intervals import cell_windows
-from abcd_ns.engine.ordering import front_to_back
-from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.rasterizer import Shot, TorchRasterizer, ZWindow
+from abcd_ns.engine.layers.compositing import fold, sandwich
+from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow
+from abcd_ns.engine.space.intervals import cell_windows
+from abcd_ns.engine.space.ordering import front_to_back
+from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
-from tests.engine.rasterizer_scenes import (
+from tests.reference.rasterizer_scenes import (
     as_leaves,
     gradients,
     probe,

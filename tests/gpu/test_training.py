@@ -8,10 +8,11 @@ import math
 import pytest
 import torch
 
-from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Mended, StepTaken, VisitEnded
-from abcd_ns.engine.rasterizer import TorchRasterizer, gsplat_pairs
-from abcd_ns.engine.training_loop import train, train_step
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.cuda import pairs as gsplat_pairs
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
 pytestmark = pytest.mark.gpu

@@ -19,11 +19,11 @@ from typing import Any
 
 import torch
 
-from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Event, VisitEnded
-from abcd_ns.engine.storage import ParameterStore, StoreError, crash_points
-from abcd_ns.engine.training_loop import train_step
+from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train_step
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 
 STEPS = 30

@@ -357,10 +357,10 @@ def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
 @contextmanager
 def lent() -> Iterator[None]:
     """Within, the package's modules call the stand-ins, where they call gsplat's functions by name."""
-    import abcd_ns.engine.rasterizer.gsplat_backend  # noqa: F401 - so that it is among the modules
+    import abcd_ns.engine.render.cuda.backend  # noqa: F401 - so that it is among the modules
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in [m for n, m in sys.modules.items() if n.startswith("abcd_ns.engine.rasterizer")]:
+        for module in [m for n, m in sys.modules.items() if n.startswith("abcd_ns.engine.render")]:
             for name in NAMES:
                 if hasattr(module, name):
                     patch.setattr(module, name, globals()[name])

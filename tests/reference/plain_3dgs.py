@@ -4,12 +4,12 @@ import random
 
 import torch
 
-from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.density import DensityClock, DensityControl
-from abcd_ns.engine.loss import photometric_loss
-from abcd_ns.engine.param_swap import LEARNING_RATES
-from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
-from abcd_ns.engine.schedule import endless_order, exponential_decay, sh_degree_at
+from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.render.loss import photometric_loss
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density.control import DensityClock, DensityControl
+from abcd_ns.engine.train.schedule import endless_order, exponential_decay, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.scenes import Photos
 

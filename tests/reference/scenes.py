@@ -6,18 +6,18 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.blocks import BlockTree
-from abcd_ns.engine.config import TrainingConfig
-from abcd_ns.engine.coordinator import Coordinator
-from abcd_ns.engine.layer_store import LAYER_BYTES
-from abcd_ns.engine.param_swap import nothing_live
-from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.rasterizer import Rasterizer
-from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
-from abcd_ns.engine.run_state import Budget
-from abcd_ns.engine.scaffold import blocks_at_rest
-from abcd_ns.engine.scene import StoredScene
-from abcd_ns.engine.storage import ParameterStore
+from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.layers.layer_store import LAYER_BYTES
+from abcd_ns.engine.render import Rasterizer
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 

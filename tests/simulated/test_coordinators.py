@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from abcd_ns.engine.block_state import MOMENTS
-from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import BlockSplit, VisitEnded
-from abcd_ns.engine.exact import ExactCoordinator
-from abcd_ns.engine.independent import IndependentCoordinator, independent_at_rest
-from abcd_ns.engine.painter import Painter, PaintSettings
-from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer
-from abcd_ns.engine.training_loop import train
+from abcd_ns.engine.gaussians.block_state import MOMENTS
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.render import TorchRasterizer, make_rasterizer
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
+from abcd_ns.peers.exact import ExactCoordinator
+from abcd_ns.peers.independent import IndependentCoordinator, independent_at_rest
 from tests.reference.scenes import make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from gsplat.cuda import _torch_impl, _wrapper
 
-from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer, self_check
-from abcd_ns.engine.rasterizer.gsplat_backend import GsplatRasterizer
-from tests.engine.rasterizer_scenes import as_leaves, random_gaussians, small_view
+from abcd_ns.engine.render import TorchRasterizer, make_rasterizer, self_check
+from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from tests.reference import gsplat_stand_ins as stand_ins
+from tests.reference.rasterizer_scenes import as_leaves, random_gaussians, small_view
 from tests.reference.simulated_device import DEVICE, simulated_device
 
 TILE, COLS, ROWS = 16, 5, 3

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from abcd_ns.engine.density import DensityConfig
-from abcd_ns.engine.layer_store import Kept, LayerStore
-from abcd_ns.engine.rasterizer.projection import Splats
-from abcd_ns.engine.training_loop import train
+from abcd_ns.engine.layers.layer_store import Kept, LayerStore
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import whole_scene
 from tests.reference.simulated_device import DEVICE
 from tests.simulated.test_coordinators import on_device

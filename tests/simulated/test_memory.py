@@ -7,10 +7,10 @@ kernels take inside, and what an allocator cannot use, is not seen here.
 
 import pytest
 
-from abcd_ns.engine.density import DensityConfig
-from abcd_ns.engine.layer_store import LayerStore
-from abcd_ns.engine.memory import DeviceNeeds, levels_of
-from abcd_ns.engine.training_loop import train
+from abcd_ns.engine.layers.layer_store import LayerStore
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.memory import DeviceNeeds, levels_of
+from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import Photos, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
 from tests.simulated.test_coordinators import on_device

@@ -6,10 +6,10 @@ import yaml
 from nerfstudio.utils.eval_utils import eval_load_checkpoint
 
 from abcd_ns import methods
-from abcd_ns.engine.storage import ParameterStore
+from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.types import Crop
 from abcd_ns.viewer.pictures import Choice, Show
-from tests.plugin.test_training import configure, run
+from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HEIGHT, WIDTH, write_scene
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.simulated_device import DEVICE, simulated_device

@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from abcd_ns.engine.density import DensityConfig
 from abcd_ns.engine.events import Mended, StepTaken
-from abcd_ns.engine.param_swap import PARAM_NAMES
-from abcd_ns.engine.rasterizer import TorchRasterizer, make_rasterizer
-from abcd_ns.engine.training_loop import train, train_step
+from abcd_ns.engine.gaussians.param_swap import PARAM_NAMES
+from abcd_ns.engine.render import TorchRasterizer, make_rasterizer
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Crop
 from benchmarks.device import Watch
-from tests.engine.rasterizer_scenes import as_leaves
+from tests.reference.rasterizer_scenes import as_leaves
 from tests.reference.scenes import make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 

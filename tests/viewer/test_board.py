@@ -5,11 +5,11 @@ import math
 import pytest
 
 from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded
-from abcd_ns.engine.run_state import UNLIMITED, ActiveVisit, RunState
-from abcd_ns.engine.schedule import VisitPlan
-from abcd_ns.engine.special_blocks import WHOLE
+from abcd_ns.engine.layers.visit_layers import VisitGeometry
+from abcd_ns.engine.store.special_blocks import WHOLE
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
+from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
-from abcd_ns.engine.visit import VisitGeometry
 from abcd_ns.viewer.board import MOST_POINTS, BlockRow, Board, Status, seconds_left, sweep_share
 from abcd_ns.viewer.words import MOST_ROWS, block_table, clock, headline, memory_table, sweep_line
 

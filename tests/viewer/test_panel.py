@@ -1,4 +1,4 @@
-"""The panel and the training lock; the rest of it is tested on a real run in tests/plugin/test_viewer.py."""
+"""The panel and the training lock; the rest on a real run in tests/nerfstudio/test_viewer.py."""
 
 import threading
 from types import SimpleNamespace

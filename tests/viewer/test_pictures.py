@@ -7,11 +7,11 @@ import pytest
 import torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
-from abcd_ns.engine.compositing import over
-from abcd_ns.engine.painter import Painter, PaintSettings
-from abcd_ns.engine.partition import build_kd
-from abcd_ns.engine.rasterizer.torch_backend import TorchRasterizer
-from abcd_ns.engine.scene import MemoryScene
+from abcd_ns.engine.layers.compositing import over
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.viewer.pictures import (
     FAR,
     MOST_PIXELS,

@@ -7,8 +7,8 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.blocks import Box
-from abcd_ns.engine.partition import build_kd
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.space.tree import Box
 from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, center, clipped, frame_mesh
 from abcd_ns.viewer.scenery import LIFT, first_look, views_that_see
 from tests.reference.scenes import ring_of_views

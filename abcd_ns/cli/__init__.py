@@ -1,0 +1,1 @@
+"""`abcd`: what a user does with a scene, one folder or file a command."""

@@ -1,0 +1,243 @@
+"""`abcd demo`: the main job from end to end, on a scene of its own, through nerfstudio's commands."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from abcd_ns.errors import UserError
+from abcd_ns.lab.compare.pictures import draw_comparison, read_picture
+from abcd_ns.lab.runs.job import evenly
+
+SCENE = {"courts": 2, "views_per_court": 20, "width": 192, "height": 144, "points_per_court": 3000}
+MARKER = "abcd-demo.txt"
+"""Marks a folder that this command made."""
+SHOWN = 3
+"""Held-out views of which pictures are made."""
+
+
+class StepFailed(Exception):
+    """A command that the demo started came to nothing; the message says which and where its output is."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training left behind."""
+
+    config: Path
+    """config.yml, by which nerfstudio's other commands find the run."""
+    seconds: float
+    """Of the whole command."""
+    peak_rss_bytes: int
+
+
+class Steps:
+    """Headers with the time that has passed, and child processes that are waited for."""
+
+    def __init__(self, console: Console, logs: Path) -> None:
+        self._console, self._logs = console, logs
+        self._began = time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """Since the demo began."""
+        return time.monotonic() - self._began
+
+    def begin(self, title: str) -> None:
+        """Print a step's header."""
+        minutes, seconds = divmod(int(self.seconds), 60)
+        self._console.print(f"\n[bold]{minutes}:{seconds:02d}  {title}[/]", highlight=False)
+
+    def run(self, name: str, command: Sequence[str], *, quiet: bool = True) -> int:
+        """Run a command to its end; returns its peak RAM in bytes.
+
+        Args:
+            quiet: its output goes to a log file instead of the terminal.
+
+        Raises:
+            StepFailed: it exited with another code than 0.
+        """
+        typed = ["abcd", *command[3:]] if command[1:2] == ["-m"] else [name, *command[1:]]
+        self._console.print(f"$ {' '.join(typed)}", style="dim", markup=False, soft_wrap=True)
+        log = self._logs / f"{name}.log"
+        with open(log if quiet else os.devnull, "wb") as stream:
+            output = {"stdout": stream, "stderr": subprocess.STDOUT} if quiet else {}
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **output)
+            # wait4 and not wait: it tells what this one child used.
+            _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode != 0:
+            where = f"see {log}" if quiet else "see its output above"
+            raise StepFailed(f"{name} failed with exit code {process.returncode}; {where}.")
+        return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)  # KiB but on macOS
+
+
+def demo(
+    *,
+    out: Path = Path("demo"),
+    seconds: Annotated[float, tyro.conf.arg(metavar="S")] = 120.0,
+    blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 4,
+) -> int:
+    """Make a small scene, train it block by block, score it and export it. Needs no GPU and no data.
+
+    Runs `abcd synth`, `ns-train abcd`, `ns-eval`, `ns-export gaussian-splat` and `abcd report`, as you
+    would.
+
+    Args:
+        out: Folder for everything that is made; absent, empty, or an earlier demo's.
+        seconds: Time for training. The rest takes about a minute on two cores.
+        blocks: Blocks that space is cut into.
+
+    Raises:
+        UserError: `out` holds something else, an option is out of range, or nerfstudio is not installed.
+    """
+    if seconds <= 0:
+        raise UserError(f"--seconds is {seconds}; it must be above 0.")
+    if blocks < 1:
+        raise UserError(f"--blocks is {blocks}; it must be at least 1.")
+    console = Console()
+    _claim(out)
+    logs = out / "logs"
+    logs.mkdir(exist_ok=True)
+    try:
+        _carry_out(Steps(console, logs), out, seconds, blocks, console)
+    except StepFailed as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        return 1
+    return 0
+
+
+def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Console) -> None:
+    scene = out / "scene"
+    steps.begin("1/5  A scene: two walled courts, seen by 40 cameras")
+    flags = [word for name, value in SCENE.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    steps.run("synth", [*_abcd("synth"), str(scene), *flags])
+    steps.begin(f"2/5  Training in {blocks} blocks for {seconds:g} s")
+    trained = _train(steps, out, scene, seconds, blocks)
+    steps.begin("3/5  Held-out views: scores and pictures")
+    scores = _evaluate(steps, out, trained)
+    steps.begin("4/5  Export for other viewers")
+    ply = out / "splat.ply"
+    export = [_tool("ns-export"), "gaussian-splat", "--load-config", str(trained.config)]
+    steps.run("ns-export", [*export, "--output-dir", str(out), "--output-filename", ply.name])
+    pictures = _draw(out)
+    steps.begin("5/5  A report about the run")
+    page = out / "report.html"
+    steps.run("report", [*_abcd("report"), str(trained.config.parent), "--out", str(page)])
+    steps.begin("Done")
+    facts = {
+        "held-out PSNR": f"{scores['psnr']:.2f} dB",
+        "held-out SSIM": f"{scores['ssim']:.3f}",
+        "Gaussians": f"{count_vertices(ply):,}",
+        "peak RAM of training": f"{trained.peak_rss_bytes / 2**30:.2f} GiB",
+        "time": f"{steps.seconds:.0f} s, training {trained.seconds:.0f} s of it",
+        "pictures": "\n".join(map(str, pictures)),
+        "Gaussians for viewers": str(ply),
+        "all about the run": str(page),
+    }
+    _print_facts(facts, console)
+    _print_next(trained.config, console)
+
+
+def _claim(out: Path) -> None:
+    """Make `out` a folder of this command."""
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out} is a file; name a folder.")
+    if out.is_dir() and any(out.iterdir()) and not (out / MARKER).exists():
+        raise UserError(f"--out {out} is not empty and is not of this command; name another folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARKER).write_text("Made by `abcd demo`. Everything here may be deleted.\n", encoding="utf-8")
+
+
+def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) -> Trained:
+    stamp = time.strftime("%Y-%m-%d_%H%M%S")
+    words = ["abcd", "--data", scene.resolve(), "--output-dir", out / "training", "--experiment-name", "demo"]
+    words += ["--timestamp", stamp, "--vis", "tensorboard", "--viewer.quit-on-train-completion", True]
+    words += ["--pipeline.blocks", blocks, "--pipeline.max-seconds", f"{seconds:g}"]
+    # The seconds end the run; evaluations meanwhile would only make the demo longer.
+    words += ["--max-num-iterations", 10**9, "--steps-per-save", 10**9]
+    words += ["--steps-per-eval-image", 0, "--steps-per-eval-all-images", 0]
+    began = time.monotonic()
+    peak = steps.run("ns-train", [_tool("ns-train"), *map(str, words)], quiet=False)
+    config = out / "training" / "demo" / "abcd" / stamp / "config.yml"
+    return Trained(config, time.monotonic() - began, peak)
+
+
+def _evaluate(steps: Steps, out: Path, trained: Trained) -> dict[str, float]:
+    """Mean scores of the held-out views; ns-eval leaves their pictures in `out`/eval."""
+    found = out / "eval" / "results.json"
+    words = ["--load-config", trained.config, "--output-path", found, "--render-output-path", found.parent]
+    steps.run("ns-eval", [_tool("ns-eval"), *map(str, words)])
+    return json.loads(found.read_text(encoding="utf-8"))["results"]
+
+
+def _draw(out: Path) -> list[Path]:
+    """Photo, picture and error of a few held-out views, from ns-eval's photo and picture side by side."""
+    pairs = sorted((out / "eval").glob("eval_img_*.png"))
+    folder = out / "pictures"
+    folder.mkdir(exist_ok=True)
+    paths = []
+    for row in evenly(len(pairs), SHOWN):
+        pair = read_picture(pairs[row])
+        width = pair.shape[1] // 2
+        paths.append(folder / f"view-{row:04d}.png")
+        draw_comparison(pair[:, :width], {"abcd": pair[:, width:]}, f"held-out view {row}", paths[-1])
+    return paths
+
+
+def count_vertices(ply: Path) -> int:
+    """How many Gaussians a .ply file says that it holds.
+
+    Raises:
+        ValueError: its header does not say.
+    """
+    with open(ply, "rb") as file:
+        for line in file:
+            if line.startswith(b"element vertex "):
+                return int(line.split()[2])
+            if line.startswith(b"end_header"):
+                break
+    raise ValueError(f"{ply} has no header of a .ply file with vertices")
+
+
+def _tool(name: str) -> str:
+    """The command of nerfstudio that lies beside this Python."""
+    path = Path(sys.executable).with_name(name)
+    if not path.exists():
+        raise UserError(f"{path} is missing; install nerfstudio into the environment of this command.")
+    return str(path)
+
+
+def _abcd(command: str) -> list[str]:
+    """A command of ours, in the environment of this one."""
+    return [sys.executable, "-m", "abcd_ns.cli.main", command]
+
+
+def _print_facts(facts: dict[str, str], console: Console) -> None:
+    table = Table.grid(padding=(0, 2))
+    for name, value in facts.items():
+        table.add_row(name, value)
+    console.print(table, highlight=False)
+
+
+def _print_next(config: Path, console: Console) -> None:
+    commands = {
+        f"ns-viewer --load-config {config}": "look around in it",
+        f"abcd report {config.parent}": "a page about any run, such as this one's report.html",
+        f"abcd compare --data {config.parents[4] / 'scene'} --seconds 60 --blocks 4 --out comparison": (
+            "hold it against training in one piece"
+        ),
+        "ns-train abcd --data FOLDER": "train on your own photographs (a COLMAP model or transforms.json)",
+    }
+    console.print("\nNext:", highlight=False)
+    for command, what in commands.items():
+        console.print(f"  {command}\n      {what}", markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,85 @@
+"""Which of a stored scene's Gaussians are exported, and where they are."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from abcd_ns.errors import UserError
+
+Box = tuple[float, float, float, float, float, float]
+"""x, y and z of its lower and then of its upper corner."""
+
+
+@dataclass
+class Shown:
+    """The Gaussians of a store that are to be written.
+
+    Args:
+        to: the frame to write them in; None is their own.
+        box: which to keep, in that frame.
+    """
+
+    store: ParameterStore
+    to: Frame | None
+    box: Box | None
+
+    def __post_init__(self) -> None:
+        state = RunState.from_json(self.store.state) if self.store.state else None
+        if state is None or (state.active is not None and state.active.is_whole):
+            raise UserError(
+                f"{self.store.folder}: no block has been trained yet. Wait until the warm-up is over, or use "
+                "`ns-export gaussian-splat` on a checkpoint."
+            )
+        self._tree = BlockTree.from_json(self.store.header["tree"])
+        self.blocks = range(self._tree.num_blocks)
+        self.largest, self.size = 0.0, 0.0
+
+    @cached_property
+    def sh_degree(self) -> int:
+        """Of all its Gaussians."""
+        return Gaussians(**self._load(0, PARAM_NAMES)).sh_degree
+
+    def count(self, block: int) -> int:
+        """How many of the block's Gaussians are to be written."""
+        found = self._load(block, ("means", "opacities"))
+        return int(self._kept(self._placed(found["means"]), found["opacities"]).sum())
+
+    def gaussians(self, block: int) -> Gaussians:
+        """Those Gaussians."""
+        found = Gaussians(**self._load(block, PARAM_NAMES))
+        found = found[self._kept(self._placed(found.means), found.opacities)]
+        if self.to is None or not len(found):
+            return found
+        exact = self.to.points(found.means)
+        self.largest = max(self.largest, float(exact.abs().max()))
+        self.size = max(self.size, float((exact.amax(0) - exact.amin(0)).max()))
+        return self.to.gaussians(found)
+
+    def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
+        """These parameters, the means among them, of the block and of those that wait for its next visit."""
+        found = self.store.load_names(block, names)
+        if INBOX not in self.store.blocks:
+            return found
+        inbox = self.store.load_names(INBOX, names)
+        here = self._tree.assign(inbox["means"]) == block
+        return {name: torch.cat([value, inbox[name][here]]) for name, value in found.items()}
+
+    def _placed(self, means: Tensor) -> Tensor:
+        return means.double() if self.to is None else self.to.points(means)
+
+    def _kept(self, means: Tensor, opacities: Tensor) -> Bool[Tensor, "n"]:
+        kept = torch.sigmoid(opacities[:, 0]) >= MIN_ALPHA
+        if self.box is not None:
+            low, high = means.new_tensor(self.box[:3]), means.new_tensor(self.box[3:])
+            kept &= ((means >= low) & (means < high)).all(dim=1)
+        return kept

@@ -1,0 +1,76 @@
+"""What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do."""
+
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rich.console import Console
+
+from abcd_ns.data.input_errors import one_line
+
+Level = Literal["error", "warning", "note"]
+STYLES: dict[Level, str] = {"error": "bold red", "warning": "yellow", "note": "cyan"}
+"""Of the levels' titles, the most serious first."""
+SHOWN = 20
+"""Findings of one level that are printed; the others are counted."""
+WIDEST = 110
+"""Columns beyond which text is wrapped even where the terminal has more."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing found."""
+
+    level: Level
+    """error: nothing can come of it. warning: it may go wrong. note: good to know."""
+    name: str
+    """By which docs/troubleshooting.md explains it; stable."""
+    what: str
+    """What was found and what follows from it, in one or two sentences."""
+    fix: str = ""
+    """What to do about it; empty where `what` says so, or where there is nothing to be done."""
+
+
+def by_level(findings: Iterable[Finding]) -> list[Finding]:
+    """The most serious first, otherwise in their order."""
+    order = list(STYLES)
+    return sorted(findings, key=lambda finding: order.index(finding.level))
+
+
+def print_findings(findings: Sequence[Finding], console: Console) -> None:
+    """In groups by level. Errors stand in one line each, as `ns-train` has them."""
+    for level, style in STYLES.items():
+        group = [finding for finding in findings if finding.level == level]
+        if not group:
+            continue
+        title = level if len(group) == 1 else f"{level}s ({len(group)})"
+        console.print(f"\n{title}", style=style, highlight=False)
+        for finding in group[:SHOWN]:
+            _print(finding, console)
+        if len(group) > SHOWN:
+            console.print(f"  ... and {len(group) - SHOWN} more ({len(group)} in all).", highlight=False)
+
+
+def _print(finding: Finding, console: Console) -> None:
+    # Names of files may hold newlines, and bytes that no terminal takes.
+    width, what, fix = min(console.width, WIDEST), one_line(finding.what), one_line(finding.fix)
+    if finding.level == "error":
+        lines = [f"  {finding.name}: {what}"]
+    else:
+        lines = _wrap(f"{finding.name}: {what}", width, "  ", "    ")
+    if fix:
+        lines += _wrap(fix, width, "    -> ", "       ")
+    for line in lines:
+        console.print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
+
+
+def _wrap(text: str, width: int, first: str, then: str) -> list[str]:
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=first,
+        subsequent_indent=then,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

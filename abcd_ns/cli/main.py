@@ -1,0 +1,158 @@
+"""The `abcd` command: finds the subcommand asked for, and imports nothing else."""
+
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from abcd_ns import __version__
+from abcd_ns.errors import UserError
+
+# What a shell expects: 2 for wrong usage, 128 + SIGINT for Ctrl-C.
+EXIT_USER_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+
+class Command(NamedTuple):
+    """A subcommand: `target` is the "module:function" that tyro makes a command line of.
+
+    The function may return an exit code; None is 0.
+    """
+
+    name: str
+    target: str
+    help: str
+    hands_on: bool = False
+    """The function takes the words as they are, and reads or hands them on by itself."""
+
+    def load(self) -> Callable[..., int | None]:
+        """Import the function. This is where the seconds go (torch, nerfstudio), so only on use."""
+        module, function = self.target.split(":")
+        return getattr(importlib.import_module(module), function)
+
+
+COMMANDS = (
+    Command("demo", "abcd_ns.cli.demo:demo", "make a small scene, train it block by block, show the result"),
+    Command("poses", "abcd_ns.cli.poses.command:poses", "find camera poses for photos, by pycolmap"),
+    Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training on it"),
+    Command("doctor", "abcd_ns.cli.doctor.command:doctor", "examine this machine and its packages"),
+    Command("synth", "abcd_ns.lab.synth.command:synth", "render a synthetic scene to train on"),
+    Command("train", "abcd_ns.cli.train:train", "ns-train, with options from a TOML file", hands_on=True),
+    Command("plan", "abcd_ns.cli.plan.command:plan", "say what a run will need, before it begins"),
+    Command(
+        "report",
+        "abcd_ns.cli.report.command:report",
+        "show all about a training run on one HTML page",
+    ),
+    Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, whole or in parts"),
+    Command(
+        "compare",
+        "abcd_ns.lab.compare.command:compare",
+        "train ABCD and its peers on one scene and compare",
+    ),
+    Command(
+        "study",
+        "abcd_ns.lab.study.command:study",
+        "vary one thing: blocks, Gaussians, or any options",
+    ),
+    Command("scale", "abcd_ns.lab.scale.command:scale", "memory and time as the scene grows"),
+    Command(
+        "stability",
+        "abcd_ns.lab.stability.command:stability",
+        "make methods fail on small scenes and see what ABCD does",
+    ),
+    Command("completion", "abcd_ns.cli.completion:completion", "complete words of this command in a shell"),
+)
+
+EXAMPLES = (
+    ("abcd demo", "see it work, without a GPU or any data"),
+    ("abcd synth --help", "the options of one command"),
+    ("abcd check --data garden", "see whether your own photographs can be trained on"),
+    ("ns-train abcd --data garden", "train on them"),
+)
+
+
+def help_text(commands: Sequence[Command]) -> str:
+    """The text of `abcd --help`."""
+    width = max(len(name) for name in ("--version", *(c.name for c in commands))) + 2
+    example_width = max(len(example) for example, _ in EXAMPLES) + 2
+    return "\n".join(
+        [
+            "usage: abcd COMMAND [OPTIONS]",
+            "",
+            "Gaussian splatting, one block at a time.",
+            "",
+            "commands:",
+            *(f"  {c.name:<{width}}{c.help}" for c in commands),
+            "",
+            "options:",
+            f"  {'--help':<{width}}show this text; after a command, its options",
+            f"  {'--version':<{width}}show the version",
+            "",
+            "examples:",
+            *(f"  {example:<{example_width}}{what}" for example, what in EXAMPLES),
+        ]
+    )
+
+
+def find_command(name: str, commands: Sequence[Command]) -> Command:
+    """The command called `name`.
+
+    Raises:
+        UserError: there is none; the message offers the nearest name.
+    """
+    by_name = {command.name: command for command in commands}
+    if name in by_name:
+        return by_name[name]
+    close = difflib.get_close_matches(name, by_name, n=1)
+    hint = f"did you mean 'abcd {close[0]}'?" if close else f"there are: {', '.join(by_name)}."
+    raise UserError(f"abcd has no command {name!r}; {hint}")
+
+
+def run_command(command: Command, args: Sequence[str]) -> int:
+    """Run `command` on its own arguments; returns its exit code. Wrong arguments raise SystemExit(2)."""
+    if command.hands_on:
+        return command.load()(list(args))
+    # Here and not above: `abcd --help` has no use for it.
+    import tyro
+
+    return tyro.cli(command.load(), prog=f"abcd {command.name}", args=list(args)) or 0
+
+
+def print_error(message: str) -> None:
+    """Print `message` on stderr, in red where a person reads it (https://no-color.org is respected)."""
+    coloured = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+    print(f"\033[31m{message}\033[0m" if coloured else message, file=sys.stderr)
+
+
+def main(args: Sequence[str] | None = None, commands: Sequence[Command] = COMMANDS) -> int:
+    """Entry point of `abcd`.
+
+    Args:
+        args: the words after `abcd`; None takes them from the command line.
+        commands: the subcommands to offer.
+
+    Returns:
+        The exit code: 0, what the command returned, 2 for an error of the user's, 130 after Ctrl-C.
+    """
+    args = sys.argv[1:] if args is None else args
+    first = args[0] if args else "--help"
+    try:
+        if first in ("--help", "-h"):
+            print(help_text(commands))
+            return 0
+        if first == "--version":
+            print(f"abcd {__version__}")
+            return 0
+        return run_command(find_command(first, commands), args[1:])
+    except UserError as error:
+        print_error(f"error: {error}")
+        return EXIT_USER_ERROR
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

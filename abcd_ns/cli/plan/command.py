@@ -1,0 +1,255 @@
+"""`abcd plan`: what a run on these photos will need, and what would not fit."""
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Annotated, TypeVar
+
+import psutil
+import torch
+import tyro
+from jaxtyping import Float, UInt8
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from abcd_ns import methods
+from abcd_ns.cli.plan.forecast import (
+    Forecast,
+    Share,
+    device_shares,
+    disk_shares,
+    ram_shares,
+    time_steps,
+    views_of_blocks,
+)
+from abcd_ns.data.photos import default_budget
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.space.near_plane import near_plane
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.train.memory import DeviceNeeds, levels_of
+from abcd_ns.engine.train.schedule import views_per_step
+from abcd_ns.engine.types import View
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.config import AbcdDataManagerConfig
+from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.room import GB, Demand, Room, device_budget, find_room
+from abcd_ns.nerfstudio.views import views_of
+
+R = TypeVar("R")
+FEW_VIEWS = 3
+"""Blocks that fewer views see are said to be under-observed."""
+
+
+@tyro.conf.configure(tyro.conf.FlagCreatePairsOff)
+def plan(
+    data: Annotated[Path, tyro.conf.arg(metavar="PATH")],
+    downscale: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0,
+    max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000,
+) -> int:
+    """Say what a run on these photos will need, and what would not fit; trains nothing, writes nothing.
+
+    abcd plan --data garden
+
+    abcd plan --data garden --device-budget-gb 6
+
+    Args:
+        data: the scene, as for `ns-train abcd --data`.
+        downscale: divides the photos' width and height; left out, no side is over 1600 px, as in training.
+        blocks: number of blocks; 0 takes as few as the device's budget allows.
+        device_budget_gb: memory of the device that training may take; 0 takes what is free.
+        max_gaussians: limit on Gaussians in the whole scene; 0 is none, and five for each point are expected.
+        steps: of the run.
+
+    Returns:
+        0; 1 if something would not fit.
+
+    Raises:
+        UserError: the data cannot be used, or an option is out of range.
+    """
+    for option, value in (("--blocks", blocks), ("--max-gaussians", max_gaussians)):
+        if value < 0:
+            raise UserError(f"{option} is {value}; it must be 0 or more.")
+    for option, value in (("--downscale", downscale), ("--steps", steps)):
+        if value is not None and value < 1:
+            raise UserError(f"{option} is {value}; it must be at least 1.")
+    console = Console()
+    options = (blocks, device_budget_gb, max_gaussians, steps)
+    found = forecast(read(data, downscale, console), Wanted(*options), console)
+    print_forecast(found, console)
+    return 1 if found.warnings else 0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The options of `plan`."""
+
+    blocks: int = 0
+    device_budget_gb: float = 0.0
+    max_gaussians: int = 0
+    steps: int = 30_000
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What there is to train on."""
+
+    points: Float[Tensor, "n 3"]
+    colors: UInt8[Tensor, "n 3"]
+    views: list[View]
+    factor: int = 1
+    """By which the photos were reduced."""
+
+
+def read(data: Path, downscale: int | None, console: Console) -> Capture:
+    """The training views and the points, as training has them; photos are looked at, not decoded.
+
+    Raises:
+        InputError: training would refuse them.
+    """
+    parser = AbcdDataParserConfig(downscale_factor=downscale)
+    config = AbcdDataManagerConfig(data=data, dataparser=parser)
+
+    def work() -> Capture:
+        manager = config.setup(device="cpu", test_mode="val")
+        dataset = manager.train_dataset
+        points = dataset.metadata["points3D_xyz"].float()
+        views = views_of(dataset.cameras)
+        near = near_plane(points, views)
+        colors = dataset.metadata["points3D_rgb"]
+        return Capture(points, colors, [replace(v, near=near) for v in views], manager.dataparser.factor)
+
+    return _said(console, "Reading the capture", work)
+
+
+def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
+    """Cut the points into blocks, look who sees them, and time a step.
+
+    Raises:
+        UserError: the device's budget has no room for any block.
+    """
+    points, views = capture.points, capture.views
+    training = methods.abcd.config.pipeline.training
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    pixels = max(view.full.pixels for view in views)
+    most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
+    demand = Demand(pixels, len(points), training, most=most, factor=capture.factor, on_cpu=on_cpu)
+    room = find_room(device_budget(wanted.device_budget_gb, device), demand)
+    room = replace(room, blocks=wanted.blocks or room.blocks)
+    training = replace(training, **room.options)
+    tree = build_kd(points, room.blocks)
+    owner = tree.assign(points)
+    seen = _said(console, "Looking which view sees which block", lambda: views_of_blocks(tree, points, views))
+    batch = views_per_step(training.batch, room.blocks, training.batch_limit)
+    options = (training.sh_degree, training.crop_pixels, levels_of(room.blocks), not on_cpu)
+    needs = DeviceNeeds(pixels, batch, *options)
+    fullest = owner == owner.bincount(minlength=room.blocks).argmax()
+    gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
+    spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
+    seconds = _said(console, "Timing a step", lambda: time_steps(gaussians, spread, training, batch))
+    shares = {
+        "device": device_shares(room, needs),
+        "ram": ram_shares(room, needs, sum(3 * view.full.pixels for view in views), default_budget()),
+        "disk": disk_shares(room, needs),
+    }
+    return Forecast(
+        room=room,
+        points=len(points),
+        batch=batch,
+        views_of_block=seen,
+        points_of_block=tuple(owner.bincount(minlength=room.blocks).tolist()),
+        **shares,
+        steps=wanted.steps,
+        seconds_per_step=seconds,
+        warnings=tuple(warnings_of(room, seen, **shares)),
+    )
+
+
+def warnings_of(
+    room: Room,
+    seen: tuple[int, ...],
+    device: tuple[Share, ...],
+    ram: tuple[Share, ...],
+    disk: tuple[Share, ...],
+) -> list[str]:
+    """What would not fit, each with what to do about it."""
+    lines = []
+    if (needed := _total(device)) > room.budget:
+        lines.append(
+            f"{needed / GB:.1f} GB on the device, but {room.budget / GB:.1f} GB may be taken: leave --blocks "
+            "out, or give more of them."
+        )
+    if (needed := _total(ram)) > (free := psutil.virtual_memory().available):
+        lines.append(
+            f"{needed / GB:.1f} GB of RAM, but {free / GB:.1f} GB are free: limit the scene by "
+            "--max-gaussians, or free memory."
+        )
+    if (needed := _total(disk)) > (free := shutil.disk_usage(Path.cwd()).free):
+        lines.append(
+            f"{needed / GB:.1f} GB of disk, but {free / GB:.1f} GB are free in this folder: use `ns-train "
+            "--output-dir` on another disk."
+        )
+    if few := sum(count < FEW_VIEWS for count in seen):
+        lines.append(
+            f"{few} of {len(seen)} blocks are seen by fewer than {FEW_VIEWS} views: use fewer blocks."
+        )
+    return lines
+
+
+def print_forecast(found: Forecast, console: Console) -> None:
+    """Tables for people."""
+    room = found.room
+    console.print(f"[bold]{room.in_words()}[/]", highlight=False)
+    if room.blocks_at_the_end > room.blocks:
+        console.print(
+            f"In the end {room.blocks_at_the_end} blocks, if {room.gaussians:,} Gaussians come of it.",
+            highlight=False,
+        )
+    if room.blocks > 1:
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+        for title in ("by block", "least", "median", "most"):
+            table.add_column(title, justify="left" if title == "by block" else "right")
+        for what, values in (("points", found.points_of_block), ("views that see it", found.views_of_block)):
+            table.add_row(what, f"{min(values):,}", f"{median(values):,.0f}", f"{max(values):,}")
+        console.print(table)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("memory and disk, at most")
+    table.add_column("GB", justify="right")
+    for title, shares in (("device", found.device), ("RAM", found.ram), ("disk", found.disk)):
+        table.add_row(f"[bold]{title}[/]", f"[bold]{_total(shares) / GB:.2f}[/]")
+        for share in shares:
+            table.add_row(f"  {share.what}", f"{share.nbytes / GB:.2f}")
+    console.print(table)
+    low, high = found.hours
+    console.print(
+        f"{found.steps:,} steps of {found.batch} view{'s' * (found.batch > 1)}: {_hours(low)} with as many "
+        f"Gaussians as points, {_hours(high)} with {room.gaussians:,}; a step on the initial points took "
+        f"{found.seconds_per_step:.3f} s.",
+        highlight=False,
+    )
+    for line in found.warnings:
+        console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
+
+
+def _said(console: Console, what: str, work: Callable[[], R]) -> R:
+    """Do something that may take seconds, and say what."""
+    began = time.monotonic()
+    with console.status(what):
+        done = work()
+    console.print(f"{what}: {time.monotonic() - began:.1f} s", style="dim", highlight=False)
+    return done
+
+
+def _total(shares: tuple[Share, ...]) -> int:
+    return sum(share.nbytes for share in shares)
+
+
+def _hours(hours: float) -> str:
+    return f"{hours * 60:.0f} min" if hours < 2 else f"{hours:.0f} h"

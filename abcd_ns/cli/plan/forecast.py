@@ -1,0 +1,136 @@
+"""What a run will need: blocks and the views that see them, memory, disk and time."""
+
+import time
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from abcd_ns.engine.render import Shot, make_rasterizer
+from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.train.batch import part_to_draw
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.memory import DeviceNeeds
+from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.nerfstudio.room import Room
+
+STATES = 3
+"""Parameters and two moments are kept of each Gaussian."""
+GENERATIONS = 2
+"""Of the store on disk: the one in use, and the one that the last checkpoint pins."""
+FROZEN_BYTES = 2 << 30
+"""RAM for blocks that were read, at most."""
+TIMED_STEPS = 3
+LAYER_SHARE = 0.35
+"""Time for layers by the time of steps: layers took 22 to 27% of the runs in docs/results, on a CPU."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """Something that takes room."""
+
+    what: str
+    nbytes: int
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """All that `abcd plan` prints."""
+
+    room: Room
+    points: int
+    batch: int
+    views_of_block: tuple[int, ...]
+    """By block, the training views in which one of its points is."""
+    points_of_block: tuple[int, ...]
+    device: tuple[Share, ...]
+    ram: tuple[Share, ...]
+    disk: tuple[Share, ...]
+    steps: int
+    seconds_per_step: float
+    """Measured with the initial points."""
+    warnings: tuple[str, ...]
+
+    @property
+    def hours(self) -> tuple[float, float]:
+        """Of the whole run: with as many Gaussians as points, and with as many as are expected."""
+        layers = 1 + LAYER_SHARE * (self.room.blocks_at_the_end > 1)
+        low = self.steps * self.seconds_per_step * layers / 3600
+        return low, low * max(self.room.gaussians / max(self.points, 1), 1.0)
+
+
+def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple[int, ...]:
+    """By block, how many views have one of its points in the picture.
+
+    Args:
+        points: [n, 3], world space.
+    """
+    owner, counts = tree.assign(points), torch.zeros(tree.num_blocks, dtype=torch.int64)
+    for view in views:
+        at = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        pixel = at[:, :2] / at[:, 2:] * view.K.diagonal()[:2] + view.K[:2, 2]
+        size = torch.tensor([view.width, view.height])
+        inside = (at[:, 2] > view.near) & ((pixel >= 0) & (pixel < size)).all(dim=1)
+        counts[owner[inside].unique()] += 1
+    return tuple(counts.tolist())
+
+
+def device_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
+    """What a visit to a block of the expected size takes on the device."""
+    limit = room.sole if room.blocks == 1 else room.limit
+    largest = min(-(-room.gaussians // room.blocks), limit)
+    trained = largest * needs.gaussian_bytes
+    return (
+        Share(f"a block of {largest:,} Gaussians in training", trained),
+        Share("a step's pictures, or layers while they are drawn", needs.fixed_bytes),
+        Share("layers that are kept", needs.layer_bytes(room.budget)),
+        Share("photos that are kept", needs.photo_bytes(room.budget)),
+    )
+
+
+def ram_shares(room: Room, needs: DeviceNeeds, photo_bytes: int, photo_budget: int) -> tuple[Share, ...]:
+    """What the rest takes in RAM, beside Python and torch."""
+    scene = room.gaussians * needs.parameter_bytes
+    return (
+        Share("decoded photos", min(photo_bytes, photo_budget)),
+        Share("frozen blocks", min(scene, FROZEN_BYTES)),
+        Share("the whole scene, while a checkpoint is written", scene),
+    )
+
+
+def disk_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
+    """What a run leaves and holds on disk."""
+    scene = room.gaussians * needs.parameter_bytes
+    return (
+        Share("blocks with their optimiser's state", GENERATIONS * STATES * scene),
+        Share("checkpoint", scene),
+    )
+
+
+def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig, batch: int) -> float:
+    """Seconds that a step on these Gaussians takes, forward and backward; the best of a few."""
+    rasterizer = make_rasterizer("auto", gaussians.device)
+    rasterizer.warm_up()
+    leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in gaussians.items()})
+    best = float("inf")
+    for step in range(TIMED_STEPS):
+        began = time.perf_counter()
+        shots = [
+            Shot(view, part_to_draw(training, view.full, step, place))
+            for place, view in enumerate(views[:batch])
+        ]
+        rasters = rasterizer.draw(leaves, shots, sh_degree=training.sh_degree)
+        losses = [
+            photometric_loss(
+                raster.color,
+                torch.zeros_like(raster.color),
+                full_pixels=shot.view.full.pixels,
+                full_windows=ssim_windows(shot.view.height, shot.view.width),
+                ssim_lambda=training.ssim_lambda,
+            )
+            for shot, raster in zip(shots, rasters, strict=True)
+        ]
+        torch.stack(losses).mean().backward()
+        best = min(best, time.perf_counter() - began)
+    return best

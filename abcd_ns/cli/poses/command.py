@@ -1,0 +1,152 @@
+"""`abcd poses`: from a folder of photos to a data set that can be trained on."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import pycolmap
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
+
+from abcd_ns.cli.poses.mapping import MappingFailed, Model, Order, Progress, Stage, Task, find_poses
+from abcd_ns.data.input_errors import Problems
+from abcd_ns.data.picture_files import SUFFIXES, check_complete, read_header
+from abcd_ns.errors import UserError
+
+WORK = "poses.part"
+"""The folder in which models are made; a command that is stopped leaves it, the next one removes it."""
+FEWEST = 3
+"""Photos."""
+MANY = 400
+"""With more photos, comparing each with each takes hours."""
+NAMED = 5
+"""Photos without a pose that are named."""
+WORDS = {
+    Stage.FEATURES: "looking for features",
+    Stage.MATCHES: "comparing photos",
+    Stage.POSES: "finding poses",
+}
+
+
+def poses(
+    data: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    order: Order = "any",
+    lens: str = "OPENCV",
+    several_lenses: bool = False,
+    seed: int = 0,
+) -> int:
+    """Find where photos were taken, and points of the scene: what training begins with.
+
+    abcd poses garden
+
+    The photos are in DATA/images. Writes a COLMAP model to DATA/sparse/0, by pycolmap; then
+    `ns-train abcd --data DATA` trains. Photos should overlap by two thirds, be sharp, and show nothing that
+    moves. On a CPU 50 photos take minutes.
+
+    Args:
+        data: Folder of the scene.
+        order: "any" compares each photo with each; "video" with those that follow by name, for many photos.
+        lens: COLMAP's camera model. OPENCV suits phones and cameras, OPENCV_FISHEYE fisheyes, PINHOLE photos
+            without distortion.
+        several_lenses: The photos are of several lenses, or zoomed.
+        seed: Of pycolmap's random choices.
+
+    Returns:
+        0; 1 if fewer than half of the photos have a pose.
+
+    Raises:
+        UserError: there are no photos, a model is there already, or the photos do not fit together.
+    """
+    photos, names = _photos(data)
+    if (data / "sparse").exists():
+        raise UserError(f"{data / 'sparse'} exists already; move it away to find poses anew.")
+    _check_lens(lens)
+    console = Console()
+    if order == "any" and len(names) > MANY:
+        console.print(f"{len(names)} photos: comparing each with each takes long; is it --order video?")
+    work = data / WORK
+    try:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir()
+        task = Task(photos, names, work, lens, not several_lenses, order, seed)
+        model = _with_bars(task, console)
+        if model is None:
+            raise UserError(
+                f"No two photos in {photos} fit together. They need to overlap, and to be taken from "
+                "different places."
+            )
+        (data / "sparse").mkdir()
+        os.replace(model.folder, data / "sparse" / "0")
+    except OSError as error:
+        raise UserError(f"{data} cannot be written to: {error.strerror}.") from None
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return _report(data, names, model, console)
+
+
+def _photos(data: Path) -> tuple[Path, tuple[str, ...]]:
+    """The folder of photos, and their names in it, sorted."""
+    folder = data / "images"
+    if not folder.is_dir():
+        raise UserError(f"{folder} does not exist; put the photos there.")
+    found = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+    if len(found) < FEWEST:
+        raise UserError(f"{folder} has {len(found)} photos; at least {FEWEST} are needed, better 30.")
+    problems = Problems()
+    for path in found:
+        with problems.collect():
+            check_complete(path, read_header(path))
+    problems.raise_if_any()
+    return folder, tuple(str(path.relative_to(folder)) for path in found)
+
+
+def _check_lens(lens: str) -> None:
+    if lens not in pycolmap.CameraModelId.__members__ or lens == "INVALID":
+        known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+        raise UserError(f"--lens {lens} is no camera model of COLMAP's: {known}.")
+
+
+def _with_bars(task: Task, console: Console) -> Model | None:
+    columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn())
+    with Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bars:
+        shown = {stage: bars.add_task(words, total=None, start=False) for stage, words in WORDS.items()}
+        photos = len(task.names)
+        totals = {Stage.FEATURES: photos, Stage.MATCHES: task.pairs, Stage.POSES: photos}
+
+        def show(progress: Progress) -> None:
+            for stage in Stage:
+                if stage < progress.stage:  # it may have ended between two looks
+                    bars.update(shown[stage], total=totals[stage], completed=totals[stage])
+            bar = shown[progress.stage]
+            bars.start_task(bar)
+            bars.update(bar, total=progress.total, completed=progress.done)
+
+        try:
+            found = find_poses(task, show)
+        except MappingFailed as error:
+            raise UserError(f"pycolmap could not find poses: {error}.") from None
+        bars.update(shown[Stage.POSES], completed=len(found.posed) if found else 0)
+        return found
+
+
+def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) -> int:
+    left_out = sorted(set(names) - set(model.posed))
+    lines = [
+        f"{len(model.posed)} of {len(names)} photos have a pose, {model.points:,} points, mean error "
+        f"{model.error:.2f} px: {data / 'sparse' / '0'}"
+    ]
+    if left_out:
+        named = ", ".join(left_out[:NAMED]) + (", ..." if len(left_out) > NAMED else "")
+        lines.append(f"Without a pose, and not used: {named}. They show too little of what others show.")
+    few = 2 * len(model.posed) < len(names)
+    if few:
+        lines.append("That is fewer than half. Take photos between those that do not fit, or try --lens.")
+    lines.append(f"Next: ns-train abcd --data {data}")
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return int(few)

@@ -1,0 +1,66 @@
+"""The blocks of a run: how large they are, how often they were trained, and how well."""
+
+from dataclasses import dataclass
+
+from abcd_ns.cli.report.run_folder import RunFolder
+from abcd_ns.cli.report.story import Story
+from abcd_ns.engine.train.run_state import RunState
+
+
+@dataclass(frozen=True)
+class Block:
+    """One row of the table of blocks."""
+
+    number: int
+    """From 1, as the progress line counts."""
+    gaussians: int | None
+    """None where there is no checkpoint."""
+    views: int | None
+    """That it is trained on; None where it is not known."""
+    visits: int
+    """That have ended."""
+    seconds: float
+    """Spent on its visits."""
+    layer_seconds: float
+    psnrs: tuple[float, ...]
+    """Of its visits, on training crops, dB."""
+    state: str
+
+
+def describe_blocks(run: RunFolder) -> list[Block]:
+    """All blocks, by number."""
+    counts = None
+    if run.checkpoint is not None:
+        tree = run.checkpoint.tree
+        counts = tree.assign(run.checkpoint.means).bincount(minlength=tree.num_blocks).tolist()
+    blocks = run.story.blocks if counts is None else len(counts)
+    return [_describe(run, block, None if counts is None else counts[block]) for block in range(blocks)]
+
+
+def _describe(run: RunFolder, block: int, gaussians: int | None) -> Block:
+    visits = run.story.of_block(block)
+    known = run.state.views if run.state is not None else {}
+    return Block(
+        number=block + 1,
+        gaussians=gaussians,
+        views=known.get(block),
+        visits=sum(visit.done for visit in visits),
+        seconds=sum(visit.seconds for visit in visits),
+        layer_seconds=sum(visit.layer_seconds for visit in visits),
+        psnrs=tuple(visit.psnr for visit in visits if visit.psnr is not None),
+        state=_state(run.story, run.state, block, gaussians),
+    )
+
+
+def _state(story: Story, state: RunState | None, block: int, gaussians: int | None) -> str:
+    if not story.visits:
+        return "trained in every step"
+    if state is not None and state.active is not None and state.active.geometry.block == block:
+        return "in training when saved"
+    if gaussians == 0:
+        return "empty"
+    if any(visit.done for visit in story.of_block(block)):
+        return "trained"
+    if state is not None and state.views.get(block) == 0:
+        return "no view shows it"
+    return "in the warm-up only" if any(visit.block is None for visit in story.visits) else "not yet visited"

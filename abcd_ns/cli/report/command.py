@@ -1,0 +1,109 @@
+"""`abcd report`: one training run as one HTML page that needs nothing else."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from abcd_ns import __version__
+from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
+from abcd_ns.cli.report.page import GENERATOR, render_page
+from abcd_ns.cli.report.plan import Plan, make_plan
+from abcd_ns.cli.report.run_folder import RunFolder, find_run, load_pipeline, open_run
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.checks import check_ranges
+from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+
+PAGE_FILE = "report.html"
+
+
+def report(
+    run: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None,
+    pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 3,
+) -> int:
+    """Write a page about a training run: quality, visits, memory, held-out views, blocks, settings.
+
+    The page is one file that needs no network and no other file. Held-out views are drawn anew from the
+    newest checkpoint; where the photos are gone, the page does without them.
+
+    Args:
+        run: A run's folder, outputs/SCENE/METHOD/TIME, as `ns-train abcd` leaves it.
+        out: The page. Default: report.html in the run's folder.
+        pictures: Held-out views to show, from the best to the worst.
+
+    Raises:
+        UserError: `run` is no run with a log, something in it is damaged, or `out` is another file.
+    """
+    check_ranges({"pictures": pictures})
+    folder = find_run(run)
+    out = folder / PAGE_FILE if out is None else out
+    _check_page(out)
+    console, found = Console(), open_run(folder)
+    pipeline, notes = _load(found)
+    held_out = None
+    if pipeline is not None:
+        held_out, more = _look(pipeline, pictures, console)
+        notes += more
+    page = render_page(found, held_out, _plan(found, pipeline), notes)
+    try:
+        # A file's name may have bytes that are no text.
+        out.write_bytes(page.encode("utf-8", "backslashreplace"))
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
+    for note in notes:
+        console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    size = f"{out.stat().st_size / 2**20:.1f} MiB"
+    console.print(f"{out} ({size})", markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def _check_page(out: Path) -> None:
+    """Whether the page may be written there: over nothing, or an earlier page of this command."""
+    if not out.parent.is_dir():
+        raise UserError(f"{out.parent} does not exist; give an existing folder.")
+    if out.is_dir():
+        raise UserError(f"--out {out} is a folder; name a file.")
+    if out.exists():
+        with open(out, "rb") as file:
+            if f'content="{GENERATOR} '.encode() not in file.read(2048):
+                raise UserError(f"--out {out} is no page of this command; name another file.")
+
+
+def _load(run: RunFolder) -> tuple[AbcdPipeline | None, list[str]]:
+    """The trained model, or None and why there is none."""
+    notes, version = [], run.settings.versions.abcd_ns
+    if version != __version__:
+        notes.append(f"The run is of abcd_ns {version}; settings are compared with those of {__version__}.")
+    if run.checkpoint is None:
+        return None, [*notes, "There is no checkpoint yet: held-out views and blocks could not be looked at."]
+    if run.checkpoint.step < run.story.step:
+        notes.append(
+            f"Pictures and blocks are those of the checkpoint at step {run.checkpoint.step:,}; the log "
+            f"goes on to step {run.story.step:,}."
+        )
+    try:
+        return load_pipeline(run, run.checkpoint), notes
+    except UserError as error:
+        return None, [*notes, f"Held-out views could not be drawn. {error}"]
+
+
+def _look(pipeline: AbcdPipeline, pictures: int, console: Console) -> tuple[HeldOut | None, list[str]]:
+    """The held-out views, or None and why not: photos may go missing until they are read."""
+    try:
+        return look_at_held_out(pipeline, pictures, console), []
+    except UserError as error:
+        return None, [f"Held-out views could not be drawn. {error}"]
+
+
+def _plan(run: RunFolder, pipeline: AbcdPipeline | None) -> Plan | None:
+    if run.checkpoint is None:
+        return None
+    cameras = []
+    if pipeline is not None:
+        data = pipeline.datamanager
+        cameras = [data.train_dataset.cameras, data.eval_dataset.cameras]
+    return make_plan(run.checkpoint.tree, run.checkpoint.means, cameras)

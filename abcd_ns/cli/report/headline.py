@@ -1,0 +1,83 @@
+"""What a run came to, in a few numbers."""
+
+from dataclasses import dataclass
+from datetime import timedelta
+
+from abcd_ns.cli.report.held_out import HeldOut
+from abcd_ns.cli.report.run_folder import RunFolder
+from abcd_ns.cli.report.story import Story
+from abcd_ns.lab.runs.tables import GIB, NOTHING
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A number of the headline."""
+
+    name: str
+    value: str
+    unit: str = ""
+    more: str = ""
+
+
+def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
+    """What a run came to, most important first."""
+    story, limit = run.story, run.story.trainings[-1].limit
+    visits, sweeps = len(story.visits), len(story.sweeps)
+    rounds = f"{_count(visits, 'visit')}, {_count(sweeps, 'full sweep')}" if story.blocks > 1 else ""
+    share = story.layer_seconds / story.seconds if story.seconds else 0.0
+    return [
+        *_quality(story, held_out),
+        Fact("Gaussians", f"{story.gaussians:,}", more="" if limit is None else f"limit {limit:,}"),
+        Fact("blocks", f"{story.blocks:,}", more=rounds if visits else ""),
+        Fact("steps", f"{story.step:,}"),
+        Fact(
+            "training time",
+            _clock(story.seconds),
+            more=f"{share:.0%} for layers" if story.layer_seconds else "",
+        ),
+        *_memory(run),
+    ]
+
+
+def _quality(story: Story, held_out: HeldOut | None) -> list[Fact]:
+    composited = held_out is not None and story.blocks > 1
+    found = held_out and held_out.mean("psnr_merged"), held_out and held_out.mean("ssim_merged")
+    if held_out is None and story.held_out:
+        found = story.held_out[-1].psnr, story.held_out[-1].ssim
+    facts = []
+    for name, field, unit, digits, value in (
+        ("held-out PSNR", "psnr", "dB", 2, found[0]),
+        ("held-out SSIM", "ssim", "", 3, found[1]),
+    ):
+        also = held_out.mean(field) if composited else None
+        more = "" if also is None else f"composited {also:.{digits}f}"
+        facts.append(Fact(name, NOTHING if value is None else f"{value:.{digits}f}", unit, more))
+    if composited:
+        facts.append(Fact("ordering gap", *_number_and_rest(held_out.gap)))
+    return facts
+
+
+def _number_and_rest(gap: str) -> tuple[str, str, str]:
+    """Value, unit and remark of an ordering gap, or of the reason why there is none."""
+    number, _, unit = gap.partition(" ")
+    return (number, unit, "merged against composited") if unit == "dB" else (NOTHING, "", gap)
+
+
+def _memory(run: RunFolder) -> list[Fact]:
+    story, machine = run.story, run.settings.machine
+    ram = max((line.rss_bytes for line in story.samples), default=0)
+    device = max((line.device_bytes or 0 for line in story.samples), default=0)
+    if story.end is not None:
+        ram, device = story.end.peak_rss_bytes, story.end.peak_device_bytes or 0
+    facts = [Fact("peak RAM", f"{ram / GIB:.2f}", "GiB", f"of {machine.ram_bytes / GIB:.0f} GiB")]
+    if machine.gpu is not None:
+        facts.append(Fact("peak GPU memory", f"{device / GIB:.2f}", "GiB", machine.gpu))
+    return facts
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}" + ("" if number == 1 else "s")
+
+
+def _clock(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < 100 else str(timedelta(seconds=int(seconds)))

@@ -1,0 +1,204 @@
+"""The report's page: what is known of a run, put into page.html."""
+
+import base64
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from abcd_ns import __version__
+from abcd_ns.cli.report import charts
+from abcd_ns.cli.report.blocks import Block, describe_blocks
+from abcd_ns.cli.report.headline import headline
+from abcd_ns.cli.report.held_out import HeldOut, Shown
+from abcd_ns.cli.report.options import as_text, changed_options, training_command
+from abcd_ns.cli.report.plan import Plan, draw_plan
+from abcd_ns.cli.report.run_folder import RunFolder
+from abcd_ns.cli.report.story import Story
+from abcd_ns.cli.report.svg import inline_svg, theme_css
+from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN
+from abcd_ns.lab.runs.tables import NOTHING, about_machine
+from abcd_ns.nerfstudio.machine import Versions, without_home
+
+GENERATOR = "abcd report"
+"""Begins the page's generator, by which a page of ours is known."""
+HERE = Path(__file__).parent
+SPARK_WIDTH, SPARK_HEIGHT, SPARK_EDGE = 112, 22, 3
+SPARK_DB = 1.0
+"""The height of a sparkline stands for at least so much, that noise may look small."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart with its caption."""
+
+    title: str
+    text: str
+    svg: Markup
+
+
+def render_page(run: RunFolder, held_out: HeldOut | None, plan: Plan | None, notes: Sequence[str]) -> str:
+    """The whole page. Every text in it is escaped by the template; its script is the only one that may run.
+
+    Args:
+        held_out: None where the held-out views could not be drawn.
+        plan: None where there is no checkpoint.
+        notes: what the reader must know before all else.
+    """
+    settings, story = run.settings, run.story
+    script = (HERE / "page.js").read_text(encoding="utf-8")
+    page = Environment(
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined
+    ).get_template("page.html")
+    return page.render(
+        generator=f"{GENERATOR} {__version__}",
+        script=Markup(script),
+        script_hash=_csp_hash(script),
+        css=Markup((HERE / "page.css").read_text(encoding="utf-8")),
+        dark_charts=Markup(theme_css()),
+        scene=settings.scene,
+        method=settings.method,
+        begun=f"{datetime.fromisoformat(settings.begun):%Y-%m-%d %H:%M} UTC",
+        unfinished=_unfinished(story),
+        headline=headline(run, held_out),
+        notes=[without_home(note) for note in notes],
+        charts=_charts(run, held_out),
+        views=[] if held_out is None else [_view(shown) for shown in held_out.shown],
+        view_count=0 if held_out is None else len(held_out.scores),
+        error_colors=", ".join(to_hex(matplotlib.colormaps[ERROR_COLORS](k / 8)) for k in range(9)),
+        error_limit=f"{100 / ERROR_GAIN:g}%",
+        plans=_plans(plan),
+        blocks=[_row(block) for block in describe_blocks(run)],
+        changed=changed_options(settings),
+        options=[(name, as_text(value)) for name, value in sorted(settings.options.items())],
+        command=without_home(training_command(settings)),
+        machine=about_machine(settings.machine),
+        versions=_versions(settings.versions),
+    )
+
+
+def _csp_hash(script: str) -> str:
+    """As a Content-Security-Policy names the one script that may run."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _versions(versions: Versions) -> list[tuple[str, str]]:
+    commit, plus, changes = (versions.commit or NOTHING).partition("+")
+    known = {**vars(versions), "commit": commit[:12] + plus + changes}
+    return [(name, value or NOTHING) for name, value in known.items()]
+
+
+def _unfinished(story: Story) -> list[str]:
+    resumed = [f"resumed at step {line.step:,}" for line in story.trainings if line.step > 0]
+    return resumed if story.end is not None else [*resumed, "not ended: still running, or broken off"]
+
+
+# -- charts ------------------------------------------------------------------------------------------
+
+
+def _charts(run: RunFolder, held_out: HeldOut | None) -> list[Chart]:
+    story, method = run.story, run.settings.method
+    psnr = None if held_out is None else held_out.mean("psnr_merged")
+    measured = None if psnr is None or run.checkpoint is None else (run.checkpoint.step, psnr)
+    drawn = (
+        (
+            "quality",
+            "Quality",
+            "PSNR of the held-out views, and of the crops that were trained on.",
+            charts.draw_quality(story, measured, method),
+        ),
+        (
+            "visits",
+            "Visits",
+            "Which block was trained when; each visit begins with drawing its layers. Dotted: a sweep ends.",
+            charts.draw_visits(story),
+        ),
+        ("gaussians", "Gaussians", "In the whole scene.", charts.draw_gaussians(story)),
+        (
+            "block-quality",
+            "Quality by block",
+            "On training crops, at the end of each visit.",
+            charts.draw_block_quality(story),
+        ),
+        ("memory", "Memory", "Of the process.", charts.draw_memory(story)),
+        (
+            "budgets",
+            "Budgets",
+            "What is kept at hand, as a share of what may be.",
+            charts.draw_budgets(story),
+        ),
+    )
+    titles = charts.visit_titles(story)
+    return [_chart(name, title, text, figure, titles) for name, title, text, figure in drawn if figure]
+
+
+def _plans(plan: Plan | None) -> list[Chart]:
+    if plan is None:
+        return []
+    text = "Cells, Gaussians (grey), cameras" + (" (orange: held out)." if len(plan.cameras) else ".")
+    drawn = [("plan", "From above", text, draw_plan(plan))]
+    if plan.is_stacked:
+        drawn.append(("side", "From the side", "Where cells lie above others.", draw_plan(plan, 0, 2)))
+    return [_chart(name, title, text, figure, {}) for name, title, text, figure in drawn if figure]
+
+
+def _chart(name: str, title: str, text: str, figure: Figure, titles: dict[str, str]) -> Chart:
+    return Chart(title, text, Markup(inline_svg(figure, name, f"Chart: {title}. {text}", titles)))
+
+
+# -- tables ------------------------------------------------------------------------------------------
+
+
+def _view(shown: Shown) -> dict[str, Any]:
+    psnr, ssim = shown.score.psnr_merged, shown.score.ssim_merged
+    pictures = {name: getattr(shown, name) for name in ("place", "photo", "picture", "error")}
+    size = {"width": shown.width, "height": shown.height}
+    scores = {"psnr": f"{psnr:.2f} dB", "ssim": "" if ssim is None else f"{ssim:.3f}"}
+    return {"name": shown.score.name, **pictures, **size, **scores}
+
+
+def _row(block: Block) -> dict[str, Any]:
+    share = f"{block.layer_seconds / block.seconds:.0%}" if block.seconds else NOTHING
+    return {
+        "number": block.number,
+        "gaussians": NOTHING if block.gaussians is None else f"{block.gaussians:,}",
+        "views": NOTHING if block.views is None else f"{block.views:,}",
+        "visits": f"{block.visits:,}",
+        "time": f"{block.seconds:.1f} s" if block.seconds else NOTHING,
+        "layers": share,
+        "psnr": f"{block.psnrs[-1]:.2f} dB" if block.psnrs else NOTHING,
+        "spark": sparkline(block.psnrs),
+        "state": block.state,
+    }
+
+
+def sparkline(values: Sequence[float]) -> Markup:
+    """A line through the values, as large as a word; nothing without values."""
+    if not values:
+        return Markup("")
+    middle, span = (min(values) + max(values)) / 2, max(max(values) - min(values), SPARK_DB)
+    across = (SPARK_WIDTH - 2 * SPARK_EDGE) / max(len(values) - 1, 1)
+    along = (SPARK_HEIGHT - 2 * SPARK_EDGE) / span
+    places = [
+        (SPARK_EDGE + k * across, SPARK_HEIGHT / 2 - (y - middle) * along) for k, y in enumerate(values)
+    ]
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+    return Markup(
+        '<svg class="spark" viewBox="0 0 {} {}" role="img" aria-label="from {} to {} dB">'
+        '<polyline points="{}"/><circle cx="{}" cy="{}" r="2.5"/></svg>'
+    ).format(
+        SPARK_WIDTH,
+        SPARK_HEIGHT,
+        f"{values[0]:.1f}",
+        f"{values[-1]:.1f}",
+        points,
+        *(f"{z:.1f}" for z in places[-1]),
+    )

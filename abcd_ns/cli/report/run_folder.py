@@ -1,0 +1,157 @@
+"""A run's folder, read without trusting it: JSON, tensors, and no Python objects."""
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.cli.report.story import Story, read_story
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.parameter_store import StoreError
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.configs import registered
+from abcd_ns.lab.runs.options import set_options
+from abcd_ns.lab.runs.records import read_record
+from abcd_ns.nerfstudio.config import AbcdTrainerConfig
+from abcd_ns.nerfstudio.pipeline import STORE, AbcdPipeline
+from abcd_ns.nerfstudio.run.run_log import LOG_FILE
+from abcd_ns.nerfstudio.settings import SCHEMA, SETTINGS_FILE, Settings
+
+CHECKPOINTS = "nerfstudio_models"
+_DAMAGE = (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, UnpicklingError)
+"""What comes of reading a file that is no checkpoint of ours."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The newest that a run saved."""
+
+    path: Path
+    step: int
+    """Optimisation steps taken."""
+    pipeline: dict[str, Any]
+    """The pipeline's state_dict."""
+    tree: BlockTree
+
+    @property
+    def means(self) -> Float[Tensor, "n 3"]:
+        """Of all Gaussians, world units."""
+        return self.pipeline["_model.gauss_params.means"]
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """What a run left."""
+
+    path: Path
+    settings: Settings
+    story: Story
+    checkpoint: Checkpoint | None
+    """None where the run ended before its first."""
+    state: RunState | None
+    """Where the planner stood at the checkpoint, or else when the run was last heard of."""
+
+
+def find_run(path: Path) -> Path:
+    """The folder of a run that is named by it or by its config.yml.
+
+    Raises:
+        UserError: it is none; the message says what to give.
+    """
+    path = path.parent if path.name == "config.yml" else path
+    if not (path / "abcd" / SETTINGS_FILE).exists():
+        raise UserError(f"{path} is no run with a log: {_hint(path)}")
+    return path
+
+
+def open_run(path: Path) -> RunFolder:
+    """Read a run's settings, log, newest checkpoint and state.
+
+    Raises:
+        UserError: something in the folder is missing, damaged or of another version.
+    """
+    settings = read_record(path / "abcd" / SETTINGS_FILE, Settings, SCHEMA)
+    story = read_story(path / "abcd" / LOG_FILE)
+    checkpoint = _newest(path / CHECKPOINTS)
+    return RunFolder(path, settings, story, checkpoint, _read_state(path / "abcd" / STORE, checkpoint))
+
+
+def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
+    """The trained model with its data, for drawing.
+
+    Raises:
+        UserError: the data is gone, or the run's options or checkpoint do not fit this version.
+    """
+    where, config = str(run.path / "abcd" / SETTINGS_FILE), _registered(run.settings.method)
+    prefix = "pipeline."
+    options = {n: v for n, v in run.settings.options.items() if n.startswith(prefix)}
+    set_options(config.pipeline, {n.removeprefix(prefix): v for n, v in options.items()}, where)
+    config.pipeline.datamanager.data = Path(run.settings.data_path)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    pipeline = config.pipeline.setup(device=device, test_mode="test")
+    pipeline.eval()
+    try:
+        pipeline.load_pipeline(checkpoint.pipeline, checkpoint.step - 1)
+    except (KeyError, RuntimeError) as error:
+        raise UserError(f"{checkpoint.path} does not fit the options in {where}: {error}.") from None
+    return pipeline
+
+
+def default_config(method: str) -> AbcdTrainerConfig | None:
+    """The method as this version registers it, options taken over as in training; None for an unknown one."""
+    try:
+        config = _registered(method)
+    except UserError:
+        return None
+    config.pipeline.model.mirror(config.pipeline.training)
+    return config
+
+
+def _registered(method: str) -> AbcdTrainerConfig:
+    found = registered(method)
+    if found is None:
+        raise UserError(f"The run's method {method!r} is none of this version of abcd_ns.")
+    return copy.deepcopy(found)
+
+
+def _hint(path: Path) -> str:
+    if not path.is_dir():
+        return "there is no such folder."
+    below = sorted(path.glob(f"**/abcd/{SETTINGS_FILE}"), key=lambda found: found.stat().st_mtime)
+    if below:
+        return f"did you mean {below[-1].parent.parent}?"
+    return "give a folder outputs/SCENE/METHOD/TIME that this version of `ns-train abcd` wrote."
+
+
+def _newest(folder: Path) -> Checkpoint | None:
+    found = sorted(folder.glob("step-*.ckpt"))
+    if not found:
+        return None
+    path = found[-1]
+    try:
+        # Tensors and plain values only: an unpickler that made objects would run what the file says.
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        tree = BlockTree.from_json(content["pipeline"]["_model._extra_state"]["tree"])
+        return Checkpoint(path, int(content["step"]) + 1, content["pipeline"], tree)
+    except _DAMAGE as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{path} cannot be read ({reason}); remove it to use an earlier one.") from None
+
+
+def _read_state(folder: Path, checkpoint: Checkpoint | None) -> RunState | None:
+    if not folder.is_dir():
+        return None
+    try:
+        store = ParameterStore.open(folder, read_only=True)
+        if checkpoint is not None and checkpoint.path.stem in store.pins:
+            store = ParameterStore.open(folder, checkpoint.path.stem)
+    except StoreError as error:
+        raise UserError(str(error)) from None
+    return RunState.from_json(store.state) if store.state else None

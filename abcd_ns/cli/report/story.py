@@ -1,0 +1,179 @@
+"""A run's log, read back: what happened when."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from abcd_ns.lab.runs.records import RecordError, decode
+from abcd_ns.nerfstudio.run.log_lines import (
+    KINDS,
+    SCHEMA,
+    EndLine,
+    HeldOutLine,
+    Line,
+    SampleLine,
+    SweepEndLine,
+    TrainingLine,
+    VisitEndLine,
+    VisitLine,
+)
+
+L = TypeVar("L", bound=Line)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """One visit, from its first line and its last."""
+
+    number: int
+    sweep: int
+    block: int | None
+    """None for the warm-up."""
+    began: float
+    """Training time, s; likewise `ended`."""
+    ended: float
+    done: bool
+    """False where the log ends within the visit."""
+    layer_seconds: float
+    views: int | None
+    """That see the block."""
+    psnr: float | None
+    """Of its later half, on training crops, dB."""
+
+    @property
+    def seconds(self) -> float:
+        """How long it took, or has taken so far."""
+        return self.ended - self.began
+
+
+@dataclass(frozen=True)
+class Story:
+    """All of a log."""
+
+    trainings: tuple[TrainingLine, ...]
+    """Where training began, and where it went on after being resumed; at least one."""
+    samples: tuple[SampleLine, ...]
+    visits: tuple[Visit, ...]
+    sweeps: tuple[SweepEndLine, ...]
+    held_out: tuple[HeldOutLine, ...]
+    """Those with a PSNR."""
+    end: EndLine | None
+    """None where the run is still going on, or was killed."""
+    moments: tuple[tuple[int, float], ...]
+    """(step, training time) of every line."""
+
+    @property
+    def step(self) -> int:
+        """The last that is known of."""
+        return self.moments[-1][0]
+
+    @property
+    def seconds(self) -> float:
+        """Of training, as far as is known."""
+        return self.moments[-1][1]
+
+    def seconds_at(self, step: int) -> float:
+        """Training time when so many steps had been taken, between the lines by proportion."""
+        steps, seconds = zip(*self.moments, strict=True)
+        return float(np.interp(step, steps, seconds))
+
+    @property
+    def blocks(self) -> int:
+        """That space is cut into."""
+        return self.trainings[-1].blocks
+
+    @property
+    def gaussians(self) -> int:
+        """In the whole scene, when last counted."""
+        known = [self.trainings[-1], *self.samples[-1:], *([self.end] if self.end else [])]
+        return known[-1].gaussians
+
+    @property
+    def layer_seconds(self) -> float:
+        """Training time that went into drawing layers."""
+        return sum(visit.layer_seconds for visit in self.visits)
+
+    def of_block(self, block: int) -> tuple[Visit, ...]:
+        """The visits to one block."""
+        return tuple(visit for visit in self.visits if visit.block == block)
+
+
+def read_story(path: Path) -> Story:
+    """Read a log.
+
+    A last line without its end, as a kill leaves it, is passed over.
+
+    Raises:
+        RecordError: the file is absent, or a line is none of a log's; the message names it.
+    """
+    try:
+        texts = path.read_bytes().decode("utf-8", "replace").split("\n")[:-1]
+    except FileNotFoundError:
+        raise RecordError(f"{path} does not exist; runs of this version of abcd_ns write it.") from None
+    except OSError as error:
+        raise RecordError(f"{path} cannot be read: {error.strerror}.") from None
+    lines = [_read_line(text, f"{path}, line {number}") for number, text in enumerate(texts, start=1)]
+    if not any(isinstance(line, TrainingLine) for line in lines):
+        raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
+    ends = _of(lines, EndLine)
+    return Story(
+        trainings=_of(lines, TrainingLine),
+        samples=_of(lines, SampleLine),
+        visits=_join_visits(lines),
+        sweeps=_of(lines, SweepEndLine),
+        held_out=tuple(line for line in _of(lines, HeldOutLine) if line.psnr is not None),
+        end=ends[-1] if ends else None,
+        moments=tuple((line.step, line.seconds) for line in lines),
+    )
+
+
+def _of(lines: Iterable[Line], kind: type[L]) -> tuple[L, ...]:
+    return tuple(line for line in lines if isinstance(line, kind))
+
+
+def _read_line(text: str, where: str) -> Line:
+    try:
+        data = json.loads(text, parse_constant=_refuse)
+    except ValueError as error:
+        raise RecordError(f"{where} is damaged ({error}); remove it to see the rest.") from None
+    kind = data.pop("kind", None) if isinstance(data, dict) else None
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise RecordError(f"{where} is of the unknown kind {kind!r}; another version of abcd_ns wrote it.")
+    line = decode(KINDS[kind], data, where)
+    if isinstance(line, TrainingLine) and line.schema != SCHEMA:
+        raise RecordError(f"{where} has schema {line.schema}; this version of abcd reads schema {SCHEMA}.")
+    return line
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number in JSON")
+
+
+def _join_visits(lines: list[Line]) -> tuple[Visit, ...]:
+    begun = {line.visit: line for line in _of(lines, VisitLine)}
+    over = {line.visit: line for line in _of(lines, VisitEndLine)}
+    return tuple(
+        _join(number, begun.get(number), over.get(number), lines[-1].seconds)
+        for number in sorted({*begun, *over})
+    )
+
+
+def _join(number: int, begun: VisitLine | None, over: VisitEndLine | None, now: float) -> Visit:
+    known = over or begun
+    # A resumed run whose past is lost has visits without a beginning.
+    since = begun.seconds if begun else over.seconds - over.visit_seconds
+    return Visit(
+        number=number,
+        sweep=known.sweep,
+        block=known.block,
+        began=since,
+        ended=over.seconds if over else now,
+        done=over is not None,
+        layer_seconds=over.layer_seconds if over else 0.0,
+        views=begun.views if begun else None,
+        psnr=over.psnr if over else None,
+    )

@@ -1,0 +1,103 @@
+"""matplotlib's figures as SVG that stands in a page: its colours follow the page's theme."""
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from io import StringIO
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from abcd_ns.lab.runs.style import STYLE
+
+DARK = {
+    "#000000": "#e4e7eb",
+    "#444444": "#c3c8cf",
+    "#767676": "#9aa1ab",
+    "#d9d9d9": "#343a43",
+    "#ffffff": "#171a1f",
+    "#d55e00": "#ff9a4d",
+    "#0072b2": "#5ab8f0",
+    "#8a5a83": "#cf9fc8",
+    "#8a6a00": "#d8b64a",
+    "#b3306b": "#f083b0",
+    "#7a3e00": "#d79a63",
+    "#007a5a": "#3fc79e",
+}
+"""What the charts' colours turn into on a dark page."""
+_SVG, _XLINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}"
+_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+
+
+def inline_svg(figure: Figure, name: str, label: str, titles: Mapping[str, str] | None = None) -> str:
+    """The figure as an <svg> element.
+
+    Args:
+        name: made of letters and hyphens; sets its ids apart from those of other figures of the page.
+        label: what it shows, for who cannot see it.
+        titles: by gid of an artist, what a pointer on it is told.
+    """
+    stream = StringIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(stream, format="svg", transparent=True, metadata=_METADATA)
+    root = ET.fromstring(stream.getvalue())
+    for part in ("width", "height"):
+        del root.attrib[part]
+    root.attrib |= {"role": "img", "aria-label": label}
+    for style in [found for found in root.iter(f"{_SVG}defs") if found.find(f"{_SVG}style") is not None]:
+        # It would hold for the whole page; page.css has it for charts.
+        style.clear()
+    _add_titles(root, titles or {})
+    _rename_ids(root, name)
+    for element in root.iter():
+        element.tag = element.tag.removeprefix(_SVG)
+        element.attrib.update(_themed(element.attrib))
+    return ET.tostring(root, encoding="unicode")
+
+
+def theme_css() -> str:
+    """The colours of a dark page, as CSS variables."""
+    return " ".join(f"{_variable(light)}: {dark};" for light, dark in DARK.items())
+
+
+def _add_titles(root: ET.Element, titles: Mapping[str, str]) -> None:
+    for group in root.iter(f"{_SVG}g"):
+        if (text := titles.get(group.get("id", ""))) is not None:
+            title = ET.Element(f"{_SVG}title")
+            title.text = text
+            group.insert(0, title)
+
+
+def _rename_ids(root: ET.Element, name: str) -> None:
+    """Drop ids that nothing refers to, and make the others the figure's own."""
+    used = {found for element in root.iter() for value in element.attrib.values() for found in _refers(value)}
+    for element in root.iter():
+        if element.attrib.get("id") not in used:
+            element.attrib.pop("id", None)
+        for key, value in list(element.attrib.items()):
+            if key == "id":
+                element.attrib[key] = f"{name}-{value}"
+            elif key == f"{_XLINK}href":
+                del element.attrib[key]
+                element.attrib["href"] = f"#{name}-{value[1:]}" if value.startswith("#") else value
+            else:
+                element.attrib[key] = value.replace("url(#", f"url(#{name}-")
+
+
+def _refers(value: str) -> Iterator[str]:
+    yield from re.findall(r"url\(#([^)]+)\)", value)
+    if value.startswith("#"):
+        yield value[1:]
+
+
+def _themed(attributes: Mapping[str, str]) -> dict[str, str]:
+    def follow(match: re.Match[str]) -> str:
+        color = match.group().lower()
+        return f"var({_variable(color)}, {color})" if color in DARK else color
+
+    style = attributes.get("style")
+    return {} if style is None else {"style": re.sub(r"#[0-9a-fA-F]{6}\b", follow, style)}
+
+
+def _variable(color: str) -> str:
+    return f"--c-{color[1:]}"

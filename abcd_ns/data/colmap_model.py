@@ -1,0 +1,324 @@
+"""Reads COLMAP models, binary and text, and checks every length before it trusts a count.
+
+The format is https://colmap.github.io/format.html. Files are walked here rather than by pycolmap,
+which loads a cut cameras.bin silently and hangs on an empty points3D.bin.
+"""
+
+import mmap
+import stat
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
+from abcd_ns.data.split_lists import read_list_files
+
+MODEL_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
+"""Where a model may lie under the data folder; the first that holds one wins."""
+
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
+"""COLMAP's guess of down (+y) becomes nerfstudio's down (-z). A permutation: it rounds nothing."""
+
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+}
+"""COLMAP's model id: name and number of parameters, for the models that OpenCV can undistort."""
+
+_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
+_PART = 1 << 16
+"""Points gathered at a time."""
+_MAX_NAME = 1 << 16
+"""Bytes within which a name must end."""
+
+
+def find_model(data: Path) -> Path | None:
+    """The folder of `data` that holds a COLMAP model, or None."""
+    candidates = (data / folder for folder in MODEL_FOLDERS)
+    return next((c for c in candidates if (c / "cameras.bin").exists() or (c / "cameras.txt").exists()), None)
+
+
+def read_colmap(data: Path, model: Path) -> Scene:
+    """The scene of a COLMAP model; its photos are looked for in `data`/images.
+
+    Args:
+        data: the data root.
+        model: the folder with cameras, images and points3D, as .bin or else .txt.
+
+    Returns:
+        The scene in a z-up world: `applied_transform` is the change of axes from COLMAP's.
+
+    Raises:
+        InputError: a file is missing, cut, empty or absurd; every bad camera and pose is listed.
+    """
+    binary = (model / "cameras.bin").exists()
+    suffix = ".bin" if binary else ".txt"
+    problems = Problems()
+    with problems.collect():
+        lenses = (_cameras_bin if binary else _cameras_txt)(model / f"cameras{suffix}")
+    with problems.collect():
+        images = (_images_bin if binary else _images_txt)(model / f"images{suffix}")
+    with problems.collect():
+        xyz, rgb = (_points_bin if binary else _points_txt)(model / f"points3D{suffix}")
+    problems.raise_if_any()
+    for number, lens in lenses.items():
+        with problems.collect():
+            check_lens(lens, f"{model}/cameras{suffix}: camera {number}")
+    frames = []
+    for name, quat, translation, camera in images:
+        label = f"{model}/images{suffix}: {name}"
+        if camera not in lenses:
+            problems.add(
+                f"{label} uses camera {camera}, which cameras{suffix} does not have; make the model again."
+            )
+            continue
+        with problems.collect():
+            inside(data / "images", name, model / f"images{suffix}")
+            frames.append(Frame(name, _camera_to_world(quat, translation, label), lenses[camera]))
+    problems.raise_if_any()
+    frames.sort(key=lambda frame: frame.name)
+    return Scene(
+        model=model,
+        root=data,
+        photo_folder=data / "images",
+        frames=frames,
+        points_xyz=xyz @ Z_UP[:, :3].T,
+        points_rgb=rgb,
+        applied_transform=Z_UP,
+        split_lists=read_list_files(data, [frame.name for frame in frames]),
+    )
+
+
+def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> np.ndarray:
+    """Invert COLMAP's world to camera (w, x, y, z), t and turn it to OpenGL axes and a z-up world."""
+    norm = np.linalg.norm(quat)
+    if not (np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6):
+        raise InputError(
+            f"{label} has a pose with NaN, infinity or a zero quaternion; remove the photo from the model."
+        )
+    w, x, y, z = quat / norm
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.concatenate([rotation.T * [1, -1, -1], -rotation.T @ translation[:, None]], axis=1)
+    return rigid(Z_UP[:, :3] @ pose, label)
+
+
+def _lens(model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
+    """COLMAP's parameter list as a Lens; one focal length stands for both where there is only one."""
+    two_focals = model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
+    fx, fy, cx, cy = p[:4] if two_focals else (p[0], *p[:3])
+    distortion = p[4:] if two_focals else p[3:]
+    fisheye = model.endswith("FISHEYE")
+    padding = (0.0,) * ((4 if fisheye else 8) - len(distortion))
+    return Lens(width, height, fx, fy, cx, cy, tuple(distortion) + padding, fisheye)
+
+
+def _unsupported(path: Path, number: int, model: object) -> InputError:
+    names = ", ".join(name for name, _ in _MODELS.values())
+    fix = "undistort the scene with `colmap image_undistorter`"
+    return InputError(f"{path}: camera {number} has the model {model}, not one of {names}; {fix}.")
+
+
+# Binary
+
+
+class _Cursor:
+    """Reads a binary file front to back and never past its end."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        _check_file(path)
+        with path.open("rb") as file:
+            self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self.at = 0
+
+    def take(self, layout: str) -> tuple:
+        """The next values, as struct.unpack has them."""
+        start = self.at
+        self.skip(struct.calcsize("<" + layout))
+        return struct.unpack_from("<" + layout, self.data, start)
+
+    def skip(self, size: int) -> None:
+        """Go on by `size` bytes, which must be there."""
+        if size > len(self.data) - self.at:
+            raise InputError(
+                f"{self.path} is cut: it ends at byte {len(self.data)} inside an entry; make it again."
+            )
+        self.at += size
+
+    def count(self, smallest: int) -> int:
+        """A number of entries of at least `smallest` bytes each, which must fit into what is left."""
+        (n,) = self.take("Q")
+        left = len(self.data) - self.at
+        if n * smallest > left:
+            raise InputError(
+                f"{self.path} claims {n} entries but only {left} bytes follow; copy or make it again."
+            )
+        return n
+
+    def name(self) -> str:
+        """Characters up to a zero byte."""
+        end = self.data.find(b"\0", self.at, self.at + _MAX_NAME)
+        if end < 0:
+            raise InputError(f"{self.path} is damaged: a photo's name has no end; copy or make it again.")
+        text = self.data[self.at : end].decode("utf-8", "surrogateescape")
+        self.at = end + 1
+        return text
+
+    def finish(self) -> None:
+        """Refuse bytes after the last entry: the count was wrong."""
+        if self.at != len(self.data):
+            extra = len(self.data) - self.at
+            raise InputError(
+                f"{self.path} has {extra} bytes more than its entries need; copy or make it again."
+            )
+
+
+def _cameras_bin(path: Path) -> dict[int, Lens]:
+    cursor, lenses = _Cursor(path), {}
+    for _ in range(cursor.count(24 + 3 * 8)):
+        number, model, width, height = cursor.take("IiQQ")
+        if model not in _MODELS:
+            raise _unsupported(path, number, f"number {model}")
+        name, size = _MODELS[model]
+        lenses[number] = _lens(name, width, height, cursor.take(f"{size}d"))
+    cursor.finish()
+    return lenses
+
+
+def _images_bin(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
+    cursor, images = _Cursor(path), []
+    for _ in range(cursor.count(4 + 7 * 8 + 4 + 1 + 8)):
+        _, *pose, camera = cursor.take("I7dI")
+        name = cursor.name()
+        cursor.skip(cursor.count(24) * 24)
+        images.append((name, np.array(pose[:4]), np.array(pose[4:]), camera))
+    cursor.finish()
+    return images
+
+
+def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(xyz float64 [n, 3], rgb uint8 [n, 3]). Tracks make entries of unlike length: chase them first."""
+    cursor = _Cursor(path)
+    n = cursor.count(_POINT.itemsize)
+    starts = np.empty(n, dtype=np.int64)
+    at, end, track = cursor.at, len(cursor.data), struct.Struct("<Q")
+    for i in range(n):
+        starts[i] = at
+        at += _POINT.itemsize
+        if at <= end:
+            at += 8 * track.unpack_from(cursor.data, at - 8)[0]
+        if at > end:  # at once: what a damaged length makes of `at` may not fit into `starts`
+            break
+    cursor.skip(at - cursor.at)
+    cursor.finish()
+    raw = np.frombuffer(cursor.data, dtype=np.uint8)
+    xyz, rgb = np.empty((n, 3)), np.empty((n, 3), dtype=np.uint8)
+    for part in (slice(i, i + _PART) for i in range(0, n, _PART)):
+        points = raw[starts[part, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
+        xyz[part], rgb[part] = points["xyz"], points["rgb"]
+    return xyz, rgb
+
+
+# Text
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """(number from 1, text) of all lines but comments; blank ones too: an image may have no 2D points."""
+    _check_file(path)
+    with path.open(encoding="utf-8", errors="surrogateescape") as file:
+        for number, line in enumerate(file, start=1):
+            if not line.startswith("#"):
+                yield number, line.strip()
+
+
+def _broken_line(path: Path, number: int) -> InputError:
+    return InputError(f"{path}, line {number}: not what COLMAP writes there; export the model again.")
+
+
+def _cameras_txt(path: Path) -> dict[int, Lens]:
+    sizes = dict(_MODELS.values())
+    lenses = {}
+    for number, line in _lines(path):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            camera, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+            params = tuple(map(float, words[4:]))
+        except (ValueError, IndexError):
+            raise _broken_line(path, number) from None
+        if model not in sizes:
+            raise _unsupported(path, camera, model)
+        if len(params) != sizes[model]:
+            raise _broken_line(path, number)
+        lenses[camera] = _lens(model, width, height, params)
+    return lenses
+
+
+def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
+    """Each image takes two lines: the pose, and its 2D points, which may be none."""
+    images = []
+    lines = _lines(path)
+    for number, line in lines:
+        if not line:
+            continue
+        words = line.split(maxsplit=9)
+        try:
+            pose, camera, name = np.array(list(map(float, words[1:8]))), int(words[8]), words[9]
+        except (ValueError, IndexError):
+            raise _broken_line(path, number) from None
+        images.append((name, pose[:4], pose[4:], camera))
+        number, observed = next(lines, (number + 1, ""))
+        # Editors drop empty lines; the next image would then be taken for this one's 2D points.
+        if observed and not observed.rsplit(maxsplit=1)[-1].removeprefix("-").isdigit():
+            raise InputError(
+                f"{path}, line {number}: not the 2D points of {name}; an image takes two lines, of which the "
+                "second may be empty: export the model again."
+            )
+    return images
+
+
+def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    xyz, rgb = [], []
+    for number, line in _lines(path):
+        words = line.split(maxsplit=7)
+        if not words:
+            continue
+        try:
+            xyz.append(tuple(map(float, words[1:4])))
+            rgb.append(tuple(min(max(int(word), 0), 255) for word in words[4:7]))
+        except ValueError:
+            raise _broken_line(path, number) from None
+        if len(words) < 7:
+            raise _broken_line(path, number)
+    return np.array(xyz, dtype=np.float64).reshape(-1, 3), np.array(rgb, dtype=np.uint8).reshape(-1, 3)
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what cannot be read as a file: nothing, a folder, a pipe (which would block), no bytes."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be read ({error.strerror}); a model is cameras, images and points3D."
+        ) from None
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path} is not a regular file; put COLMAP's file there.")
+    if status.st_size == 0:
+        raise InputError(f"{path} is empty; copy or make it again.")

@@ -1,0 +1,79 @@
+"""Turns, centres and scales a scene in float64, so that float32 afterwards loses nothing."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+
+from abcd_ns.data.input_errors import InputError
+
+Orientation = Literal["pca", "up", "vertical", "none"]
+Center = Literal["poses", "focus", "none"]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x becomes scale x (rotation x + translation), in nerfstudio's order."""
+
+    rotation: np.ndarray
+    """float64 [3, 3]."""
+    translation: np.ndarray
+    """float64 [3], before scaling."""
+    scale: float
+
+    def points(self, xyz: np.ndarray) -> np.ndarray:
+        """Points float64 [..., 3] in the new frame."""
+        return self.scale * (xyz @ self.rotation.T + self.translation)
+
+    def poses(self, camera_to_world: np.ndarray) -> np.ndarray:
+        """Poses float64 [n, 3, 4] in the new frame; rotations stay rotations."""
+        centers = self.points(camera_to_world[..., 3])
+        return np.concatenate([self.rotation @ camera_to_world[..., :3], centers[..., None]], axis=-1)
+
+    def after(self, transform: np.ndarray, scale: float) -> "Similarity":
+        """This one applied after x -> scale x (transform [3, 4] @ x), as one Similarity."""
+        rotation = self.rotation @ transform[:, :3]
+        translation = self.rotation @ transform[:, 3] + self.translation / scale
+        return Similarity(rotation, translation, self.scale * scale)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """float64 [3, 4]: rotation and translation, without the scale."""
+        return np.concatenate([self.rotation, self.translation[:, None]], axis=1)
+
+
+def normalizing_similarity(
+    poses: np.ndarray, orientation: Orientation, center: Center, auto_scale: bool, scale_factor: float
+) -> Similarity:
+    """The frame that nerfstudio's auto_orient_and_center_poses and auto_scale_poses choose.
+
+    nerfstudio works in float32, where geo-referenced coordinates (1e6 m) have lost half a metre. So the
+    mean of the centres is taken off in float64 first; both its rotation and its centre commute with that.
+
+    Args:
+        poses: camera to world, float64 [n, 3, 4], OpenGL convention.
+        auto_scale: scale until the farthest camera's largest coordinate is 1.
+        scale_factor: on top of it.
+
+    Raises:
+        InputError: the cameras define no orientation or no size.
+    """
+    middle = poses[..., 3].mean(axis=0)
+    near = torch.eye(4).repeat(len(poses), 1, 1)
+    near[:, :3, :3] = torch.from_numpy(poses[..., :3])
+    near[:, :3, 3] = torch.from_numpy(poses[..., 3] - middle)
+    _, transform = auto_orient_and_center_poses(near, method=orientation, center_method=center)
+    transform = transform.numpy().astype(np.float64)
+    if not np.isfinite(transform).all():
+        raise InputError("the cameras define no upward direction; set --orientation-method none.")
+    u, _, vt = np.linalg.svd(transform[:, :3])
+    rotation = u @ vt
+    # With center "none" nerfstudio keeps the origin, so `middle` must not be taken off.
+    translation = np.zeros(3) if center == "none" else transform[:, 3] - rotation @ middle
+    centered = Similarity(rotation, translation, 1.0)
+    reach = np.abs(centered.poses(poses)[..., 3]).max()
+    if auto_scale and reach == 0:
+        raise InputError("all cameras are at the origin; set --auto-scale-poses False.")
+    return Similarity(rotation, translation, scale_factor / reach if auto_scale else scale_factor)

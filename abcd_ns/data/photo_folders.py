@@ -1,0 +1,133 @@
+"""Decides which folder each photo is read from, and checks all of them before training."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.picture_files import SUFFIXES, check_complete, is_turned, read_header
+from abcd_ns.data.scene import Frame, Scene
+
+
+@dataclass(frozen=True)
+class PhotoFile:
+    """One photo on disk, and the size it is reduced to after decoding."""
+
+    path: Path
+    stored: tuple[int, int]
+    """(width, height) in the file, EXIF orientation not applied."""
+    reduced: tuple[int, int]
+    """(width, height) after area averaging."""
+
+
+def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoFile], list[str]]:
+    """Find and check the photos of all frames.
+
+    images_N (N = `factor`) is used where every photo is there in W/N x H/N, rounded either way. Otherwise
+    the full photos are reduced to floor(W/N) x floor(H/N). Where there are no full photos, the least
+    reduced copies that can serve are taken.
+
+    Returns:
+        (one file per frame, notes for the user).
+
+    Raises:
+        InputError: lists every photo that is missing, damaged or of the wrong size.
+    """
+    full = scene.photo_folder
+    copies = _reduced_folders(scene)
+    notes = []
+    if factor in copies:
+        try:
+            return _check_folder(copies[factor], factor, scene.frames, factor), notes
+        except InputError as error:
+            if not full.is_dir():
+                raise
+            notes.append(
+                f"{copies[factor]} does not fit and is not used; {full} is reduced instead ({error.lines[0]})"
+            )
+    if full.is_dir():
+        return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene)
+    if not copies:
+        count, example = len(scene.frames), scene.frames[0].name
+        raise InputError(
+            f"{full} does not exist: put the {count} photos of {scene.model} there ({example}, ...)."
+        )
+    of = max((n for n in copies if factor % n == 0), default=min(copies))
+    if factor % of:
+        notes.append(
+            f"{full} does not exist: {copies[of]} is used, which is more than --downscale-factor {factor}."
+        )
+    return _check_folder(copies[of], of, scene.frames, max(factor, of)), notes
+
+
+def assume_photos(scene: Scene, factor: int) -> list[PhotoFile]:
+    """The photos as the model describes them, without looking: for viewing and exporting."""
+    return [
+        PhotoFile(scene.photo_folder / f.name, f.lens.size, _reduce(f.name, f.lens.size, factor))
+        for f in scene.frames
+    ]
+
+
+def _reduced_folders(scene: Scene) -> dict[int, Path]:
+    """N: folder, for the folders <photo_folder>_N beside the photo folder."""
+    if scene.photo_folder == scene.root:
+        return {}
+    prefix = scene.photo_folder.name + "_"
+    found = {}
+    for folder in scene.photo_folder.parent.glob("*_*"):
+        number = folder.name.removeprefix(prefix)
+        if folder.name.startswith(prefix) and number.isdecimal() and int(number) > 1 and folder.is_dir():
+            found[int(number)] = folder
+    return found
+
+
+def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> list[PhotoFile]:
+    """The files of `frames` in a folder of photos reduced by `of`, to be reduced by `factor` in all."""
+    problems, files = Problems(), []
+    for frame in frames:
+        with problems.collect():
+            path = folder / frame.name
+            header = read_header(path)
+            _check_size(path, header.size, frame, of)
+            check_complete(path, header)
+            files.append(PhotoFile(path, header.size, _reduce(str(path), header.size, factor // of)))
+    problems.raise_if_any()
+    return files
+
+
+def _reduce(label: str, size: tuple[int, int], factor: int) -> tuple[int, int]:
+    width, height = size[0] // factor, size[1] // factor
+    if width == 0 or height == 0:
+        raise InputError(
+            f"{label}: --downscale-factor leaves nothing of {size[0]} x {size[1]} px; set a smaller one."
+        )
+    return width, height
+
+
+def _check_size(path: Path, size: tuple[int, int], frame: Frame, of: int) -> None:
+    """The stored size must be the lens's, or that divided by `of` and rounded up or down."""
+    lens = frame.lens.size
+    if all(abs(have - want / of) < 1 for have, want in zip(size, lens, strict=True)):
+        return
+    shape, wanted = f"{size[0]} x {size[1]}", f"{lens[0] / of:g} x {lens[1] / of:g}"
+    if of == 1 and size == lens[::-1] and is_turned(path):
+        raise InputError(
+            f"{path} is stored as {shape} and turned by its EXIF orientation, but its camera is {wanted}; "
+            "save it turned and without EXIF, or make the model again."
+        )
+    raise InputError(
+        f"{path} is {shape} but its camera is {wanted}; use the photos that the model was made from "
+        f"(copies reduced N times go into a folder like images_N)."
+    )
+
+
+def _unposed(folder: Path, scene: Scene) -> list[str]:
+    """A note on photos that the model knows nothing of: training goes on without them."""
+    posed = {os.path.abspath(folder / frame.name) for frame in scene.frames}
+    known = posed | {os.path.abspath(frame.mask_path) for frame in scene.frames if frame.mask_path}
+    found = (p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and not p.is_dir())
+    extra = sorted(str(p.relative_to(folder)) for p in found if os.path.abspath(p) not in known)
+    if not extra:
+        return []
+    few = " Fewer than half have one: see whether the model is complete." if len(extra) > len(posed) else ""
+    return [f"{len(extra)} photos in {folder} have no pose and are not used ({extra[0]}, ...).{few}"]

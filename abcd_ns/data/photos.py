@@ -1,0 +1,212 @@
+"""Photos by index, read on demand and kept in memory under a byte budget."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import psutil
+import torch
+from jaxtyping import Bool, UInt8
+from PIL import Image
+from torch import Tensor
+
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.picture_files import has_alpha, open_picture, undecodable
+from abcd_ns.data.undistort import Undistortion
+from abcd_ns.engine.types import Crop
+
+_MASK_USED = 255
+
+
+@dataclass(frozen=True)
+class PhotoSource:
+    """How one file becomes the photo of its camera: decode, reduce, undistort."""
+
+    path: Path
+    stored: tuple[int, int]
+    """(width, height) that the file must have; EXIF orientation is not applied."""
+    reduced: tuple[int, int]
+    """(width, height) after area averaging; equal to `stored` where nothing is to be reduced."""
+    undistortion: Undistortion | None = None
+    """From the reduced photo to the final one; None leaves the pixels as they are."""
+    mask_path: Path | None = None
+    """A picture of the stored size or in the same proportion; pixels that are not 0 are used."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the final photo."""
+        return self.undistortion.pinhole.size if self.undistortion else self.reduced
+
+
+def default_budget() -> int:
+    """Bytes: 2 GiB, or 10% of the machine's memory where that is less."""
+    return min(2 << 30, psutil.virtual_memory().total // 10)
+
+
+class Photos:
+    """The photos of a set of cameras. Safe to use from several threads.
+
+    Pixels depend on the sources alone: not on the budget, nor on the order of calls.
+
+    Args:
+        sources: one per camera.
+        budget_bytes: how much decoded pixels may stay in memory between calls; None means
+            `default_budget()`. With 0 every call reads the file.
+    """
+
+    def __init__(self, sources: Sequence[PhotoSource], budget_bytes: int | None = None):
+        self.sources = tuple(sources)
+        self._cache = _ByteCache(default_budget() if budget_bytes is None else budget_bytes)
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    @property
+    def budget_bytes(self) -> int:
+        """How much decoded pixels may stay in memory."""
+        return self._cache.budget
+
+    @property
+    def cached_bytes(self) -> int:
+        """Bytes of decoded pixels that are kept now; at most the budget."""
+        return self._cache.used
+
+    def size(self, index: int) -> tuple[int, int]:
+        """(width, height) of a photo, without reading it."""
+        return self.sources[index].size
+
+    def image(self, index: int) -> UInt8[Tensor, "h w c"]:
+        """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it.
+
+        Raises:
+            InputError: the file is gone, damaged or has another size than when it was checked.
+        """
+        return self._cache.get(("image", index), lambda: _read_photo(self.sources[index]))
+
+    def crop(self, index: int, crop: Crop) -> UInt8[Tensor, "h w c"]:
+        """The pixels of `crop`: a view of `image(index)`, so do not write to it.
+
+        Raises:
+            ValueError: the crop reaches over the border.
+            InputError: as `image`.
+        """
+        width, height = self.size(index)
+        if crop.x < 0 or crop.y < 0 or crop.x + crop.width > width or crop.y + crop.height > height:
+            raise ValueError(f"{crop} reaches over the border of photo {index}, {width} x {height} px.")
+        return self.image(index)[crop.slices]
+
+    def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
+        """Which pixels count, or None where the photo has no mask. Do not write to it.
+
+        A reduced or undistorted pixel counts only if all pixels that it is made of count.
+
+        Raises:
+            InputError: the file is gone, damaged, of another shape than the photo, or hides everything.
+        """
+        if self.sources[index].mask_path is None:
+            return None
+        return self._cache.get(("mask", index), lambda: _read_mask(self.sources[index]))
+
+
+def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UInt8[np.ndarray, "y x c"]:
+    """The mean of the source's area that each pixel of the result covers, rounded to 8 bits.
+
+    Args:
+        size: (width, height) of the result, at most the source's; the ratio need not be whole.
+    """
+    if size == (image.shape[1], image.shape[0]):
+        return image
+    reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return reduced.reshape(size[1], size[0], image.shape[2])
+
+
+def _decode(path: Path, keeps_alpha: Callable[[Image.Image], bool]) -> np.ndarray:
+    """uint8 [H, W, 3 or 4] as stored."""
+    try:
+        with open_picture(path) as picture:
+            return np.array(picture.convert("RGBA" if keeps_alpha(picture) else "RGB"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise undecodable(path, error) from None
+
+
+def _read_photo(source: PhotoSource) -> Tensor:
+    image = _decode(source.path, has_alpha)
+    if (image.shape[1], image.shape[0]) != source.stored:
+        wanted = f"{source.stored[0]} x {source.stored[1]}"
+        raise InputError(
+            f"{source.path} is {image.shape[1]} x {image.shape[0]} px, not {wanted}; put the photo back."
+        )
+    image = area_reduce(image, source.reduced)
+    if source.undistortion:
+        image = source.undistortion.apply(image)
+    return torch.from_numpy(image)
+
+
+def _read_mask(source: PhotoSource) -> Tensor:
+    mask = _decode(source.mask_path, lambda _: False).max(axis=2, keepdims=True)
+    width, height = source.reduced
+    # Proportion, to half a pixel of the result: masks_N folders and full-size masks both do.
+    same_shape = abs(mask.shape[1] / mask.shape[0] * height - width) <= max(1.0, width / height)
+    if not same_shape or mask.shape[1] < width or mask.shape[0] < height:
+        shape = f"{mask.shape[1]} x {mask.shape[0]}"
+        raise InputError(
+            f"{source.mask_path} is {shape} px, unlike its photo of {width} x {height}; make the mask again."
+        )
+    used = area_reduce(np.where(mask > 0, np.uint8(_MASK_USED), np.uint8(0)), source.reduced)
+    used = np.where(used == _MASK_USED, used, 0)
+    if source.undistortion:
+        used = source.undistortion.apply(used)
+    if not (used == _MASK_USED).any():
+        raise InputError(f"{source.mask_path} hides the whole photo; remove the frame or repair the mask.")
+    return torch.from_numpy(used == _MASK_USED)
+
+
+class _ByteCache:
+    """Least recently used tensors go first. Two threads that want one tensor make it once."""
+
+    def __init__(self, budget: int):
+        self.budget = budget
+        self.used = 0
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[tuple[Literal["image", "mask"], int], Tensor] = OrderedDict()
+        self._making: dict[tuple[str, int], Future[Tensor]] = {}
+
+    def get(self, key: tuple[Literal["image", "mask"], int], make: Callable[[], Tensor]) -> Tensor:
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+            future = self._making.get(key)
+            mine = future is None
+            if mine:
+                future = self._making[key] = Future()
+        if not mine:
+            return future.result()
+        try:
+            value = make()
+        except BaseException as error:
+            # Whoever waits must get the error as well, whatever it is; it is raised here too.
+            with self._lock:
+                del self._making[key]
+            future.set_exception(error)
+            raise
+        with self._lock:
+            del self._making[key]
+            self._keep(key, value)
+        future.set_result(value)
+        return value
+
+    def _keep(self, key: tuple[Literal["image", "mask"], int], value: Tensor) -> None:
+        if value.nbytes > self.budget:
+            return
+        self._kept[key] = value
+        self.used += value.nbytes
+        while self.used > self.budget:
+            _, oldest = self._kept.popitem(last=False)
+            self.used -= oldest.nbytes

@@ -1,0 +1,223 @@
+"""Reads and checks everything that a scene consists of, once for all of its splits."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from abcd_ns.data.colmap_model import MODEL_FOLDERS, find_model, read_colmap
+from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.normalize import Similarity, normalizing_similarity
+from abcd_ns.data.photo_folders import PhotoFile, assume_photos, locate_photos
+from abcd_ns.data.photos import Photos, PhotoSource
+from abcd_ns.data.picture_files import check_regular
+from abcd_ns.data.scene import Frame, Lens, Scene, check_layout
+from abcd_ns.data.transforms_json import read_transforms
+from abcd_ns.data.undistort import Undistortion, undistortion
+from abcd_ns.late_bar import LateBar
+
+if TYPE_CHECKING:
+    from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+
+MAX_AUTO_SIDE = 1600
+"""Pixels along a photo's longer side, at most, where nothing is said: nerfstudio's MAX_AUTO_RESOLUTION."""
+DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
+"""The option by which something is said."""
+MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What all splits of a scene share. Lists run in the order of the scene's frames."""
+
+    scene: Scene
+    sources: list[PhotoSource]
+    lenses: list[Lens]
+    """Final cameras: reduced, undistorted."""
+    factor: int
+    """By which the photos' width and height were to be divided."""
+    similarity: Similarity
+    """From the scene's world to that of training."""
+    points: dict[str, Tensor]
+    """points3D_xyz float32 [n, 3], world of training, and points3D_rgb uint8 [n, 3]; empty without any."""
+    points_in_model: np.ndarray
+    """The same points, float64 [n, 3], in the scene's world."""
+    notes: tuple[str, ...]
+    """What the user should know but need not repair."""
+    chosen: tuple[str, ...] = ()
+    """What was chosen where the user said nothing."""
+
+
+def read_scene(data: Path) -> Scene:
+    """The model in `data`, COLMAP's before transforms.json.
+
+    Raises:
+        InputError: nothing there; says what was looked for, and where known scenes come from.
+    """
+    if data.suffix == ".json" and data.exists():
+        return read_transforms(data)
+    model, transforms = find_model(data), data / "transforms.json"
+    if model is not None:
+        scene = read_colmap(data, model)
+        if transforms.exists():
+            scene.notes.append(f"{model} is used; give --data {transforms} for the other.")
+        return scene
+    if transforms.exists():
+        return read_transforms(transforms)
+    if data.name in MIP_NERF_360:
+        hint = f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there."
+    else:
+        hint = f"give a folder with a COLMAP model, or make one of {data}/images with `abcd poses {data}`."
+    if not data.exists():
+        raise InputError(f"--data {data} does not exist; {hint}")
+    looked = ", ".join(f"{folder}/cameras.bin|txt" for folder in MODEL_FOLDERS)
+    raise InputError(f"--data {data} holds no model (looked for {looked} and transforms.json); {hint}")
+
+
+def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
+    """Read the model, look at the header and the end of every photo, and place the scene in its frame.
+
+    Args:
+        needs_photos: False for viewing and exporting, which go on without.
+
+    Raises:
+        InputError: the input cannot be used; all bad files are listed.
+    """
+    wanted = config.downscale_factor
+    if wanted is not None and (int(wanted) != wanted or wanted < 1):
+        raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
+    try:
+        scene = read_scene(config.data)
+        factor = automatic_factor(scene) if wanted is None else int(wanted)
+        files, notes = _check_layout_and_photos(scene, factor, needs_photos)
+    except OSError as error:
+        where = error.filename or config.data
+        raise InputError(f"{where} cannot be read ({error.strerror}); check its permissions.") from None
+    sources, lenses = _sources(scene, files)
+    poses = np.stack([frame.camera_to_world for frame in scene.frames])
+    similarity = normalizing_similarity(
+        poses, config.orientation_method, config.center_method, config.auto_scale_poses, config.scale_factor
+    )
+    points, in_model, more = _points(scene, similarity)
+    both = scene.split_lists.in_both if scene.split_lists else 0
+    if both:
+        more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
+    reduced = [_reduction(scene, sources, factor)] if wanted is None and factor > 1 and needs_photos else []
+    notes = (*scene.notes, *notes, *more)
+    return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, tuple(reduced))
+
+
+def automatic_factor(scene: Scene) -> int:
+    """What photos are divided by where nothing is said: the smallest power of two that leaves no side longer
+    than MAX_AUTO_SIDE, as nerfstudio's parsers have it, but by the largest photo and not by the first."""
+    longest, factor = max((max(frame.lens.size) for frame in scene.frames), default=0), 1
+    while longest / factor > MAX_AUTO_SIDE:
+        factor *= 2
+    return factor
+
+
+def _reduction(scene: Scene, sources: list[PhotoSource], factor: int) -> str:
+    """What was chosen for the user."""
+    full = max((frame.lens.size for frame in scene.frames), key=max)
+    longest = max(max(source.reduced) for source in sources)
+    return (
+        f"Photos of up to {full[0]} x {full[1]} px are reduced {factor} times, to {longest} px at most, as "
+        f"splatfacto does; {DOWNSCALE} 1 keeps their size."
+    )
+
+
+def check_masks(sources: list[PhotoSource]) -> None:
+    """Decode every mask.
+
+    Raises:
+        InputError: masks that cannot be read, do not fit their photo or hide all of it; lists them all.
+    """
+    masked = [source for source in sources if source.mask_path is not None]
+    photos, problems = Photos(masked, budget_bytes=0), Problems()
+
+    def look(row: int) -> tuple[str, ...]:
+        try:
+            photos.mask(row)
+        except InputError as error:
+            return error.lines
+        return ()
+
+    with ThreadPoolExecutor() as pool, LateBar("Looking at masks", len(masked)) as bar:
+        for lines in pool.map(look, range(len(masked))):
+            problems.lines.extend(lines)
+            bar.advance()
+    problems.raise_if_any()
+
+
+def _check_layout_and_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoFile], list[str]]:
+    """The photos' files, and notes; both kinds of fault are looked for before either is reported."""
+    problems = Problems()
+    with problems.collect():
+        check_layout(scene)
+    with problems.collect():
+        found = _find_photos(scene, factor, needed)
+    problems.raise_if_any()
+    return found
+
+
+def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoFile], list[str]]:
+    problems = Problems()
+    for frame in scene.frames:
+        if frame.mask_path is not None:
+            with problems.collect():
+                check_regular(frame.mask_path)
+    try:
+        with problems.collect():
+            files, notes = locate_photos(scene, factor)
+        problems.raise_if_any()
+    except InputError as error:
+        if needed:
+            raise
+        files, notes = assume_photos(scene, factor), [f"Going on without photos: {error.lines[0]}"]
+    return files, notes
+
+
+def _sources(scene: Scene, files: list[PhotoFile]) -> tuple[list[PhotoSource], list[Lens]]:
+    """Photo sources and final cameras. A lens without distortion is left alone, pixel for pixel."""
+    flats, problems = {}, Problems()
+    lenses = [frame.lens.resized(*file.reduced) for frame, file in zip(scene.frames, files, strict=True)]
+    for frame, lens in zip(scene.frames, lenses, strict=True):
+        if lens not in flats:
+            flats[lens] = None
+            with problems.collect():
+                flats[lens] = _undistortion(frame, lens) if lens.distorted else None
+    problems.raise_if_any()
+    sources = [
+        PhotoSource(file.path, file.stored, file.reduced, flats[lens], frame.mask_path)
+        for frame, file, lens in zip(scene.frames, files, lenses, strict=True)
+    ]
+    return sources, [flats[lens].pinhole if flats[lens] else lens for lens in lenses]
+
+
+def _undistortion(frame: Frame, lens: Lens) -> Undistortion:
+    try:
+        return undistortion(lens)
+    except InputError as error:
+        raise InputError(f"{frame.name}: {error}") from None
+
+
+def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np.ndarray, list[str]]:
+    """(metadata as splatfacto expects it, the points in the scene's world, notes)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        xyz = similarity.points(scene.points_xyz).astype(np.float32)
+    good = np.isfinite(xyz).all(axis=1)
+    left_out = f"{scene.model}: {(~good).sum()} points with NaN, infinity or absurd numbers are left out."
+    notes = [] if good.all() else [left_out]
+    if not good.any():
+        notes.append(
+            f"{scene.model} has no points: Gaussians start at random places, which costs quality; make some "
+            "with `colmap point_triangulator`."
+        )
+        return {}, np.empty((0, 3)), notes
+    rgb = np.ascontiguousarray(scene.points_rgb[good])
+    metadata = {"points3D_xyz": torch.from_numpy(xyz[good]), "points3D_rgb": torch.from_numpy(rgb)}
+    return metadata, scene.points_xyz[good], notes

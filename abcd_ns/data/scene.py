@@ -1,0 +1,185 @@
+"""A scene as its model file describes it, before any scaling: lenses, frames and points."""
+
+import math
+import os
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.split_lists import SplitLists
+
+MAX_SIDE = 100_000
+"""Pixels along one side beyond which a width or height is taken for a broken file."""
+MAX_COORDINATE = 1e12
+"""World units beyond which a camera's place is taken for a broken file."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Size and intrinsics of a camera, in pixels of that size; pixel centres at +0.5."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """OpenCV's coefficients: k1 k2 p1 p2 k3 k4 k5 k6 (or fewer), for a fisheye k1 k2 k3 k4."""
+    fisheye: bool = False
+    """Equidistant projection, as OpenCV's fisheye module has it."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height)."""
+        return self.width, self.height
+
+    @property
+    def distorted(self) -> bool:
+        """Whether photos must be undistorted; a fisheye is even with all coefficients zero."""
+        return self.fisheye or any(self.distortion)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Intrinsics, float64 [3, 3]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    def resized(self, width: int, height: int) -> "Lens":
+        """The same lens on a photo resampled to width x height; each axis has its own ratio."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
+        )
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed photo."""
+
+    name: str
+    """Path of the photo inside the photo folder; the order of frames is the order of names."""
+    camera_to_world: np.ndarray
+    """float64 [3, 4], OpenGL convention (x right, y up, z backward), world of the Scene."""
+    lens: Lens
+    mask_path: Path | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All that a model file says. Frames are sorted by name."""
+
+    model: Path
+    """The file or folder that was read, for messages."""
+    root: Path
+    """The data root; no path leads out of it."""
+    photo_folder: Path
+    """Holds the photos; reduced copies may lie beside it, as in images_4."""
+    frames: list[Frame]
+    points_xyz: np.ndarray
+    """float64 [n, 3], world of the Scene."""
+    points_rgb: np.ndarray
+    """uint8 [n, 3]."""
+    applied_transform: np.ndarray = field(default_factory=lambda: np.eye(4)[:3])
+    """float64 [3, 4]: world of the Scene = applied_scale x (applied_transform @ original coordinates)."""
+    applied_scale: float = 1.0
+    split_lists: SplitLists | None = None
+    """Which frames are trained on and which are held out, if the data say so."""
+    notes: list[str] = field(default_factory=list)
+    """What the user should know but need not repair."""
+
+
+def inside(root: Path, relative: str, said_by: Path) -> Path:
+    """root / relative, for a path that a file names.
+
+    The check is by name: a link that the user laid inside the root may point anywhere.
+
+    Raises:
+        InputError: the path leaves `root`.
+    """
+    try:
+        os.fsencode(relative)
+    except UnicodeEncodeError:
+        raise InputError(f"{said_by}: no file can have the name {relative}; correct the path.") from None
+    path = Path(os.path.abspath(root / relative))
+    if not path.is_relative_to(os.path.abspath(root)) or "\0" in relative:
+        raise InputError(
+            f"{said_by}: the path {relative} leads out of {root}; move the file inside and correct the path."
+        )
+    return path
+
+
+def check_lens(lens: Lens, label: str) -> None:
+    """Refuse what no camera has; lenses are told apart from broken files by wide margins.
+
+    Raises:
+        InputError: named `label`, with the offending value.
+    """
+    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    side = max(lens.width, lens.height)
+    if not (0 < lens.width <= MAX_SIDE and 0 < lens.height <= MAX_SIDE):
+        raise InputError(
+            f"{label} has the size {lens.width} x {lens.height}; the file is damaged, make the model again."
+        )
+    if not all(math.isfinite(v) for v in values):
+        raise InputError(f"{label} has NaN or infinite parameters; make the model again.")
+    for name, focal in (("fx", lens.fx), ("fy", lens.fy)):
+        if not side / 50 < focal < side * 1000:
+            raise InputError(
+                f"{label} has the focal length {name} = {focal:g} px for {side} px; make the model again."
+            )
+    if not (-side < lens.cx < 2 * side and -side < lens.cy < 2 * side):
+        raise InputError(
+            f"{label} has its principal point at ({lens.cx:g}, {lens.cy:g}), far outside the photo."
+        )
+
+
+def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
+    """`matrix` [3 or 4, 4] as float64 [3, 4] with its rotation made exact (the nearest one).
+
+    Raises:
+        InputError: named `label`: wrong shape, NaN, infinite, a scale, a shear, a reflection, or too far off.
+    """
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise InputError(
+            f"{label} must be a 4 x 4 or 3 x 4 matrix, not {' x '.join(map(str, matrix.shape))}."
+        )
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{label} holds NaN or infinity; remove the frame or repair its pose.")
+    if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
+        raise InputError(
+            f"{label} is {np.abs(matrix[:3, 3]).max():.1g} units from the origin; remove the frame or repair "
+            "its pose."
+        )
+    rotation = matrix[:3, :3].astype(np.float64)
+    u, stretch, vt = np.linalg.svd(rotation)
+    if not np.abs(stretch - 1).max() <= 1e-2 or np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"{label} is no rotation (it scales, shears or mirrors); remove the frame or repair its pose."
+        )
+    return np.concatenate([u @ vt, matrix[:3, 3:].astype(np.float64)], axis=1)
+
+
+def check_layout(scene: Scene) -> None:
+    """Refuse scenes that no frame of reference can be made for.
+
+    Raises:
+        InputError: fewer than two cameras, one name twice, or all cameras at one place.
+    """
+    if len(scene.frames) < 2:
+        raise InputError(
+            f"{scene.model} has {len(scene.frames)} camera(s); at least 2 are needed: add photos."
+        )
+    problems = Problems()
+    for name, times in Counter(frame.name for frame in scene.frames).items():
+        if times > 1:
+            many = "twice" if times == 2 else f"{times} times"
+            problems.add(f"{scene.model} names the photo {name} {many}; keep one pose of it.")
+    problems.raise_if_any()
+    centers = np.stack([frame.camera_to_world[:, 3] for frame in scene.frames])
+    if np.abs(centers - centers[0]).max() <= 1e-12 * np.abs(centers).max():
+        raise InputError(
+            f"{scene.model} has all cameras at one place; 3D needs photos from different places."
+        )

@@ -1,0 +1,100 @@
+"""Gaussians in another frame of coordinates."""
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.spherical_harmonics import sh_basis_rows, sh_degree_of
+from abcd_ns.engine.types import Gaussians
+
+DIRECTIONS = 64
+"""More than the 15 basis functions, so that the fit of a rotated basis is overdetermined and exact."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A change of frame: x becomes scale x (rotation x + translation)."""
+
+    rotation: Float[Tensor, "3 3"]
+    """Of determinant 1; float64."""
+    translation: Float[Tensor, "3"]
+    """Before scaling; float64."""
+    scale: float
+
+    @property
+    def inverse(self) -> "Frame":
+        """The way back."""
+        turned = self.rotation.T @ self.translation
+        return Frame(self.rotation.T, -self.scale * turned, 1 / self.scale)
+
+    def points(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Points in the new frame, float64."""
+        return self.scale * (points.double() @ self.rotation.T + self.translation)
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """The same Gaussians in the new frame; they look the same to a camera that moves along.
+
+        Means are rounded to the Gaussians' dtype: far from the origin that costs digits.
+        """
+        like = gaussians.means
+        quats = multiplied(quaternion(self.rotation), F.normalize(gaussians.quats.double(), dim=1))
+        rest = gaussians.features_rest.double()
+        turn = sh_rotation(self.rotation)[: rest.shape[1], : rest.shape[1]]
+        moved = replace(
+            gaussians,
+            means=self.points(like),
+            scales=gaussians.scales.double() + torch.tensor(self.scale).double().log(),
+            quats=quats,
+            features_rest=torch.einsum("ij,njc->nic", turn, rest),
+        )
+        return moved.to(like)
+
+
+def sh_rotation(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "15 15"]:
+    """The matrix M with Y(R d) = M Y(d) for the basis of degrees 1 to 3 in every direction d, float64.
+
+    A function keeps its values while directions turn if its coefficients are multiplied by M, since M is
+    orthogonal. Degrees do not mix (Ivanic and Ruedenberg, J. Phys. Chem. 100, 1996), so M is found degree by
+    degree, from the basis in many directions.
+    """
+    generator = torch.Generator().manual_seed(0)
+    directions = F.normalize(torch.randn(DIRECTIONS, 3, generator=generator, dtype=torch.float64), dim=1)
+    before, after = _basis(directions), _basis(directions @ rotation.double().T)
+    degrees = torch.tensor([sh_degree_of(basis) for basis in range(before.shape[1])])
+    turn = before.new_zeros(before.shape[1], before.shape[1])
+    for degree in degrees.unique():
+        members = (degrees == degree).nonzero()[:, 0]
+        fit = torch.linalg.lstsq(before[:, members], after[:, members]).solution
+        turn[members[:, None], members] = fit.T
+    return turn
+
+
+def _basis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 15"]:
+    return torch.stack(sh_basis_rows(*directions.unbind(1)), dim=1)
+
+
+def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+    """(w, x, y, z) of a rotation, w >= 0.
+
+    It is the eigenvector of the largest eigenvalue of a symmetric matrix, without the cases of the usual
+    formulae (Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation Matrix", 2000).
+    """
+    r = rotation.double()
+    skew = torch.stack((r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]))
+    trace = r.trace()
+    k = r.new_zeros(4, 4)
+    k[0, 0], k[0, 1:], k[1:, 0] = trace, skew, skew
+    k[1:, 1:] = r + r.T - trace * torch.eye(3, dtype=r.dtype)
+    found = torch.linalg.eigh(k / 3).eigenvectors[:, -1]
+    return found if found[0] >= 0 else -found
+
+
+def multiplied(first: Float[Tensor, "4"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """The rotations `quats`, followed by `first`."""
+    w, v = first[0], first[1:]
+    ws, vs = quats[:, :1], quats[:, 1:]
+    scalar = w * ws - vs @ v[:, None]
+    return torch.cat((scalar, w * vs + ws * v + torch.linalg.cross(v.expand_as(vs), vs)), dim=1)

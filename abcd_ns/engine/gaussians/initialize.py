@@ -1,0 +1,115 @@
+"""The first Gaussians: one for each point of a structure-from-motion model, as in 3DGS."""
+
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
+from abcd_ns.engine.types import Gaussians
+
+INITIAL_OPACITY = 0.1
+NEIGHBOURS = 3
+"""Other points whose mean distance is a point's size."""
+
+
+def gaussians_from_points(
+    points: Float[Tensor, "n 3"],
+    colors: UInt8[Tensor, "n 3"] | Float[Tensor, "n 3"],
+    *,
+    sh_degree: int = 3,
+    seed: int = 0,
+) -> Gaussians:
+    """Isotropic Gaussians at `points`, as wide as the mean distance to the three nearest others.
+
+    Args:
+        points: world space; rows that are not finite are dropped with a warning. Another warns where the
+            points are too few.
+        colors: 0..255.
+        seed: of the random rotations.
+    """
+    keep = torch.isfinite(points).all(dim=1)
+    if not bool(keep.all()):
+        warnings.warn(f"dropped {int((~keep).sum())} initial points that are not finite", stacklevel=2)
+        points, colors = points[keep], colors[keep]
+    count = points.shape[0]
+    elsewhere = int((points != points[:1]).any(dim=1).sum())
+    if elsewhere < NEIGHBOURS:
+        warnings.warn(
+            f"{count} initial points, {elsewhere} of them not where the first is: too few to tell how large "
+            "Gaussians should be, and to grow a scene from; look at how the poses were found",
+            stacklevel=2,
+        )
+    generator = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=points.clone(),
+        scales=spacing(points).log()[:, None].repeat(1, 3),
+        quats=_random_quats(count, generator).to(points.dtype),
+        features_dc=(colors.to(points.dtype) / 255 - 0.5) / SH_C0,
+        features_rest=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+        opacities=points.new_full((count, 1), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))),
+    )
+
+
+def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """The mean distance of each point to its three nearest others; never 0."""
+    return torch.from_numpy(_neighbour_distance(points.double().numpy())).to(points.dtype)
+
+
+def split_off(gaussians: Gaussians, keep: int, seed: int) -> tuple[Gaussians, Gaussians]:
+    """A random `keep` of freshly initialised Gaussians, widened to fill the gaps, and the others."""
+    order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(seed))
+    chosen, others = gaussians[order[:keep].sort().values], gaussians[order[keep:].sort().values]
+    wide = torch.maximum(chosen.scales, spacing(chosen.means).log()[:, None])
+    return replace(chosen, scales=wide), others
+
+
+def thin_out(gaussians: Gaussians, limit: int | None, seed: int) -> Gaussians:
+    """Freshly initialised Gaussians, no more than `limit`: all of them, or a random choice, widened to fill
+    the gaps, so that a scene with fewer Gaussians than points is covered all the same.
+
+    Density control never adds above the limit, but it removes only what is faint or huge.
+
+    Args:
+        limit: None for no limit.
+        seed: the same one makes the same choice.
+    """
+    if limit is None or len(gaussians) <= limit:
+        return gaussians
+    return split_off(gaussians, limit, seed)[0]
+
+
+def random_points(count: int, extent: float, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """`count` points uniform in a cube of side `extent` around the origin, and random colours 0..255."""
+    generator = torch.Generator().manual_seed(seed)
+    points = (torch.rand((count, 3), generator=generator) - 0.5) * extent
+    return points, torch.rand((count, 3), generator=generator) * 255
+
+
+def _neighbour_distance(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
+    """[n] mean distance to the nearest others; equal points get the smallest positive distance there is."""
+    count = len(points)
+    if count < 2:
+        return np.ones(count)
+    k = min(neighbours, count - 1) + 1
+    distance = cKDTree(points).query(points, k=k)[0][:, 1:].mean(axis=1)
+    positive = distance[distance > 0]
+    if len(positive) == 0:
+        return np.ones(count)
+    return np.maximum(distance, positive.min())
+
+
+def _random_quats(count: int, generator: torch.Generator) -> Tensor:
+    """Uniform random rotations (Shoemake, "Uniform random rotations", Graphics Gems III)."""
+    u, v, w = torch.rand((3, count), generator=generator)
+    a, b = torch.sqrt(1 - u), torch.sqrt(u)
+    tau = 2 * math.pi
+    return torch.stack(
+        [a * torch.sin(tau * v), a * torch.cos(tau * v), b * torch.sin(tau * w), b * torch.cos(tau * w)],
+        dim=1,
+    )

@@ -1,0 +1,144 @@
+"""Puts a block into live parameters and Adam optimizers, and takes it out again, moments included."""
+
+from collections.abc import Mapping, MutableMapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import Parameter, ParameterDict
+
+from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState, Clocks
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+
+Params = MutableMapping[str, Parameter] | ParameterDict
+"""The live parameters by name."""
+Optimizers = Mapping[str, torch.optim.Optimizer]
+"""One Adam per parameter, under the parameter's name; each with one parameter group."""
+LEARNING_RATES = {
+    "means": 1.6e-4,
+    "features_dc": 0.0025,
+    "features_rest": 0.0025 / 20,
+    "opacities": 0.05,
+    "scales": 0.005,
+    "quats": 0.001,
+}
+"""Splatfacto's. The means' decays with the progress of the run, see TrainingConfig."""
+
+
+STEP_PARTS = 128
+"""Adam's step count is a multiple of 1 over this, which float32 counts exactly to beyond 100,000."""
+
+
+def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: int = 1) -> None:
+    """Make `state` the live block: new Parameters, with its moments as Adam's state.
+
+    The Parameters that were live before lose their memory at once, even where something (a logged loss,
+    say) still refers to them.
+
+    Args:
+        batch: views in each of the steps to come, see `Pace.set`.
+    """
+    for name, value in state.gaussians.items():
+        parameter = Parameter(value.detach().clone())
+        group = optimizers[name].param_groups[0]
+        _release(group["params"][0], optimizers[name])
+        group["params"] = [parameter]
+        optimizers[name].state[parameter] = {
+            "step": adam_step(state.clocks, batch).to(value.device),  # fused Adam reads it there
+            **{moment: getattr(getattr(state, moment), name).clone() for moment in MOMENTS},
+        }
+        params[name] = parameter
+
+
+def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clocks: Clocks) -> BlockState:
+    """The live block as a BlockState on the CPU that shares no memory with later steps; it stays live.
+
+    From a GPU the copies are in pinned memory, which is not for keeping: what is put to rest is copied once
+    more.
+
+    Args:
+        growth: the strategy's statistics, each [n]; copied.
+        clocks: the block's clocks, up to date.
+    """
+    held = [params, *({n: _moment(n, params, optimizers, moment) for n in PARAM_NAMES} for moment in MOMENTS)]
+    values = [part[name] for part in held for name in PARAM_NAMES]
+    copies = iter(_on_cpu([*values, *growth.values()]))
+    parts = [Gaussians(**{name: next(copies) for name in PARAM_NAMES}) for _ in held]
+    return BlockState(*parts, {name: next(copies) for name in growth}, clocks)
+
+
+def _moment(name: str, params: Params, optimizers: Optimizers, moment: str) -> Tensor:
+    found = optimizers[name].state.get(params[name], {}).get(moment)
+    return torch.zeros_like(params[name]) if found is None else found
+
+
+def _on_cpu(values: list[Tensor]) -> list[Tensor]:
+    """Copies of tensors of one device, for which it is waited once: the last comes when all have come."""
+    last = len(values) - 1
+    return [value.detach().to("cpu", copy=True, non_blocking=k < last) for k, value in enumerate(values)]
+
+
+def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:
+    """Steps of `batch` views that would have let the moments forget as much as they have.
+
+    Adam divides its moments by 1 - beta**step, with the beta of the present steps: so `step` counts these,
+    and may be a fraction. It is rounded, so that counting on from it is exact: a run that is resumed in the
+    middle of a visit counts the same numbers as one that was not.
+    """
+    return torch.tensor(round(clocks.adam_views * STEP_PARTS / batch) / STEP_PARTS, dtype=torch.float32)
+
+
+def live_gaussians(params: Params) -> Gaussians:
+    """The live parameters as Gaussians, with their gradients' graph."""
+    return Gaussians(**{name: params[name] for name in PARAM_NAMES})
+
+
+def make_adam(params: Params) -> Optimizers:
+    """One Adam for each parameter, as 3DGS uses it."""
+    return {
+        name: torch.optim.Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
+        for name in PARAM_NAMES
+    }
+
+
+def nothing_live(
+    sh_degree: int, device: torch.device | str = "cpu"
+) -> tuple[dict[str, Parameter], Optimizers]:
+    """Empty parameters and their Adam, for a coordinator that nerfstudio does not call."""
+    empty = Gaussians.empty(sh_degree, device)
+    params = {name: Parameter(value) for name, value in empty.items()}
+    return params, make_adam(params)
+
+
+class Pace:
+    """Learning rates and memories of the optimizers, as they were given for steps of one view each.
+
+    Args:
+        power: of a step's views, with which the rates grow.
+    """
+
+    def __init__(self, optimizers: Optimizers, power: float) -> None:
+        groups = {name: optimizer.param_groups[0] for name, optimizer in optimizers.items()}
+        self._optimizers, self._power = optimizers, power
+        self._given = {name: (group["lr"], group["betas"]) for name, group in groups.items()}
+
+    def set(self, batch: int, means_decay: float, damping: float = 1.0) -> None:
+        """For a step of `batch` views, with the means' rate at a share of what was given, and all of them
+        damped.
+
+        Moments forget as many views' worth a step. With rates that grow with the square root, Adam then
+        follows the path of single views as far as gradients are noise (Malladi et al. 2022, "On the SDEs and
+        scaling rules for adaptive gradient algorithms"; Zhao et al. 2024 use it for Gaussian Splatting); as
+        far as they agree, with rates in proportion.
+        """
+        for name, (rate, betas) in self._given.items():
+            group = self._optimizers[name].param_groups[0]
+            decay = means_decay if name == "means" else 1.0
+            group["lr"] = rate * decay * batch**self._power * damping
+            group["betas"] = tuple(beta**batch for beta in betas)
+
+
+def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:
+    optimizer.state.pop(parameter, None)
+    parameter.grad = None
+    parameter.data = parameter.data.new_empty(0)

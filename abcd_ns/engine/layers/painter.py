@@ -1,0 +1,301 @@
+"""Draws frozen blocks into layers, as many blocks in one pass as the device has room for.
+
+With ownership by *fragments* (design, section 2) a layer holds the fragments of one convex node of the
+block tree, drawn from all Gaussians that reach into it, so that folding layers gives the merged picture.
+With ownership by *means* a layer holds a node's own Gaussians whole, as the paper has it.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.layers.compositing import empty_layer, over
+from abcd_ns.engine.render import Rasterizer, ZWindow
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.space.culling import Frusta, Optics, intersection
+from abcd_ns.engine.space.intervals import ray_interval
+from abcd_ns.engine.space.ordering import node_children_in_order, split_around
+from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.space.visibility import reaches
+from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+
+Ownership = Literal["fragments", "means"]
+LEAST_PASS = 200_000
+"""Gaussians: so many are drawn in one pass wherever blocks are small."""
+
+
+@dataclass(frozen=True)
+class PaintSettings:
+    """What every drawing of a run has in common."""
+
+    sh_degree: int
+    antialiased: bool = False
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What one view sees of a unit, cut by the active block's window."""
+
+    front: Layer
+    back: Layer
+    inside: Splats | None = None
+    """The unit's own Gaussians that have fragments in the window, if there are any; None by means."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A unit's Gaussians on the device."""
+
+    gaussians: Gaussians
+    """Its own, then those of other units that reach into it."""
+    own: int
+    """How many are its own."""
+    seen: frozenset[int] | None = None
+    """Indices of the views that may see something of the unit, or None if that was not asked."""
+
+    def shows_in(self, view: View) -> bool:
+        """Whether `view` may see something of the unit; False is certain."""
+        return len(self.gaussians) > 0 and (self.seen is None or view.index in self.seen)
+
+
+class Painter:
+    """Draws the frozen blocks of a scene.
+
+    Args:
+        scene: where Gaussians are read from.
+        views: all views that will be drawn; they bound how far Gaussians reach.
+        pass_gaussians: the most Gaussians that one drawing may take on the device. A node of the tree
+            that holds more is drawn in parts, down to single blocks.
+    """
+
+    def __init__(
+        self,
+        scene: BlockScene,
+        views: list[View],
+        rasterizer: Rasterizer,
+        *,
+        ownership: Ownership,
+        pass_gaussians: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.scene = scene
+        self.rasterizer = rasterizer
+        self.ownership = ownership
+        self.device = torch.device(device)
+        self._pass_gaussians = pass_gaussians
+        self._optics = Optics(views, rasterizer.window_side)
+
+    @property
+    def tree(self) -> BlockTree:
+        return self.scene.tree
+
+    def frusta(self, seen: Iterable[tuple[View, Crop]]) -> Frusta:
+        """What crops look at, for `load`."""
+        return Frusta(seen, self.rasterizer.window_side)
+
+    def units(self, exclude: int | None = None) -> tuple[int, ...]:
+        """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass.
+
+        By fragments they tile space: where no other node holds the cell of `exclude` it is one of them, for
+        what reaches into it.
+        """
+        return tuple(self._descend(0, exclude))
+
+    def depth_of(self, unit: int) -> int:
+        """How many nodes are above a unit."""
+        depth = 0
+        while unit:
+            unit, depth = int(self.tree.parent[unit]), depth + 1
+        return depth
+
+    def load(self, unit: int, exclude: int | None = None, seen_by: Frusta | None = None) -> Loaded:
+        """On the device: the Gaussians of the unit's blocks and, by fragments, all others that reach in.
+
+        Args:
+            seen_by: keep to blocks of which something may show in these crops; others are not even read.
+        """
+        inside = [b for b in self.tree.leaves(unit) if b != exclude]
+        outside: list[int] = []
+        if self.ownership == "fragments" and unit != 0:
+            outside = [b for b in range(self.tree.num_blocks) if b not in set(inside) and b != exclude]
+        seen = None
+        if seen_by is not None:
+            shown = self._shown(unit, [*inside, *outside], seen_by)
+            inside, outside = ([b for b in some if b in shown] for some in (inside, outside))
+            seen = frozenset(
+                view.index
+                for k, (view, _) in enumerate(seen_by.seen)
+                if any(row[k] for row in shown.values())
+            )
+        # The live block is on the device already, the others are not.
+        parts = [self.scene.gaussians(block).to(self.device) for block in inside]
+        own = sum(map(len, parts))
+        parts += [self.reaching(block, self.tree.box(unit)).to(self.device) for block in outside]
+        return Loaded(Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device), own, seen)
+
+    def _shown(self, unit: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
+        """Of these blocks, those with fragments in the unit that some crop may show, and which crops."""
+        known = ((b, self.scene.bounds(b)) for b in blocks)
+        boxes = {b: self._optics.drawn_within(bounds) for b, bounds in known if bounds is not None}
+        if self.ownership == "fragments":
+            space = self.tree.box(unit)
+            shared = {b: intersection(box, space) for b, box in boxes.items()}
+            boxes = {b: box for b, box in shared.items() if box is not None}
+        rows = seen_by.may_show(list(boxes.values())).tolist()
+        return {b: row for b, row in zip(boxes, rows, strict=True) if any(row)}
+
+    def reaching(self, block: int, box: Box) -> Gaussians:
+        """The block's Gaussians that some view may see inside `box`."""
+        gaussians = self.scene.gaussians(block)
+        return gaussians[reaches(gaussians, box, self._optics.slack(gaussians.means), self._optics.slant)]
+
+    def paint(
+        self,
+        unit: int,
+        loaded: Loaded,
+        view: View,
+        crop: Crop,
+        settings: PaintSettings,
+        *,
+        active: int | None = None,
+        window: ZWindow | None = None,
+    ) -> Parts | None:
+        """Draw a unit, loaded by `load`, cut by the window of the active block (by fragments) or put
+        whole before or behind the active block (by means). Without an active block all is in front.
+        None if the view sees nothing of it."""
+        gaussians, nothing = loaded.gaussians, self._nothing(view, crop)
+        if not loaded.shows_in(view):
+            return None
+        if self.ownership == "means":
+            layer = self._draw(gaussians, view, crop, settings, None)
+            front = active is None or self._is_in_front(unit, active, view)
+            return Parts(layer, nothing) if front else Parts(nothing, layer)
+        span = self.span(unit, view, crop)
+        if window is None:
+            return Parts(self._draw(gaussians, view, crop, settings, span), nothing)
+        cut = self.rasterizer.cut(
+            gaussians,
+            view,
+            front=span.before(window),
+            inside=window,
+            back=span.behind(window),
+            crop=crop,
+            sh_degree=settings.sh_degree,
+            antialiased=settings.antialiased,
+        )
+        # What reaches in from another unit is inside that one's.
+        return Parts(cut.front, cut.back, cut.inside[torch.where(cut.members < loaded.own)[0]])
+
+    def span(self, unit: int, view: View, crop: Crop) -> ZWindow:
+        """Where the rays through the crop's tiles are inside a unit."""
+        grid = self.rasterizer.window_grid(crop)
+        if unit == 0:
+            return ZWindow.everything(grid, self.device, view.viewmat.dtype)
+        return ray_interval(self.tree.box(unit), view, grid, self.device)
+
+    def order(self, units: Sequence[int], view: View) -> tuple[int, ...]:
+        """The units front to back, as `view` sees them."""
+        wanted, center = set(units), view.center.double().cpu()
+        return tuple(node for node in self._walk(0, center) if node in wanted)
+
+    def fold_up(self, parts: dict[int, Parts | None], unit: int, view: View) -> None:
+        """Collapse what has come in with `unit` and its neighbours in the tree, in place, as far as it goes.
+
+        Whatever lies under a node is a run of the front-to-back order, so it folds by itself. Done after
+        each unit, what is held grows with the depth of the tree and not with the number of units.
+
+        Args:
+            parts: by node; None for one that shows nothing.
+        """
+        center, node = view.center.double().cpu(), unit
+        while node:
+            node = int(self.tree.parent[node])
+            near, far = node_children_in_order(self.tree, node, center)
+            if near not in parts or far not in parts:
+                return
+            parts[node] = _over(parts.pop(near), parts.pop(far))
+
+    def fold(self, parts: dict[int, Parts | None], view: View, crop: Crop) -> Parts:
+        """All parts collapsed into one layer in front of the active block and one behind, and what is
+        inside in one."""
+        folded: Parts | None = None
+        for unit in self.order(tuple(parts), view):
+            folded = _over(folded, parts[unit])
+        nothing = self._nothing(view, crop)
+        return folded or Parts(nothing, nothing)
+
+    def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
+        """The whole scene through layers, unit by unit: the composited render."""
+        crop = crop or view.full
+        parts: dict[int, Parts | None] = {}
+        for unit in self.units():
+            loaded = self.load(unit, seen_by=self.frusta([(view, crop)]))
+            parts[unit] = self.paint(unit, loaded, view, crop, settings)
+            self.fold_up(parts, unit, view)
+        return self.fold(parts, view, crop).front
+
+    def _draw(
+        self, gaussians: Gaussians, view: View, crop: Crop, settings: PaintSettings, window: ZWindow | None
+    ) -> Layer:
+        if len(gaussians) == 0:
+            return self._nothing(view, crop)
+        with torch.no_grad():
+            return self.rasterizer(
+                gaussians,
+                view,
+                crop=crop,
+                sh_degree=settings.sh_degree,
+                antialiased=settings.antialiased,
+                z_window=window,
+            ).layer
+
+    def _nothing(self, view: View, crop: Crop) -> Layer:
+        return empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
+
+    def _descend(self, node: int, exclude: int | None) -> Iterator[int]:
+        blocks = [block for block in self.tree.leaves(node) if block != exclude]
+        if not blocks:
+            # What others' Gaussians do in the active cell, before or behind the window, is no other unit's.
+            if self.ownership == "fragments" and node != 0:
+                yield node
+            return
+        # By means, a node around the active block would be neither in front of it nor behind it.
+        whole = self.ownership == "fragments" or len(blocks) == len(self.tree.leaves(node))
+        fits = sum(map(self.scene.count, blocks)) <= self._pass_gaussians
+        if whole and (fits or len(self.tree.leaves(node)) == 1):
+            yield node
+            return
+        yield from self._descend(int(self.tree.left[node]), exclude)
+        yield from self._descend(int(self.tree.right[node]), exclude)
+
+    def _walk(self, node: int, center: Float[Tensor, "3"]) -> Iterator[int]:
+        yield node
+        if int(self.tree.block[node]) < 0:
+            for child in node_children_in_order(self.tree, node, center):
+                yield from self._walk(child, center)
+
+    def _is_in_front(self, unit: int, active: int, view: View) -> bool:
+        front, _ = split_around(self.tree, view.center.double().cpu(), active)
+        return self.tree.leaves(unit)[0] in front
+
+
+def _over(front: Parts | None, behind: Parts | None) -> Parts | None:
+    """The parts of two units as one, `front` being the nearer; None shows nothing."""
+    if front is None or behind is None:
+        return behind if front is None else front
+    inside = [part.inside.planes for part in (front, behind) if part.inside is not None and len(part.inside)]
+    return Parts(
+        over(front.front, behind.front),
+        over(front.back, behind.back),
+        Splats(torch.cat(inside, dim=1)) if inside else None,
+    )
+
+
+def default_pass(scene: BlockScene) -> int:
+    """Frozen Gaussians to draw in one pass: room for twice the largest block, and for any small scene."""
+    return max(2 * max(map(scene.count, range(scene.tree.num_blocks))), LEAST_PASS)

@@ -1,0 +1,223 @@
+"""One visit: what a block looks like to its views, and the frozen layers around it."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
+from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
+from abcd_ns.engine.layers.painter import Loaded, Painter, PaintSettings, Parts
+from abcd_ns.engine.render import Rasterizer, ZWindow
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.space.visibility import footprint
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+PARTS_BYTES = 256 << 20
+"""Size of the layers held while units are folded, at most, unless those of a single view are larger."""
+BYTES_PER_PIXEL = 32
+"""Of a front and a back layer in float32."""
+CROP_MARGIN = SSIM_WINDOW - 1
+"""Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
+
+
+@dataclass(frozen=True)
+class VisitGeometry:
+    """What is decided once, when a visit begins, and must be the same after a resume."""
+
+    block: int
+    crops: dict[int, Crop]
+    """By view index, the pixels to train on; views that do not see the block are missing."""
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """Indices of the views that see the block."""
+        return tuple(sorted(self.crops))
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON; numbers survive exactly."""
+        crops = {str(i): [c.x, c.y, c.width, c.height] for i, c in self.crops.items()}
+        return {"block": self.block, "crops": crops}
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> "VisitGeometry":
+        """The inverse of `to_json`."""
+        return VisitGeometry(data["block"], {int(i): Crop(*crop) for i, crop in data["crops"].items()})
+
+
+def survey(
+    gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: Rasterizer, *, align: int = 16
+) -> VisitGeometry:
+    """Which views see the block's Gaussians, and where in the image.
+
+    Args:
+        align: crops begin and end on multiples of this, pixels (or at the image's edge).
+    """
+    views = tuple(views)
+    extents = rasterizer.extents(gaussians, views).tolist() if views else []
+    crops = {
+        view.index: footprint(extent, view, margin=CROP_MARGIN, align=align)
+        for view, extent in zip(views, extents, strict=True)
+    }
+    return VisitGeometry(block, {view: crop for view, crop in crops.items() if crop is not None})
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What one training view sees around the active block."""
+
+    layers: Parts
+    """F (front) and B (back), for the view's crop."""
+    near: Splats | None
+    """Frozen Gaussians to be sorted in with the active ones, as this view sees them."""
+    window: ZWindow | None
+    """Where the fragments of `near` count; None by means."""
+
+
+class VisitLayers:
+    """F and B for the views of one visit. They show the frozen blocks as they were when it began.
+
+    Args:
+        store: where they are kept; new for each visit.
+        own: the block's Gaussians when the visit began; they decide the windows.
+        window_weight: see TrainingConfig.
+        views: all views, by index.
+    """
+
+    def __init__(
+        self,
+        painter: Painter,
+        store: LayerStore,
+        geometry: VisitGeometry,
+        own: Gaussians,
+        views: Mapping[int, View],
+        settings: PaintSettings,
+        *,
+        window_weight: float,
+    ) -> None:
+        self._painter, self._store = painter, store
+        self._geometry, self._views, self._settings = geometry, views, settings
+        self._window_weight = window_weight
+        self._units = painter.units(exclude=geometry.block)
+        self._own = own if painter.ownership == "fragments" else None
+        # All views of the block, though few may be drawn: what is loaded must not depend on which.
+        self._seen_by = painter.frusta((views[view], crop) for view, crop in sorted(geometry.crops.items()))
+        self._windows: dict[int, ZWindow] = {}
+        self._loaded: dict[int, int] = {}
+        self._sum: Tensor | float = 0.0
+
+    def draw(self, views: Iterable[int]) -> Iterator[int]:
+        """Draw F and B of these views and keep what there is room for; yields each view when it is ready.
+
+        Raises:
+            RuntimeError: when all are drawn, if some pixel is NaN or infinite.
+        """
+        for view, _ in self._draw(tuple(dict.fromkeys(views))):
+            yield view
+
+    def _draw(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
+        for group in self._groups(views):
+            yield from self._draw_group(group)
+        if not math.isfinite(self._sum):  # the one look at values: a device would be waited for at each
+            block = self._geometry.block
+            raise RuntimeError(
+                f"The layers around block {block} have NaN or infinite pixels; another block has diverged."
+            )
+
+    def _groups(self, views: Sequence[int]) -> Iterator[Sequence[int]]:
+        """Views that are drawn together: as many as there is room for what their units are folded from."""
+        if len(self._units) == 1:
+            yield views
+            return
+        levels = max(map(self._painter.depth_of, self._units), default=0) + 1
+        group: list[int] = []
+        room = PARTS_BYTES
+        for view in views:
+            crop = self._geometry.crops[view]
+            room -= levels * BYTES_PER_PIXEL * crop.pixels
+            if group and room < 0:
+                yield group
+                group, room = [], PARTS_BYTES - levels * BYTES_PER_PIXEL * crop.pixels
+            group.append(view)
+        if group:
+            yield group
+
+    def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
+        """All units one after the other, each for all of these views: the device holds one at a time."""
+        self._find_windows(views)
+        block = self._geometry.block
+        # By means no unit holds the active block's own place in the order; nothing stands there.
+        own_place = {} if self._own is not None else {self._painter.tree.node_of(block): None}
+        parts: dict[int, dict[int, Parts | None]] = {view: dict(own_place) for view in views}
+        for unit in self._units:
+            loaded = self._painter.load(unit, exclude=block, seen_by=self._seen_by)
+            self._loaded[unit] = len(loaded.gaussians)
+            for view in views:
+                parts[view][unit] = self._paint(unit, loaded, view)
+                self._painter.fold_up(parts[view], unit, self._views[view])
+                if unit == self._units[-1]:
+                    yield view, self._keep(view, parts.pop(view))
+
+    def around(self, view: int, crop: Crop | None = None) -> Surroundings:
+        """What `view` sees around the active block, in a part of the visit's crop or in all of it."""
+        whole = self._geometry.crops[view]
+        kept = self._store.get(view)
+        if kept is None:  # there was no room for it, or nobody knew that it would be asked for
+            ((_, kept),) = self._draw([view])
+        part = crop or whole
+        layers = kept.layers[(slice(None), *part.within(whole).slices)]
+        window = self._window(view)
+        return Surroundings(
+            unpacked(layers.to(self._views[view].viewmat.dtype)),
+            kept.near,
+            window and window.on(TileGrid(part, window.grid.side)),
+        )
+
+    @property
+    def frozen(self) -> int:
+        """Gaussians that are drawn for each view."""
+        return sum(self._loaded.values())
+
+    @property
+    def nbytes(self) -> int:
+        """Of the layers that are kept."""
+        return self._store.nbytes
+
+    def _find_windows(self, views: Iterable[int]) -> None:
+        if self._own is None:
+            return
+        own = self._own.to(self._painter.device)
+        for view in views:
+            if view not in self._windows:
+                self._windows[view] = self._painter.rasterizer.depth_window(
+                    own,
+                    self._views[view],
+                    crop=self._geometry.crops[view],
+                    visible=self._window_weight,
+                    antialiased=self._settings.antialiased,
+                )
+
+    def _window(self, view: int) -> ZWindow | None:
+        return None if self._own is None else self._windows[view]
+
+    def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts | None:
+        return self._painter.paint(
+            unit,
+            loaded,
+            self._views[view],
+            self._geometry.crops[view],
+            self._settings,
+            active=self._geometry.block,
+            window=self._window(view),
+        )
+
+    def _keep(self, view: int, parts: dict[int, Parts | None]) -> Kept:
+        folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
+        layers = packed(folded)
+        self._sum = self._sum + layers.sum()
+        kept = Kept(rounded(layers), folded.inside)
+        self._store.put(view, kept)
+        return kept

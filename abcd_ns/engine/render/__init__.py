@@ -1,0 +1,52 @@
+"""Rasterizers: one interface, a torch implementation for any device and gsplat's CUDA kernels."""
+
+from typing import Literal
+
+import torch
+
+from abcd_ns.engine.render.base import Raster, Rasterizer, Shot
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.render.cpu.chunk_kernels import CompilePolicy
+from abcd_ns.engine.render.self_check import self_check
+from abcd_ns.engine.render.z_window import ZWindow
+
+__all__ = [
+    "Raster",
+    "Rasterizer",
+    "Shot",
+    "TorchRasterizer",
+    "ZWindow",
+    "make_rasterizer",
+    "self_check",
+]
+
+WITHOUT_GSPLAT = ("cpu", "mps")
+"""Types of devices."""
+
+
+def make_rasterizer(
+    name: Literal["auto", "torch", "gsplat"], device: torch.device | str, *, compile: CompilePolicy = "auto"
+) -> Rasterizer:
+    """The rasterizer called `name`; "auto" takes gsplat where there may be kernels for it, else torch.
+
+    gsplat's kernels are checked against the torch backend on a tiny scene first (see self_check).
+
+    Args:
+        compile: passed to TorchRasterizer.
+
+    Raises:
+        ValueError: gsplat was asked for on such a device.
+        RuntimeError: gsplat's kernels do not agree with the torch backend.
+    """
+    device = torch.device(device)
+    if name == "torch" or (name == "auto" and device.type in WITHOUT_GSPLAT):
+        return TorchRasterizer(compile)
+    if device.type in WITHOUT_GSPLAT:
+        raise ValueError(
+            f'The gsplat rasterizer needs a CUDA device, not "{device}"; set the rasterizer to "torch".'
+        )
+    from abcd_ns.engine.render.cuda.backend import GsplatRasterizer  # imports gsplat
+
+    rasterizer = GsplatRasterizer()
+    self_check(rasterizer, device)
+    return rasterizer

@@ -1,0 +1,162 @@
+"""What every rasterizer takes and gives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from abcd_ns.engine.render.extents import extents_of
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+
+
+@dataclass(frozen=True)
+class Raster:
+    """One drawing: the pixels of a crop."""
+
+    color: Float[Tensor, "h w 3"]
+    """Premultiplied colour, no background."""
+    transmittance: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
+    info: dict[str, Any]
+    """gsplat 1.4.0's `info` for the Gaussians that take gradients, from v cameras: means2d [v, n, 2], radii
+    [v, n], depths, conics, opacities, width, height, n_cameras, gaussian_ids. Of the full image, not the
+    crop."""
+
+    @property
+    def layer(self) -> Layer:
+        return Layer(self.color, self.transmittance)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture to draw."""
+
+    view: View
+    crop: Crop
+    """Draw only these pixels of the image. The result equals the crop of the full drawing exactly."""
+    frozen: Splats | None = None
+    """What occludes and is occluded, without gradients: projected into `view` by the same rasterizer."""
+    z_window: ZWindow | None = None
+    """Masks the fragments of `frozen` where it is given, else those of the Gaussians; of this crop."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Gaussians as one view sees them, cut by windows."""
+
+    front: Layer
+    back: Layer
+    inside: Splats
+    """Those that have any fragment in the middle, in the Gaussians' order."""
+    members: Int[Tensor, "m"]
+    """Which of the Gaussians they are."""
+
+
+@runtime_checkable
+class Rasterizer(Protocol):
+    """Draws Gaussians as gsplat 1.4.0's `rasterization` does for one pinhole camera.
+
+    Constants (alpha >= 1/255, alpha <= 0.999, stop at T <= 1e-4, 3 sigma radius, 0.3 px blur) are gsplat's.
+    """
+
+    name: str
+    """Identifies backend and version; part of every layer's key."""
+    window_side: int
+    """Side of the tiles that z windows are given by, px."""
+
+    def window_grid(self, crop: Crop) -> TileGrid:
+        """The tiles of a crop that its z windows are given by."""
+        return TileGrid(crop, self.window_side)
+
+    def warm_up(self) -> None:
+        """Do now, before a clock runs, what would otherwise be done on first use or not at all: compile."""
+        ...
+
+    def project(
+        self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
+    ) -> Splats:
+        """What a view sees of Gaussians that take no gradients, to be looked at or given to shots as frozen.
+
+        Raises:
+            ValueError: `sh_degree` is above what the Gaussians hold.
+        """
+        ...
+
+    def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
+        """Where in each view's image Gaussians may be drawn, on the CPU; see `extents_of`."""
+        seen = ((self.project(gaussians, view), view) for view in views)
+        return torch.stack([extents_of(splats.means2d, splats.radii, view) for splats, view in seen]).cpu()
+
+    def draw(
+        self,
+        gaussians: Gaussians,
+        shots: Sequence[Shot],
+        *,
+        sh_degree: int,
+        antialiased: bool = False,
+        absgrad: bool = False,
+    ) -> tuple[Raster, ...]:
+        """Draw `gaussians` for each shot, sorted by depth with what is frozen there.
+
+        Args:
+            gaussians: take gradients where their tensors require them; `info` is about these alone. Several
+                rasters may share one `info`, of that many cameras.
+            sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
+            antialiased: scale opacities by gsplat's compensation factor.
+            absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward.
+
+        Raises:
+            ValueError: a window is of another crop, or of tiles that are no multiples of the rasterizer's; or
+                `sh_degree` is above what the Gaussians hold.
+        """
+        ...
+
+    def __call__(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        *,
+        sh_degree: int,
+        crop: Crop | None = None,
+        frozen: Gaussians | None = None,
+        z_window: ZWindow | None = None,
+        antialiased: bool = False,
+        absgrad: bool = False,
+    ) -> Raster:
+        """`draw` for a single view and, without `crop`, all of its image."""
+        crop = crop or view.full
+        seen = None
+        if frozen is not None:
+            seen = self.project(frozen, view, sh_degree=sh_degree, antialiased=antialiased)
+        shot = Shot(view, crop, seen, z_window)
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "absgrad": absgrad}
+        return self.draw(gaussians, [shot], **options)[0]
+
+    def cut(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        *,
+        front: ZWindow,
+        inside: ZWindow,
+        back: ZWindow,
+        crop: Crop,
+        sh_degree: int,
+        antialiased: bool = False,
+    ) -> Cut:
+        """The fragments in two windows as layers, and what has fragments in a third; no gradients."""
+        ...
+
+    def depth_window(
+        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
+    ) -> ZWindow:
+        """In each tile of the crop the range of camera z in which the Gaussians show, with nothing else in
+        the scene; no gradients. See z_window.showing."""
+        ...

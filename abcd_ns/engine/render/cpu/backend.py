@@ -1,0 +1,206 @@
+"""The torch rasterizer: gsplat's drawing in plain torch, for any device."""
+
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from abcd_ns.engine.render.base import Cut, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.cpu.binning import Candidates, find_candidates
+from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels, CompilePolicy
+from abcd_ns.engine.render.cpu.compositing_function import Composite, Job, pair_weights
+from abcd_ns.engine.render.image_size import image_size
+from abcd_ns.engine.render.projection import Splats, check_degree, pack, project_packed
+from abcd_ns.engine.render.splat_kernels import CONIC_XX, DEPTH, GRADED, OPACITY, RADIUS
+from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
+from abcd_ns.engine.render.z_window import ZWindow, showing
+from abcd_ns.engine.types import Crop, Gaussians, Layer, View
+
+TILE_SIDE = 4
+"""Pixels along a tile's side; small, since Gaussians of low-resolution views are a few pixels wide."""
+CHUNK = 8
+"""Gaussians per kernel call and tile."""
+
+
+class _TakeColumns(torch.autograd.Function):
+    """x[:, columns] for distinct columns. Autograd's own backward would accumulate, one by one."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Float[Tensor, "c n"], columns: Int[Tensor, "m"]) -> Float[Tensor, "c m"]:
+        ctx.save_for_backward(columns)
+        ctx.width = x.shape[1]
+        return x.index_select(1, columns)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Float[Tensor, "c m"]) -> tuple[Float[Tensor, "c n"], None]:
+        (columns,) = ctx.saved_tensors
+        return grad.new_zeros((grad.shape[0], ctx.width)).index_copy_(1, columns, grad), None
+
+
+class TorchRasterizer(Rasterizer):
+    """gsplat 1.4.0's `rasterization(packed=False)` in plain torch: same picture, same gradient.
+
+    Works in float32 and float64 and on any device; made to be fast on a CPU. Deterministic.
+
+    Args:
+        compile: whether float32 on the CPU runs on kernels built ahead of time (see kernels): "auto" if they
+            are found, "always" building them now if need be, "never" not at all. Built and eager kernels
+            agree to rounding only: use "never" where last bits must not depend on the machine.
+        tile_side: pixels along a tile's side; a divisor of 16. Speed only.
+        chunk: Gaussians per kernel call and tile. Speed and memory only.
+        window_side: pixels along the sides of the tiles of its z windows; 0 takes `tile_side`.
+
+    Raises:
+        ValueError: `tile_side` does not divide 16, or `window_side` is no multiple of it.
+    """
+
+    name = "torch-3"
+
+    def __init__(
+        self,
+        compile: CompilePolicy = "auto",
+        *,
+        tile_side: int = TILE_SIDE,
+        chunk: int = CHUNK,
+        window_side: int = 0,
+    ) -> None:
+        if tile_side < 1 or 16 % tile_side:
+            raise ValueError(f"tile_side is {tile_side}; choose one of 1, 2, 4, 8, 16.")
+        if window_side % tile_side:
+            raise ValueError(f"window_side is {window_side}; choose a multiple of tile_side, {tile_side}.")
+        self.kernels = ChunkKernels(compile, tile_side, chunk)
+        self.tile_side = tile_side
+        self.chunk = chunk
+        self.window_side = window_side or tile_side
+        self._packed: tuple[weakref.ref[Gaussians], Tensor] | None = None
+
+    def warm_up(self) -> None:
+        """See Rasterizer.warm_up."""
+        self.kernels.warm_up()
+
+    @torch.no_grad()
+    def project(
+        self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
+    ) -> Splats:
+        """See Rasterizer.project."""
+        check_degree(gaussians, sh_degree)
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": self.kernels.built}
+        return project_packed(self._pack(gaussians), view, **options)
+
+    def draw(
+        self,
+        gaussians: Gaussians,
+        shots: Sequence[Shot],
+        *,
+        sh_degree: int,
+        antialiased: bool = False,
+        absgrad: bool = False,
+    ) -> tuple[Raster, ...]:
+        """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
+        check_degree(gaussians, sh_degree)
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": self.kernels.built}
+        packed = pack(gaussians)
+        own = torch.stack([project_packed(packed, shot.view, **options).planes for shot in shots])
+        info = _info(own, shots)
+        # Through info's tensor, so that it is in the graph.
+        graded = torch.cat((info["means2d"].transpose(1, 2), own[:, DEPTH:GRADED]), dim=1)
+        graded, bounds = _side_by_side(graded), _side_by_side(own.detach())
+        grid_of = torch.arange(len(shots), device=own.device).repeat_interleave(own.shape[2])
+        frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
+        if frozen:
+            graded = torch.cat((graded, *(planes[:GRADED] for _, planes in frozen)), dim=1)
+            bounds = torch.cat((bounds, *(planes for _, planes in frozen)), dim=1)
+            grid_of = torch.cat((grid_of, *(grid_of.new_full((p.shape[1],), k) for k, p in frozen)))
+        sheet = TileSheet(tuple(TileGrid(shot.crop, self.tile_side) for shot in shots))
+        candidates = find_candidates(Splats(bounds), grid_of, sheet, built=self.kernels.built)
+        if any(shot.z_window is not None for shot in shots):
+            masked = _masked(shots, grid_of, own.shape[0] * own.shape[2])
+            candidates = candidates.within([shot.z_window for shot in shots], masked)
+        job = self._job(candidates, bounds, info["means2d"] if absgrad else None)
+        images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, candidates.rows), job))
+        return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
+
+    @torch.no_grad()
+    def cut(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        *,
+        front: ZWindow,
+        inside: ZWindow,
+        back: ZWindow,
+        crop: Crop,
+        sh_degree: int,
+        antialiased: bool = False,
+    ) -> Cut:
+        """See Rasterizer.cut. Projected and binned once."""
+        splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
+        candidates = self._candidates(splats, crop)
+        members = candidates.within([inside]).members
+        layers = (self._layer(splats, candidates.within([window])) for window in (front, back))
+        return Cut(*layers, splats[members], members)
+
+    @torch.no_grad()
+    def depth_window(
+        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
+    ) -> ZWindow:
+        """See Rasterizer.depth_window."""
+        splats = self.project(gaussians, view, antialiased=antialiased)
+        candidates = self._candidates(splats, crop)
+        drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
+        weight = pair_weights(drawn, self._job(candidates, splats.planes))
+        grid, drawn_in = self.window_grid(crop), candidates.sheet.grids[0]
+        # Pairs come by depth, so that sorting by tile alone keeps them in order.
+        tile, order = grid.holding(drawn_in, candidates.pairs.tile).sort(stable=True)
+        return showing(grid, tile, candidates.z[order], weight[order], visible)
+
+    def _candidates(self, splats: Splats, crop: Crop) -> Candidates:
+        sheet = TileSheet((TileGrid(crop, self.tile_side),))
+        grid_of = torch.zeros(len(splats), dtype=torch.long, device=splats.planes.device)
+        return find_candidates(splats, grid_of, sheet, built=self.kernels.built)
+
+    def _layer(self, splats: Splats, candidates: Candidates) -> Layer:
+        drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
+        (image,) = candidates.sheet.to_images(Composite.apply(drawn, self._job(candidates, splats.planes)))
+        return Layer(image[1:4].permute(1, 2, 0), image[0])
+
+    def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
+        """`pack`, kept for the next view of the same Gaussians."""
+        if self._packed is None or self._packed[0]() is not gaussians:
+            self._packed = (weakref.ref(gaussians), pack(gaussians))
+        return self._packed[1]
+
+    def _job(
+        self, candidates: Candidates, planes: Float[Tensor, "r n"], absgrad_target: Tensor | None = None
+    ) -> Job:
+        return Job(candidates.lists(self.chunk), planes.shape[1], self.kernels, absgrad_target)
+
+
+def _side_by_side(planes: Float[Tensor, "v r n"]) -> Float[Tensor, "r vn"]:
+    """The columns of all views in one row after the other."""
+    return planes.transpose(0, 1).reshape(planes.shape[1], -1)
+
+
+def _masked(shots: Sequence[Shot], grid_of: Int[Tensor, "n"], own: int) -> Bool[Tensor, "n"]:
+    """Which splats the shots' windows apply to; the first `own` splats are not frozen."""
+    is_frozen = torch.arange(grid_of.numel(), device=grid_of.device) >= own
+    masks_frozen = torch.tensor([shot.frozen is not None for shot in shots], device=grid_of.device)
+    return is_frozen == masks_frozen[grid_of]
+
+
+def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot]) -> dict[str, Any]:
+    """What gsplat's densification strategies read."""
+    return {
+        "means2d": own[:, :DEPTH].transpose(1, 2),
+        "radii": own[:, RADIUS].detach().int(),
+        "depths": own[:, DEPTH],
+        "conics": own[:, CONIC_XX:OPACITY].transpose(1, 2),
+        "opacities": own[:, OPACITY],
+        **image_size([shot.view for shot in shots], own.device),
+        "n_cameras": len(shots),
+        "camera_ids": None,
+        "gaussian_ids": None,
+    }

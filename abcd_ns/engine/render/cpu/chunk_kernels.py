@@ -1,0 +1,100 @@
+"""The chunk kernels of one size, and the choice between eager and built ones."""
+
+import functools
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.kernels import Kernel
+from abcd_ns.engine.kernels.build import build_kernels
+from abcd_ns.engine.render import splat_kernels
+from abcd_ns.engine.render.cpu.torch_kernels import STATE_PLANES, backward_chunk, forward_chunk, weigh_chunk
+from abcd_ns.engine.render.splat_kernels import GRADED, OPACITY, SPLAT_KERNELS
+
+CompilePolicy = Literal["auto", "always", "never"]
+
+
+@functools.cache
+def chunk_kernels(side: int, chunk: int) -> tuple[Kernel, Kernel, Kernel]:
+    """`forward_chunk`, `backward_chunk`, `weigh_chunk` for tiles of `side` px, `chunk` Gaussians a call."""
+    pixels = side * side
+    state = f"{STATE_PLANES} {pixels} a"
+    given = (f"{GRADED} {chunk} a", "2 a", state)
+    depends = (splat_kernels.__file__,)
+    forward = functools.partial(forward_chunk, side)
+    backward = functools.partial(backward_chunk, side)
+    weigh = functools.partial(weigh_chunk, side)
+    seen = (f"{OPACITY + 1} {chunk} a", "2 a", f"1 {pixels} a")
+    return (
+        Kernel(f"forward-{side}-{chunk}", forward, given, depends),
+        Kernel(f"backward-{side}-{chunk}", backward, (*given, state), depends),
+        Kernel(f"weigh-{side}-{chunk}", weigh, seen, depends),
+    )
+
+
+class ChunkKernels:
+    """The chunk kernels of a rasterizer.
+
+    Args:
+        policy: "auto" takes built kernels where they are found and builds them when `warm_up` is called;
+            "always" builds them now; "never" is eager.
+    """
+
+    def __init__(self, policy: CompilePolicy, side: int, chunk: int) -> None:
+        self._policy, self._size = policy, (side, chunk)
+        self._forward, self._backward, self._weigh = chunk_kernels(side, chunk)
+        self.built = policy != "never" and all(kernel.is_built for kernel in self._all)
+        """Whether float32 on the CPU runs fast."""
+        if policy == "always":
+            self.warm_up()
+
+    def warm_up(self) -> None:
+        """Build the kernels, a few minutes once per machine, unless the policy is "never"."""
+        if self._policy != "never" and not self.built:
+            build_kernels(self._all, *self._size)
+            self.built = all(kernel.is_built for kernel in self._all)
+
+    @property
+    def _all(self) -> tuple[Kernel, ...]:
+        return (*SPLAT_KERNELS, self._forward, self._backward, self._weigh)
+
+    def forward(
+        self,
+        params: Float[Tensor, "c k a"],
+        origins: Float[Tensor, "2 a"],
+        state: Float[Tensor, "s p a"],
+    ) -> Float[Tensor, "s p a"]:
+        """See torch_kernels.forward_chunk."""
+        wide = _two_wide(params, origins, state)
+        return self._forward(*wide, built=self.built)[0][..., : params.shape[-1]]
+
+    def backward(
+        self,
+        params: Float[Tensor, "c k a"],
+        origins: Float[Tensor, "2 a"],
+        state: Float[Tensor, "s p a"],
+        upstream: Float[Tensor, "s p a"],
+    ) -> Float[Tensor, "g k a"]:
+        """See torch_kernels.backward_chunk."""
+        wide = _two_wide(params, origins, state, upstream)
+        return self._backward(*wide, built=self.built)[0][..., : params.shape[-1]]
+
+    def weigh(
+        self,
+        params: Float[Tensor, "c k a"],
+        origins: Float[Tensor, "2 a"],
+        state: Float[Tensor, "1 p a"],
+    ) -> tuple[Float[Tensor, "1 p a"], Float[Tensor, "k a"]]:
+        """See torch_kernels.weigh_chunk."""
+        found = self._weigh(*_two_wide(params, origins, state), built=self.built)
+        state, weights = (plane[..., : params.shape[-1]] for plane in found)
+        return state, weights
+
+
+def _two_wide(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """Built kernels take two tiles or more: a single one is drawn twice."""
+    if tensors[0].shape[-1] != 1:
+        return tensors
+    return tuple(torch.cat((tensor, tensor), dim=-1) for tensor in tensors)

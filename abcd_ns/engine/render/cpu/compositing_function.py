@@ -1,0 +1,227 @@
+"""Alpha compositing of projected Gaussians as one differentiable function of bounded memory."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from abcd_ns.engine.render.cpu.binning import TileLists
+from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels
+from abcd_ns.engine.render.cpu.torch_kernels import (
+    ALL_GRADIENTS,
+    GRADIENTS,
+    STATE_PLANES,
+    gather_params,
+)
+from abcd_ns.engine.render.splat_kernels import CONIC_XX, OPACITY
+
+COMPACT = 0.75
+"""Tiles whose pixels are all finished are dropped once fewer than this share is left."""
+
+
+@dataclass
+class Job:
+    """All that a drawing needs besides tensors that take gradients."""
+
+    lists: TileLists
+    splats: int
+    """How many there are in all, drawn or not."""
+    kernels: ChunkKernels
+    absgrad_target: Tensor | None
+    """Gets an attribute `absgrad` in the backward pass: means2d [v, n, 2] of the first v n splats."""
+
+
+@dataclass
+class _Trace:
+    """What the forward pass leaves for the backward pass."""
+
+    columns: list[Tensor | None] = field(default_factory=list)
+    """Per level, which of its columns were drawn; None means all."""
+    states: list[Tensor] = field(default_factory=list)
+    """Per level, the state before it."""
+
+
+def _initial_state(lists: TileLists, dtype: torch.dtype) -> Float[Tensor, "5 p a"]:
+    sheet, device = lists.sheet, lists.tiles.device
+    crops = [grid.crop for grid in sheet.grids]
+    inside = [torch.ones((1, crop.height, crop.width), device=device, dtype=dtype) for crop in crops]
+    state = inside[0].new_zeros((STATE_PLANES, sheet.pixels_per_tile, lists.tiles.numel()))
+    state[0] = sheet.to_tiles(inside, fill=-1.0)[0].index_select(1, lists.tiles)
+    return state
+
+
+def _live_columns(state: Float[Tensor, "s p a"]) -> Int[Tensor, "b"] | None:
+    """The columns with an unfinished pixel, if dropping the others is worth it."""
+    live = (state[0] > 0).any(dim=0).nonzero()[:, 0]
+    return live if live.numel() < COMPACT * state.shape[2] else None
+
+
+def _level_ranks(lists: TileLists, index: int, columns: Tensor | None) -> Int[Tensor, "k a"]:
+    level = lists.levels[index]
+    ranks = lists.ranks[level.start : level.start + lists.chunk * level.width].view(lists.chunk, level.width)
+    return ranks if columns is None else ranks.index_select(1, columns)
+
+
+def _take(planes: Tensor, width: int, columns: Tensor | None) -> Tensor:
+    """The columns of a level from planes [..., a] that hold all tiles' columns."""
+    return planes[..., :width].contiguous() if columns is None else planes.index_select(-1, columns)
+
+
+DrawChunk = Callable[[int, Tensor | None, Float[Tensor, "s p a"]], Float[Tensor, "s p a"]]
+"""(level, columns, state) -> the state after that level's chunk; no columns are all of the level's."""
+
+
+def _walk(lists: TileLists, state: Float[Tensor, "s p a"], draw: DrawChunk) -> Float[Tensor, "s p a"]:
+    """All levels front to back, for as long as a tile has unfinished pixels. Returns the last states."""
+    columns, final = None, state.clone()
+    for index, level in enumerate(lists.levels):
+        if columns is not None and level.width < lists.levels[index - 1].width:
+            keep = int((columns < level.width).sum())
+            final.index_copy_(2, columns[keep:], state[..., keep:])
+            columns, state = columns[:keep], state[..., :keep].contiguous()
+        elif level.width < state.shape[2]:
+            final[..., level.width : state.shape[2]] = state[..., level.width :]
+            state = state[..., : level.width].contiguous()
+        live = _live_columns(state)
+        if live is not None:
+            held = torch.arange(level.width, device=state.device) if columns is None else columns
+            final.index_copy_(2, held, state)
+            columns, state = held[live], state.index_select(2, live)
+        if state.shape[2] == 0:
+            break
+        state = draw(index, columns, state)
+    if columns is None:
+        final[..., : state.shape[2]] = state
+    else:
+        final.index_copy_(2, columns, state)
+    return final
+
+
+def _composite(
+    job: Job, table: Tensor, origins: Float[Tensor, "2 a"], keep_states: bool
+) -> tuple[Float[Tensor, "5 p a"], _Trace]:
+    """Draw all levels. Returns the final state of every tile and the trace."""
+    lists, trace = job.lists, _Trace()
+
+    def draw(index: int, columns: Tensor | None, state: Tensor) -> Tensor:
+        if keep_states:
+            trace.columns.append(columns)
+            trace.states.append(state)
+        params = gather_params(table, _level_ranks(lists, index, columns))
+        return job.kernels.forward(params, _take(origins, lists.levels[index].width, columns), state)
+
+    return _walk(lists, _initial_state(lists, table.dtype), draw), trace
+
+
+class Composite(torch.autograd.Function):
+    """Drawn Gaussians by rank [10, m] -> planes [5, p, t] of all tiles: transmittance, colour, depth.
+
+    Rows are the GRADED ones of splat_kernels. Memory for the backward pass: five planes per tile and chunk
+    of K Gaussians, that is 5/K floats per fragment instead of the dozens that autograd would keep; everything
+    else is computed again.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "5 p t"]:
+        lists, sheet = job.lists, job.lists.sheet
+        table, origins = _table(drawn, job)
+        final, trace = _composite(job, table, origins, keep_states=any(ctx.needs_input_grad))
+        planes = final.new_zeros((STATE_PLANES, sheet.pixels_per_tile, sheet.tiles))
+        planes[0] = 1.0
+        planes.index_copy_(2, lists.tiles, torch.cat((final[:1].abs(), final[1:])))
+        ctx.job, ctx.columns = job, trace.columns
+        ctx.save_for_backward(table, origins, final, *trace.states)
+        return planes
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Float[Tensor, "5 p t"]) -> tuple[Float[Tensor, "d m"], None]:
+        job, lists = ctx.job, ctx.job.lists
+        table, origins, final, *states = ctx.saved_tensors
+        tiled = grad.index_select(2, lists.tiles)
+        total = (final[1:] * tiled[1:]).sum(dim=0) + final[0].abs() * tiled[0]
+        upstream = torch.cat((tiled[1:], total[None]))
+        per_slot = _slot_gradients(job, table, origins, upstream, ctx.columns, states)
+        sums = sum_bags(per_slot, lists.slots, lists.bags)
+        if job.absgrad_target is not None:
+            target = job.absgrad_target
+            absolute = sums.new_zeros((job.splats, 2)).index_copy_(0, lists.rows, sums[:, GRADIENTS:])
+            target.absgrad = absolute[: target.shape[0] * target.shape[1]].view_as(target)
+        return _to_parameters(table[:, :-1], sums), None
+
+
+def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> Float[Tensor, "s g"]:
+    """The backward kernel's sums for every slot; 0 for slots that early stopping left out."""
+    lists = job.lists
+    kept = GRADIENTS if job.absgrad_target is None else ALL_GRADIENTS
+    per_slot = table.new_zeros((lists.ranks.numel(), kept))
+    for index, (columns, state) in enumerate(zip(all_columns, states, strict=True)):
+        level = lists.levels[index]
+        params = gather_params(table, _level_ranks(lists, index, columns))
+        level_origins, level_upstream = (_take(x, level.width, columns) for x in (origins, upstream))
+        sums = job.kernels.backward(params, level_origins, state, level_upstream)
+        _put(per_slot, lists, index, columns, sums[:kept].reshape(kept, -1).T)
+    return per_slot
+
+
+def _put(per_slot: Tensor, lists: TileLists, index: int, columns: Tensor | None, by_slot: Tensor) -> None:
+    """Write what a level's chunk gave for some columns to their slots."""
+    level = lists.levels[index]
+    if columns is None:
+        per_slot[level.start : level.start + by_slot.shape[0]] = by_slot
+    else:
+        lanes = torch.arange(lists.chunk, device=columns.device) * level.width
+        per_slot.index_copy_(0, (level.start + lanes[:, None] + columns).view(-1), by_slot)
+
+
+def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
+    """For each pair of the job's lists the sum of the Gaussian's weight alpha T over the tile's pixels."""
+    lists = job.lists
+    table, origins = _table(drawn[: OPACITY + 1], job)
+    per_slot = table.new_zeros(lists.ranks.numel())
+
+    def weigh(index: int, columns: Tensor | None, state: Tensor) -> Tensor:
+        params = gather_params(table, _level_ranks(lists, index, columns))
+        level_origins = _take(origins, lists.levels[index].width, columns)
+        state, weights = job.kernels.weigh(params, level_origins, state)
+        _put(per_slot, lists, index, columns, weights.reshape(-1))
+        return state
+
+    _walk(lists, _initial_state(lists, table.dtype)[:1], weigh)
+    return per_slot[lists.slots]
+
+
+def _table(drawn: Float[Tensor, "d m"], job: Job) -> tuple[Float[Tensor, "c n"], Float[Tensor, "2 a"]]:
+    """What is drawn, with a last column of opacity 0 for empty slots, and the tiles' corners."""
+    table = F.pad(drawn, (0, 1))
+    return table, job.lists.sheet.origins(table).index_select(1, job.lists.tiles)
+
+
+def sum_bags(
+    values: Float[Tensor, "s g"], members: Int[Tensor, "q"], starts: Int[Tensor, "m"]
+) -> Float[Tensor, "m g"]:
+    """For each bag j the sum of values[members[starts[j] : starts[j + 1]]], in that order."""
+    if starts.numel() == 0 or members.numel() == 0:
+        return values.new_zeros((starts.numel(), values.shape[1]))
+    if values.device.type in ("cpu", "cuda"):
+        return F.embedding_bag(members, values, starts, mode="sum")
+    ends = torch.cat((starts[1:], starts.new_tensor([members.numel()])))
+    owner = torch.repeat_interleave(torch.arange(starts.numel(), device=starts.device), ends - starts)
+    return values.new_zeros((starts.numel(), values.shape[1])).index_add_(0, owner, values[members])
+
+
+def _to_parameters(table: Float[Tensor, "c m"], sums: Float[Tensor, "m g"]) -> Float[Tensor, "d m"]:
+    """Gradients of the drawn rows, from the backward kernel's sums.
+
+    sigma = (xx dx^2 + yy dy^2) / 2 + xy dx dy and alpha = opacity exp(-sigma), with d = mean - pixel.
+    """
+    xx, xy, yy, opacity = table[CONIC_XX : OPACITY + 1]
+    s, s_dx, s_dy, s_xx, s_xy, s_yy, red, green, blue, depth = sums.T[:GRADIENTS]
+    means = (xx * s_dx + xy * s_dy, xy * s_dx + yy * s_dy)
+    conics = (0.5 * s_xx, s_xy, 0.5 * s_yy)
+    return torch.stack((*means, depth, *conics, -s / opacity, red, green, blue))

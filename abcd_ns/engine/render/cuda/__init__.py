@@ -1,0 +1,1 @@
+"""The rasterizer that hands the work to gsplat's CUDA kernels."""

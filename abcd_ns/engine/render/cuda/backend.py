@@ -1,0 +1,191 @@
+"""The gsplat rasterizer: gsplat 1.4.0's CUDA kernels, unmodified, with crops, frozen Gaussians and z windows.
+
+Importing this module imports gsplat, which compiles its CUDA extension at the first call if need be.
+"""
+
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import gsplat
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.render.base import Cut, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, Packed
+from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_screen, project
+from abcd_ns.engine.render.extents import extents_of
+from abcd_ns.engine.render.projection import Splats, check_degree
+from abcd_ns.engine.render.splat_kernels import SPLAT_ROWS
+from abcd_ns.engine.render.z_window import ZWindow, showing
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+SURVEY_BYTES = 256 << 20
+"""Of what is projected into several views at once, to see where they see it."""
+SURVEYED_BYTES = 100
+"""Of a Gaussian in a view meanwhile."""
+
+
+class GsplatRasterizer(Rasterizer):
+    """gsplat 1.4.0 on CUDA, float32. The picture of a crop is that of the full image."""
+
+    window_side = TILE
+
+    def __init__(self) -> None:
+        self.name = f"gsplat-{gsplat.__version__}"
+        self._cameras = Cameras()
+
+    def warm_up(self) -> None:
+        """Nothing: gsplat compiles when it is imported, at the latest for the self-check."""
+
+    @torch.no_grad()
+    def project(
+        self, gaussians: Gaussians, view: View, *, sh_degree: int = 0, antialiased: bool = False
+    ) -> Splats:
+        """See Rasterizer.project."""
+        check_degree(gaussians, sh_degree)
+        if len(gaussians) == 0:
+            return Splats(gaussians.means.new_zeros((SPLAT_ROWS, 0)))
+        return project(gaussians, [view], self._cameras, sh_degree, antialiased).splats(0)
+
+    @torch.no_grad()
+    def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
+        """See Rasterizer.extents. Views are projected together, and all that is found is copied at once."""
+        if len(gaussians) == 0:
+            return super().extents(gaussians, views)
+        most = max(SURVEY_BYTES // (SURVEYED_BYTES * len(gaussians)), 1)
+        found: list[Tensor] = [torch.empty(0)] * len(views)
+        for places in _alike([(view.width, view.height, view.near) for view in views]):
+            for k in range(0, len(places), most):
+                part = places[k : k + most]
+                seen = [views[place] for place in part]
+                radii, means2d, *_ = place_on_screen(gaussians, seen, self._cameras)
+                for place, extent in zip(part, extents_of(means2d, radii, seen[0]), strict=True):
+                    found[place] = extent
+        return torch.stack(found).cpu()
+
+    def draw(
+        self,
+        gaussians: Gaussians,
+        shots: Sequence[Shot],
+        *,
+        sh_degree: int,
+        antialiased: bool = False,
+        absgrad: bool = False,
+    ) -> tuple[Raster, ...]:
+        """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
+        check_degree(gaussians, sh_degree)
+        rasters: dict[int, Raster] = {}
+        # Windows mask what is frozen, or the Gaussians: no list has both.
+        kinds = [(s.view.width, s.view.height, s.view.near, s.frozen is None) for s in shots]
+        for places in _alike(kinds):
+            drawn = self._draw_alike(gaussians, [shots[k] for k in places], sh_degree, antialiased, absgrad)
+            rasters.update(zip(places, drawn, strict=True))
+        for raster in rasters.values():
+            raster.info["n_cameras"] = len(shots)
+        return tuple(rasters[k] for k in range(len(shots)))
+
+    @torch.no_grad()
+    def cut(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        *,
+        front: ZWindow,
+        inside: ZWindow,
+        back: ZWindow,
+        crop: Crop,
+        sh_degree: int,
+        antialiased: bool = False,
+    ) -> Cut:
+        """See Rasterizer.cut. Projected and sorted once."""
+        splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
+        drawing = self._drawing_of(splats, crop, windowed=True)
+        members = drawing.members(drawing.inside([inside]))
+        layers = (drawing.only(drawing.inside([window])).layer() for window in (front, back))
+        return Cut(*layers, splats[members], members)
+
+    @torch.no_grad()
+    def depth_window(
+        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
+    ) -> ZWindow:
+        """See Rasterizer.depth_window."""
+        drawing = self._drawing_of(self.project(gaussians, view, antialiased=antialiased), crop)
+        return showing(drawing.sheet.grids[0], drawing.tile, drawing.z, drawing.weights(), visible)
+
+    def _drawing_of(self, splats: Splats, crop: Crop, windowed: bool = False) -> Drawing:
+        return Drawing.of(Packed.of_splats([(0, splats)]), [crop], self._cameras, windowed=windowed)
+
+    def _draw_alike(
+        self, gaussians: Gaussians, shots: Sequence[Shot], sh_degree: int, antialiased: bool, absgrad: bool
+    ) -> list[Raster]:
+        views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
+        frozen = [
+            (k, shot.frozen) for k, shot in enumerate(shots) if shot.frozen is not None and len(shot.frozen)
+        ]
+        if len(gaussians) == 0 and not frozen:
+            return _nothing(gaussians, shots)
+        own = project(gaussians, views, self._cameras, sh_degree, antialiased)
+        everyone = Packed.of(own)
+        if frozen:
+            everyone = everyone.and_then(Packed.of_splats(frozen))
+        windows = [shot.z_window for shot in shots]
+        windowed = any(window is not None for window in windows)
+        drawing = Drawing.of(everyone, crops, self._cameras, windowed=windowed)
+        if windowed:
+            always = 0 if shots[0].frozen is None else own.radii.numel()
+            drawing = drawing.only(drawing.inside(windows, always))
+        if absgrad and own.means2d.requires_grad:
+            _forward_absgrad(own.means2d, drawing.means2d)
+        info = _info(own, views[0])
+        return [
+            Raster(features[..., :3], transmittance, features[..., 3], info)
+            for features, transmittance in drawing.draw(absgrad)
+        ]
+
+
+def _alike(kinds: Sequence[object]) -> list[list[int]]:
+    """Places of equal kinds."""
+    return [[k for k, each in enumerate(kinds) if each == kind] for kind in dict.fromkeys(kinds)]
+
+
+def _forward_absgrad(means2d: Float[Tensor, "c n 2"], drawn: Float[Tensor, "m 2"]) -> None:
+    """Have gsplat's `absgrad`, which it leaves on the tensor it drew from, appear on `means2d` too.
+
+    The hook holds `means2d` weakly, and `means2d` holds `drawn`: otherwise the graph would hold itself.
+    """
+    means2d.drawn_from = drawn
+    reference = weakref.ref(means2d)
+
+    def copy(_: Tensor) -> None:
+        target = reference()
+        if target is not None:
+            target.absgrad = target.drawn_from.absgrad[: target.numel() // 2].view_as(target)
+
+    means2d.register_hook(copy)
+
+
+def _info(own: Projected, view: View) -> dict[str, Any]:
+    names = ("means2d", "radii", "depths", "conics", "opacities")
+    info: dict[str, Any] = {name: getattr(own, name) for name in names}
+    return info | {
+        "width": view.width,
+        "height": view.height,
+        "n_cameras": len(own.radii),
+        "camera_ids": None,
+        "gaussian_ids": None,
+    }
+
+
+def _nothing(gaussians: Gaussians, shots: Sequence[Shot]) -> list[Raster]:
+    """Empty drawings; gsplat is not asked. In the graph like any other, so that a loss has a gradient."""
+    means, opacities = (
+        gaussians.means.expand(len(shots), -1, -1),
+        gaussians.opacities[:, 0].expand(len(shots), -1),
+    )
+    features = means.new_zeros((len(shots), 0, 4))
+    empty = Projected(opacities.int(), means[..., :2], opacities, means, opacities, features)
+    zero, info = empty.means2d.sum(), _info(empty, shots[0].view)
+    colors = [zero.expand(shot.crop.height, shot.crop.width, 3) for shot in shots]
+    return [Raster(color, 1.0 - color[..., 0], color[..., 0], info) for color in colors]

@@ -1,0 +1,288 @@
+"""What gsplat draws in the crops of several cameras at once: one sorted list of (tile, depth) keys.
+
+Each key has the splat that it belongs to. Leaving out those whose depth is not within their tile's window is
+all that a z window takes. Lists keep their length for that, since the host would have to wait for a new one:
+what is left out goes to the end of the list, to a tile that is not drawn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+import torch.nn.functional as F
+from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles, rasterize_to_pixels
+from jaxtyping import Bool, Float, Int, Int64
+from torch import Tensor
+
+from abcd_ns.engine.render.cuda.projection import Cameras, Projected
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.types import Crop, Layer
+
+TILE = 16
+"""gsplat's tile size, pixels."""
+LAST_DEPTH = 0x7FFFFFFF
+"""No key's low half is larger: bits of a depth, which is positive."""
+
+
+@dataclass(frozen=True)
+class Packed:
+    """m splats of several cameras in one list; pixels of the full images."""
+
+    cameras: Int64[Tensor, "m"]
+    radii: Int[Tensor, "m"]
+    means2d: Float[Tensor, "m 2"]
+    depths: Float[Tensor, "m"]
+    conics: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, "m"]
+    features: Float[Tensor, "m 4"]
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+    @staticmethod
+    def of(projected: Projected) -> "Packed":
+        """Camera by camera."""
+        cameras, n = projected.radii.shape
+        numbers = torch.arange(cameras, device=projected.radii.device)[:, None].expand(-1, n)
+        return Packed(numbers.flatten(), *(value.flatten(0, 1) for value in vars(projected).values()))
+
+    @staticmethod
+    def of_splats(splats: Sequence[tuple[int, Splats]]) -> "Packed":
+        """(camera, what it sees) pairs."""
+        numbers = [s.planes.new_full((len(s),), camera, dtype=torch.int64) for camera, s in splats]
+        each = Splats(torch.cat([s.planes for _, s in splats], dim=1))
+        features = torch.cat((each.colors, each.depths[:, None]), dim=-1)
+        values = (each.radii, each.means2d, each.depths, each.conics, each.opacities, features)
+        return Packed(torch.cat(numbers), *(value.contiguous() for value in values))
+
+    def and_then(self, others: "Packed") -> "Packed":
+        """These, and others after them."""
+        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
+        return Packed(*(torch.cat(pair) for pair in pairs))
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A grid of tiles for each of several crops, all as large as the largest; a crop is in the upper left.
+
+    Crops are grown up and left to gsplat's tiles, so that their tiles are those of the full image. Tiles that
+    a crop does not have are not drawn.
+    """
+
+    crops: tuple[Crop, ...]
+    spare: bool
+    """Each has a row of tiles below the others, beyond every picture; for what a window leaves out."""
+
+    @cached_property
+    def grids(self) -> tuple[TileGrid, ...]:
+        return tuple(TileGrid(crop, TILE) for crop in self.crops)
+
+    @cached_property
+    def tiled(self) -> tuple[Crop, ...]:
+        """The crops as they are drawn."""
+        return tuple(
+            Crop(x := c.x - c.x % TILE, y := c.y - c.y % TILE, c.x + c.width - x, c.y + c.height - y)
+            for c in self.crops
+        )
+
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """(cameras, rows, columns) of tiles."""
+        rows = max(grid.rows for grid in self.grids) + self.spare
+        return len(self.crops), rows, max(grid.cols for grid in self.grids)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of what is drawn of each crop, px.
+
+        Whole tiles: of a masked one gsplat's kernel lets the threads go that have a pixel in the picture, and
+        the others would read the whole list.
+        """
+        return self.shape[2] * TILE, (self.shape[1] - self.spare) * TILE
+
+    @property
+    def _bits(self) -> int:
+        """Of a tile's number in a key, as gsplat has them."""
+        return (self.shape[1] * self.shape[2]).bit_length()
+
+    @property
+    def last_key(self) -> int:
+        """The largest: in the last tile of all."""
+        cameras, rows, cols = self.shape
+        return ((cameras - 1) << self._bits | rows * cols - 1) << 32 | LAST_DEPTH
+
+    def tile(self, keys: Int64[Tensor, "q"]) -> Int64[Tensor, "q"]:
+        """Number of each key's tile among those of all cameras."""
+        tile = keys >> 32
+        if len(self.crops) == 1:
+            return tile
+        return (tile >> self._bits) * (self.shape[1] * self.shape[2]) + (tile & (1 << self._bits) - 1)
+
+    def drawn(self, device: torch.device) -> Bool[Tensor, "c rows cols"] | None:
+        """Which tiles are; None for all."""
+        if all((grid.rows, grid.cols) == self.shape[1:] for grid in self.grids):
+            return None
+        drawn = torch.zeros(self.shape, dtype=torch.bool, device=device)
+        for each, grid in zip(drawn, self.grids, strict=True):
+            each[: grid.rows, : grid.cols].fill_(True)
+        return drawn
+
+    def spread(self, windows: Sequence[ZWindow | None], like: Tensor) -> Float[Tensor, "2 tiles"]:
+        """(near, far) of each camera's window; the same numbers twice, so nothing, where it has no tile."""
+        spread = []
+        for grid, window in zip(self.grids, windows, strict=True):
+            window = window or ZWindow.everything(grid, like.device, like.dtype)
+            window = window.on(grid)
+            beyond = (0, self.shape[2] - grid.cols, 0, self.shape[1] - grid.rows)
+            spread.append(F.pad(torch.stack((window.near, window.far)).view(2, grid.rows, grid.cols), beyond))
+        return torch.stack(spread, dim=1).view(2, -1)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Second half of gsplat's `rasterization(packed=True)`, for crops."""
+
+    splats: Packed
+    means2d: Float[Tensor, "m 2"]
+    """Relative to the upper left tile of each splat's crop."""
+    sheet: Sheet
+    keys: Int64[Tensor, "q"]
+    """Sorted: camera, tile, bits of the depth."""
+    owners: Int[Tensor, "q"]
+    """Whose they are."""
+
+    @staticmethod
+    def of(splats: Packed, crops: Sequence[Crop], cameras: Cameras, *, windowed: bool = False) -> "Drawing":
+        """What may be drawn in a crop of each camera.
+
+        Args:
+            windowed: leave room for what windows are going to leave out.
+        """
+        sheet = Sheet(tuple(crops), windowed)
+        # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
+        # By 0 too: a view would hold on to what it is of, which holds on to this (see _forward_absgrad).
+        corners = cameras.corners(sheet.tiled, splats.means2d)
+        means2d = splats.means2d - (corners if len(crops) == 1 else corners.index_select(0, splats.cameras))
+        if len(splats) == 0:
+            return Drawing(splats, means2d, sheet, splats.cameras, splats.cameras.int())
+        _, rows, cols = sheet.shape
+        _, keys, owners = isect_tiles(
+            means2d,
+            splats.radii,
+            splats.depths,
+            TILE,
+            cols,
+            rows,
+            packed=True,
+            n_cameras=len(crops),
+            camera_ids=splats.cameras,
+            gaussian_ids=splats.cameras,  # asked for, and not read
+        )
+        return Drawing(splats, means2d, sheet, keys, owners)
+
+    @property
+    def tile(self) -> Int64[Tensor, "q"]:
+        """Number of each pair's tile among those of all cameras."""
+        return self.sheet.tile(self.keys)
+
+    @property
+    def z(self) -> Float[Tensor, "q"]:
+        """Camera z of each pair's Gaussian."""
+        return self.splats.depths.index_select(0, self.owners)
+
+    def inside(self, windows: Sequence[ZWindow | None], always: int = 0) -> Bool[Tensor, "q"]:
+        """Which pairs lie within their tile's window.
+
+        Args:
+            windows: of each camera.
+            always: the first so many splats do.
+        """
+        near, far = self.sheet.spread(windows, self.splats.depths)
+        tile, z = self.tile, self.z
+        inside = (z >= near.index_select(0, tile)) & (z < far.index_select(0, tile))
+        return inside | (self.owners < always) if always else inside
+
+    def only(self, keep: Bool[Tensor, "q"]) -> "Drawing":
+        """Without some pairs. The others move up, in order, and the end of the lists belongs to the last
+        tile, a spare one: the host need not know how many there are.
+        """
+        count = len(keep)
+        place = torch.where(keep, keep.cumsum(0) - 1, count)  # the others: to one place, which is cut off
+        keys = self.keys.new_full((count + 1,), self.sheet.last_key).scatter_(0, place, self.keys)
+        owners = self.owners.new_zeros(count + 1).scatter_(0, place, self.owners)
+        return replace(self, keys=keys[:count], owners=owners[:count])
+
+    def members(self, keep: Bool[Tensor, "q"]) -> Int64[Tensor, "k"]:
+        """Which splats have any of these pairs; one wait."""
+        held = keep.new_zeros(len(self.splats) + 1)
+        held.index_fill_(0, torch.where(keep, self.owners, len(self.splats)).long(), True)
+        return held[:-1].nonzero()[:, 0]
+
+    def draw(self, absgrad: bool = False) -> list[tuple[Float[Tensor, "h w 4"], Float[Tensor, "h w"]]]:
+        """(features, transmittance) of each crop."""
+        splats = self.splats
+        features, alphas = self._rasterize(
+            self.means2d, splats.conics, splats.features, splats.opacities, self.owners, absgrad
+        )
+        parts = self._parts()
+        return [
+            (feature[part], 1.0 - alpha[part][..., 0])
+            for feature, alpha, part in zip(features.unbind(), alphas.unbind(), parts, strict=True)
+        ]
+
+    def layer(self) -> Layer:
+        """What the only crop looks like."""
+        ((features, transmittance),) = self.draw()
+        return Layer(features[..., :3], transmittance)
+
+    def weights(self) -> Float[Tensor, "q"]:
+        """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels in the only crop.
+
+        Each pair is drawn as if it were a Gaussian of its own: the gradient of the picture's sum by its
+        colour, of which one channel will do, is its weight.
+        """
+        count = len(self.owners)
+        if count == 0:
+            return self.z
+        parts = (self.means2d, self.splats.conics, self.splats.opacities)
+        means2d, conics, opacities = (part.index_select(0, self.owners) for part in parts)
+        dark = means2d.new_zeros((count, 1)).requires_grad_()
+        each = torch.arange(count, device=dark.device, dtype=self.owners.dtype)
+        with torch.enable_grad():
+            picture, _ = self._rasterize(means2d, conics, dark, opacities, each)
+            (found,) = torch.autograd.grad(picture[0][self._parts()[0]].sum(), dark)
+        return found[:, 0]
+
+    def _rasterize(
+        self,
+        means2d: Float[Tensor, "p 2"],
+        conics: Float[Tensor, "p 3"],
+        features: Float[Tensor, "p f"],
+        opacities: Float[Tensor, "p"],
+        owners: Int[Tensor, "q"],
+        absgrad: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        cameras, rows, cols = self.sheet.shape
+        return rasterize_to_pixels(
+            means2d,
+            conics,
+            features,
+            opacities,
+            *self.sheet.size,
+            TILE,
+            isect_offset_encode(self.keys, cameras, cols, rows),
+            owners,
+            # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
+            masks=self.sheet.drawn(means2d.device),
+            packed=True,
+            absgrad=absgrad,
+        )
+
+    def _parts(self) -> list[tuple[slice, slice]]:
+        """Rows and columns of each crop in what is drawn of it."""
+        return [
+            crop.within(tiled).slices for crop, tiled in zip(self.sheet.crops, self.sheet.tiled, strict=True)
+        ]

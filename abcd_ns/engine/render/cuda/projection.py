@@ -1,0 +1,146 @@
+"""Gaussians as several cameras see them, in gsplat's shapes, and these cameras on the device."""
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+
+import torch
+from gsplat.cuda._wrapper import fully_fused_projection, spherical_harmonics
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+MOST_KEPT = 1 << 14
+"""Small tensors that are kept on the device; then all are forgotten."""
+
+
+class Kept:
+    """Small tensors on the device that steps would otherwise upload again and again."""
+
+    def __init__(self) -> None:
+        self._held: dict[Hashable, Tensor] = {}
+
+    def get(self, keys: Sequence[Hashable], make: Callable[[list[int]], Sequence[Tensor]]) -> list[Tensor]:
+        """A tensor for each key; `make` is asked once for all places whose key is new."""
+        new = [k for k, key in enumerate(keys) if key not in self._held]
+        if new:
+            if len(self._held) + len(new) > MOST_KEPT:
+                self._held.clear()
+                new = list(range(len(keys)))
+            with torch.inference_mode(False), torch.no_grad():  # they outlive this call
+                self._held.update(zip((keys[k] for k in new), make(new), strict=True))
+        return [self._held[key] for key in keys]
+
+
+class Cameras:
+    """Matrices of views, which are on the CPU, and corners of crops, on the device."""
+
+    def __init__(self) -> None:
+        self._views: dict[tuple[int, int], View] = {}
+        self._poses, self._corners = Kept(), Kept()
+
+    def poses(
+        self, views: Sequence[View], like: Tensor
+    ) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c 3 3"], Float[Tensor, "c 3"]]:
+        """World to camera, intrinsics, and centres in world space; all new ones in one copy."""
+
+        def make(new: list[int]) -> Sequence[Tensor]:
+            for k in new:  # holds on to tensors by whose identity views are known
+                self._views[id(views[k].viewmat), id(views[k].K)] = views[k]
+            rows = (
+                torch.cat((v.viewmat.flatten(), v.K.flatten(), v.center)) for v in (views[k] for k in new)
+            )
+            return torch.stack(list(rows)).to(like, non_blocking=True).unbind()
+
+        place = like.device, like.dtype
+        if len(self._views) > MOST_KEPT:
+            self._views, self._poses = {}, Kept()
+        found = self._poses.get([(id(view.viewmat), id(view.K), *place) for view in views], make)
+        packed = torch.stack(found)
+        return packed[:, :16].view(-1, 4, 4), packed[:, 16:25].view(-1, 3, 3), packed[:, 25:]
+
+    def corners(self, crops: Sequence[Crop], like: Tensor) -> Float[Tensor, "c 2"]:
+        """(x, y) of upper left corners; written there by the device, so nothing is copied."""
+
+        def make(new: list[int]) -> Sequence[Tensor]:
+            pairs, place = (
+                ((crops[k].x, crops[k].y) for k in new),
+                {"dtype": like.dtype, "device": like.device},
+            )
+            return [torch.stack([torch.full((), x, **place) for x in pair]) for pair in pairs]
+
+        keys = [(crop.x, crop.y, like.device, like.dtype) for crop in crops]
+        return torch.stack(self._corners.get(keys, make))
+
+
+@dataclass(frozen=True)
+class Projected:
+    """n Gaussians in each of c cameras of one image size and near plane; pixels of the full images."""
+
+    radii: Int[Tensor, "c n"]
+    """0 where nothing is drawn; nothing else is initialised there."""
+    means2d: Float[Tensor, "c n 2"]
+    depths: Float[Tensor, "c n"]
+    conics: Float[Tensor, "c n 3"]
+    opacities: Float[Tensor, "c n"]
+    features: Float[Tensor, "c n 4"]
+    """Colour, then depth: what is composited."""
+
+    def splats(self, camera: int) -> Splats:
+        """As one of the cameras sees them."""
+        rows = (
+            self.means2d[camera].T,
+            self.depths[camera, None],
+            self.conics[camera].T,
+            self.opacities[camera, None],
+            self.features[camera, :, :3].T,
+            self.radii.new_zeros((3, self.radii.shape[1])),  # covariances
+            self.radii[camera, None],
+        )
+        return Splats(torch.cat([row.to(self.depths) for row in rows]))
+
+
+def place_on_screen(
+    gaussians: Gaussians, views: Sequence[View], cameras: Cameras, antialiased: bool = False
+) -> tuple[Tensor | None, ...]:
+    """radii, means2d, depths, conics as in Projected, compensations or None, and the cameras' centres."""
+    viewmats, Ks, centers = cameras.poses(views, gaussians.means)
+    found = fully_fused_projection(
+        gaussians.means,
+        None,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        viewmats,
+        Ks,
+        views[0].width,
+        views[0].height,
+        near_plane=views[0].near,
+        packed=False,
+        calc_compensations=antialiased,
+    )
+    return *found, centers
+
+
+def project(
+    gaussians: Gaussians, views: Sequence[View], cameras: Cameras, sh_degree: int, antialiased: bool
+) -> Projected:
+    """The first half of gsplat's `rasterization(packed=False)`, for the full images.
+
+    Args:
+        views: of one size and near plane.
+    """
+    radii, means2d, depths, conics, compensations, centers = place_on_screen(
+        gaussians, views, cameras, antialiased
+    )
+    opacities = gaussians.opacities[:, 0].sigmoid().expand(len(views), -1)
+    if compensations is not None:
+        opacities = opacities * compensations
+    used = (sh_degree + 1) ** 2
+    coefficients = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)[:, :used]
+    # Camera by camera: for all at once gsplat would copy the coefficients, most of a Gaussian, for each.
+    directions = (gaussians.means - centers[:, None]).unbind()
+    seen = zip(directions, (radii > 0).unbind(), strict=True)
+    colors = torch.stack([spherical_harmonics(sh_degree, d, coefficients, masks=m) for d, m in seen])
+    features = torch.cat((torch.clamp_min(colors + 0.5, 0.0), depths[..., None]), dim=-1)
+    return Projected(radii, means2d, depths, conics, opacities, features)

@@ -1,0 +1,93 @@
+"""The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from abcd_ns.engine.kernels.photometric import SSIM_WINDOW, photometric_sums
+
+
+class _Photometric(torch.autograd.Function):
+    """`weights` . `photometric_sums`, which finds the gradient in the same go."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, rendered: Float[Tensor, "3 h w"], photo: Float[Tensor, "3 h w"], weights: Float[Tensor, "2"]
+    ) -> Float[Tensor, ""]:
+        sums, gradient = photometric_sums(rendered, photo, weights)
+        ctx.save_for_backward(gradient)
+        return (sums * weights).sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Float[Tensor, ""]) -> tuple[Float[Tensor, "3 h w"], None, None]:
+        return grad * ctx.saved_tensors[0], None, None
+
+
+def photometric_loss(
+    rendered: Float[Tensor, "h w 3"],
+    photo: Float[Tensor, "h w 3"],
+    *,
+    full_pixels: int,
+    full_windows: int,
+    ssim_lambda: float = 0.2,
+    pixel_loss: Literal["l1", "l2"] = "l1",
+) -> Float[Tensor, ""]:
+    """(1 - lambda) L1 + lambda (1 - SSIM), summed over the crop and divided by the full image's counts.
+
+    Kerbl et al. 2023, equation 7. Dividing by the full image's number of pixels (and of SSIM windows that
+    lie wholly inside the image) makes a crop's loss the full image's less what lies outside the crop, so
+    gradients, and densification thresholds with them, mean the same at every crop size.
+
+    Args:
+        full_pixels: H W of the full image.
+        full_windows: (H - 10)(W - 10) of the full image, or 0 where it is too small for one window.
+        pixel_loss: l2 takes the squared difference in L1's place.
+    """
+    height, width = rendered.shape[:2]
+    by_pixel = (1 - ssim_lambda) / (3 * full_pixels)
+    has_windows = ssim_lambda > 0 and full_windows > 0 and min(height, width) >= SSIM_WINDOW
+    if not has_windows:
+        return by_pixel * _by_pixels(rendered, photo, pixel_loss)
+    in_kernel = by_pixel if pixel_loss == "l1" else 0.0
+    weights = _pair(in_kernel, ssim_lambda / (3 * full_windows), rendered.dtype, rendered.device)
+    planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
+    loss = _Photometric.apply(*planes, weights)
+    return loss if pixel_loss == "l1" else loss + by_pixel * _by_pixels(rendered, photo, pixel_loss)
+
+
+@functools.lru_cache(maxsize=1024)
+def _pair(first: float, second: float, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2"]:
+    """Two numbers on the device, without a copy."""
+    with torch.inference_mode(False):  # they outlive this call
+        return torch.stack([torch.full((), x, dtype=dtype, device=device) for x in (first, second)])
+
+
+def _by_pixels(
+    rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], pixel_loss: Literal["l1", "l2"]
+) -> Float[Tensor, ""]:
+    difference = rendered - photo
+    return difference.abs().sum() if pixel_loss == "l1" else difference.square().sum()
+
+
+def ssim_windows(height: int, width: int) -> int:
+    """How many SSIM windows lie wholly inside an image; 0 where it is smaller than one."""
+    return max(height - SSIM_WINDOW + 1, 0) * max(width - SSIM_WINDOW + 1, 0)
+
+
+def psnr(rendered: Float[Tensor, "..."], photo: Float[Tensor, "..."]) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio in dB for values in 0..1; infinite where both are equal."""
+    return -10 * torch.log10(torch.mean((rendered - photo) ** 2))
+
+
+@torch.no_grad()
+def psnrs(
+    rendered: Sequence[Float[Tensor, "..."]], photos: Sequence[Float[Tensor, "..."]]
+) -> list[Float[Tensor, ""]]:
+    """The PSNR of each pair, dB."""
+    return [psnr(a, b) for a, b in zip(rendered, photos, strict=True)]

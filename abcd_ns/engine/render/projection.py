@@ -1,0 +1,143 @@
+"""Gaussians as one camera sees them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from abcd_ns.engine.gaussians.spherical_harmonics import BASES, MAX_SH_DEGREE
+from abcd_ns.engine.render import splat_kernels as rows
+from abcd_ns.engine.types import Gaussians, View
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians as a rasterizer draws them. Pixels of the full image throughout."""
+
+    planes: Float[Tensor, "r n"]
+    """A row for each quantity, see splat_kernels."""
+
+    def __len__(self) -> int:
+        return self.planes.shape[1]
+
+    @property
+    def means2d(self) -> Float[Tensor, "n 2"]:
+        """Centres (x, y)."""
+        return self.planes[: rows.DEPTH].T
+
+    @property
+    def depths(self) -> Float[Tensor, "n"]:
+        """Camera z of the 3D centres, world units."""
+        return self.planes[rows.DEPTH]
+
+    @property
+    def conics(self) -> Float[Tensor, "n 3"]:
+        """Inverses of the 2D covariances (xx, xy, yy), blur included."""
+        return self.planes[rows.CONIC_XX : rows.OPACITY].T
+
+    @property
+    def opacities(self) -> Float[Tensor, "n"]:
+        """After the sigmoid and, if antialiased, after compensation."""
+        return self.planes[rows.OPACITY]
+
+    @property
+    def colors(self) -> Float[Tensor, "n 3"]:
+        """As this camera sees them: linear, 0 or more, may exceed 1."""
+        return self.planes[rows.RED : rows.GRADED].T
+
+    @property
+    def radii(self) -> Int[Tensor, "n"]:
+        """3 sigma along the longer axis, rounded up; 0 for what no pixel sees."""
+        return self.planes[rows.RADIUS].detach().int()
+
+    def __getitem__(self, index: Int[Tensor, "m"]) -> "Splats":
+        """Those at `index`."""
+        return Splats(self.planes.index_select(1, index))
+
+
+class _Splat(torch.autograd.Function):
+    """`splat` and its gradient by the Gaussians; nothing but the inputs is kept in between."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"], built: bool
+    ) -> Float[Tensor, "r n"]:
+        ctx.save_for_backward(parameters, camera)
+        ctx.built = built
+        return rows.SPLAT(parameters, camera, built=built)[0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Float[Tensor, "r n"]) -> tuple[Float[Tensor, "p n"], None, None]:
+        graded = grad[: rows.GRADED].contiguous()
+        return rows.SPLAT_BACKWARD(*ctx.saved_tensors, graded, built=ctx.built)[0], None, None
+
+
+def pack(gaussians: Gaussians) -> Float[Tensor, "p n"]:
+    """Gaussians as `splat` takes them; worth keeping where many views look at the same ones."""
+    parts = [gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.features_dc]
+    rest = gaussians.features_rest.flatten(1)
+    missing = 3 * BASES - rest.shape[1]
+    return torch.cat((*parts, F.pad(rest, (0, missing)) if missing else rest), dim=1).T.contiguous()
+
+
+def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) -> Float[Tensor, "c"]:
+    """A view as `splat` takes it, in the dtype and on the device of `like`; one copy to the device."""
+    viewmat, K = view.viewmat, view.K
+    options = viewmat.new_tensor([view.width, view.height, float(antialiased)])
+    degrees = [float(degree < sh_degree) for degree in range(MAX_SH_DEGREE)]
+    pinhole = (K[0, 0, None], K[1, 1, None], K[:2, 2])
+    pose = (viewmat[:3, :3].reshape(-1), viewmat[:3, 3])
+    rest = (options, view.center, viewmat.new_tensor([view.near, *degrees]))
+    return torch.cat((*pose, *pinhole, *rest)).to(like)
+
+
+def project_packed(
+    parameters: Float[Tensor, "p n"],
+    view: View,
+    *,
+    sh_degree: int = 0,
+    antialiased: bool = False,
+    built: bool = True,
+) -> Splats:
+    """See `project`; of packed Gaussians."""
+    camera = camera_numbers(view, parameters, sh_degree, antialiased)
+    if camera.requires_grad and torch.is_grad_enabled():
+        return Splats(rows.splat(parameters, camera)[0])
+    return Splats(_Splat.apply(parameters, camera, built))
+
+
+def project(
+    gaussians: Gaussians,
+    view: View,
+    *,
+    sh_degree: int = 0,
+    antialiased: bool = False,
+    built: bool = True,
+) -> Splats:
+    """Project Gaussians into a view; differentiable in the Gaussians, and in the pose if it takes gradients.
+
+    Args:
+        sh_degree: the degree of spherical harmonics in use.
+        antialiased: multiply opacities by sqrt(det(cov) / det(cov + blur)), as in Mip-Splatting.
+        built: use machine code where it is there.
+
+    Raises:
+        ValueError: `sh_degree` is above 3, or above what the Gaussians hold.
+    """
+    check_degree(gaussians, sh_degree)
+    options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": built}
+    return project_packed(pack(gaussians), view, **options)
+
+
+def check_degree(gaussians: Gaussians, sh_degree: int) -> None:
+    """Raise ValueError unless the Gaussians hold harmonics of `sh_degree`."""
+    if not 0 <= sh_degree <= min(MAX_SH_DEGREE, gaussians.sh_degree):
+        raise ValueError(
+            f"sh_degree is {sh_degree}, but the Gaussians hold degrees up to {gaussians.sh_degree}, and "
+            f"degrees above {MAX_SH_DEGREE} are not supported; lower sh_degree."
+        )

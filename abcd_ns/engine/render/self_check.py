@@ -1,0 +1,161 @@
+"""A backend proves itself on a tiny scene before it is trusted with hours of training."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.render.base import Raster, Rasterizer, Shot
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
+
+TOLERANCE = 2e-3
+"""Largest difference allowed, relative to the largest value; float32 kernels with fast exponentials stay
+well below, a wrong sign or a lost term is far above."""
+WIDTH, HEIGHT, COUNT = 40, 24, 24
+
+
+def check_scene(device: torch.device | str) -> tuple[Gaussians, View]:
+    """24 Gaussians of degree 3, some overlapping, in front of a 40 x 24 camera; no random numbers."""
+    i = torch.arange(COUNT, dtype=torch.float64)
+
+    def wave(*frequencies: float) -> Float[Tensor, "n c"]:
+        return torch.stack([torch.sin(f * (i + 1)) for f in frequencies], dim=-1)
+
+    rest = wave(*(0.37 * (k + 1) for k in range(45))).view(COUNT, 15, 3)
+    gaussians = Gaussians(
+        means=wave(1.3, 2.1, 0.7) * torch.tensor([1.6, 1.0, 1.0], dtype=torch.float64)
+        + torch.tensor([0.0, 0.0, 4.0]),
+        scales=0.5 * wave(0.9, 1.7, 2.9) - 1.5,
+        quats=wave(0.3, 1.1, 1.9, 2.3),
+        features_dc=wave(0.6, 1.4, 2.2),
+        features_rest=0.2 * rest,
+        opacities=2 * wave(1.6) + 0.5,
+    )
+    K = torch.tensor([[32.0, 0.0, 19.5], [0.0, 30.0, 12.5], [0.0, 0.0, 1.0]])
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
+    return gaussians.to(device=device, dtype=torch.float32), View(viewmat, K, WIDTH, HEIGHT)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something that training asks of a rasterizer."""
+
+    name: str
+    crop: Crop | None = None
+    frozen: int = 0
+    """So many of the Gaussians are frozen."""
+    sizes: tuple[float, ...] = (1.0,)
+    """Views are drawn together, each with an image so many times as large as the scene's."""
+    antialiased: bool = False
+    windowed: bool = False
+    """Each tile has a z window, some of them empty."""
+    sh_degree: int = 3
+
+    def shots(self, rasterizer: Rasterizer, frozen: Gaussians, view: View) -> list[Shot]:
+        """What is to be drawn."""
+        views = [_resized(view, size) for size in self.sizes]
+        options = {"sh_degree": self.sh_degree, "antialiased": self.antialiased}
+        seen = [rasterizer.project(frozen, each, **options) if self.frozen else None for each in views]
+        crops = [self.crop or each.full for each in views]
+        windows = [_window(rasterizer, crop, frozen.device) if self.windowed else None for crop in crops]
+        return [Shot(*shot) for shot in zip(views, crops, seen, windows, strict=True)]
+
+
+CASES = (
+    Case("a whole view"),
+    Case("an antialiased view", antialiased=True),
+    Case("a crop", crop=Crop(9, 5, 23, 13), sh_degree=1),
+    Case("a view with frozen splats", frozen=9),
+    Case("a crop with frozen splats", crop=Crop(18, 3, 17, 20), frozen=9, antialiased=True),
+    Case("two views of different sizes", sizes=(1.0, 1.4), sh_degree=2),
+    Case("a z window", windowed=True),
+    Case("a crop with frozen splats in a z window", crop=Crop(18, 3, 17, 20), frozen=9, windowed=True),
+)
+
+
+def _window(rasterizer: Rasterizer, crop: Crop, device: torch.device) -> ZWindow:
+    """Windows that differ from tile to tile."""
+    grid = rasterizer.window_grid(crop)
+    tile = torch.arange(grid.tiles, device=device, dtype=torch.float32)
+    near = 3.6 + torch.sin(2.3 * tile)
+    return ZWindow(grid, near, near + 1.1 + torch.sin(1.7 * tile + 1))
+
+
+def _resized(view: View, times: float) -> View:
+    scale = view.K.new_tensor([[times], [times], [1.0]])
+    return replace(view, K=view.K * scale, width=round(times * view.width), height=round(times * view.height))
+
+
+def _loss(raster: Raster) -> Float[Tensor, ""]:
+    """Depends on every output of every pixel, differently."""
+    planes = torch.cat((raster.color, raster.transmittance[..., None], 0.2 * raster.depth[..., None]), dim=-1)
+    weights = torch.cos(torch.arange(planes.numel(), device=planes.device, dtype=planes.dtype)).view_as(
+        planes
+    )
+    return (planes * weights).sum()
+
+
+@torch.enable_grad()  # whoever evaluates or renders asks for the first picture without
+def values_and_gradients(
+    rasterizer: Rasterizer, device: torch.device | str, case: Case, shift: float = 0.0
+) -> dict[str, Tensor]:
+    """All that a rasterizer finds in a case, by name; float64 on the CPU.
+
+    Args:
+        shift: added to the logits of all opacities.
+    """
+    gaussians, view = check_scene(device)
+    gaussians = replace(gaussians, opacities=gaussians.opacities + shift)
+    own, frozen = gaussians[: COUNT - case.frozen], gaussians[COUNT - case.frozen :]
+    leaves = {name: value.clone().requires_grad_() for name, value in own.items()}
+    shots = case.shots(rasterizer, frozen, view)
+    options = {"sh_degree": case.sh_degree, "antialiased": case.antialiased, "absgrad": True}
+    rasters = rasterizer.draw(Gaussians(**leaves), shots, **options)
+    means2d = [info["means2d"] for info in {id(raster.info): raster.info for raster in rasters}.values()]
+    for each in means2d:
+        each.retain_grad()
+    sum(map(_loss, rasters)).backward()
+    planes = ("color", "transmittance", "depth")
+    results = {name: [getattr(raster, name).flatten() for raster in rasters] for name in planes}
+    results |= {f"gradient of {name}": [leaves[name].grad] for name in PARAM_NAMES}
+    results["gradient of means2d"] = [each.grad for each in means2d]
+    results["absolute gradient of means2d"] = [getattr(m, "absgrad", torch.zeros_like(m)) for m in means2d]
+    return {name: torch.cat(value).detach().cpu().double() for name, value in results.items()}
+
+
+def self_check(rasterizer: Rasterizer, device: torch.device | str) -> float:
+    """Compare a rasterizer with the torch backend, forward and gradient, on a tiny fixed scene, in all CASES.
+
+    A backend whose picture is right and whose gradient is wrong trains to a much worse model without any
+    error, as a port of gsplat to other hardware once did; hence this check at every start.
+
+    Returns:
+        The largest difference, relative to the largest value of its kind.
+
+    Raises:
+        RuntimeError: a value or gradient differs by more than rounding.
+    """
+    largest, reference = 0.0, TorchRasterizer("never", window_side=rasterizer.window_side)
+    for case in CASES:
+        expected = values_and_gradients(reference, "cpu", case)
+        for name, error in errors(values_and_gradients(rasterizer, device, case), expected).items():
+            if not error <= TOLERANCE:  # NaN fails too
+                raise RuntimeError(
+                    f'The rasterizer "{rasterizer.name}" on {device} is off in {name} of {case.name} by '
+                    f"{error:.2g} of the largest value, so its kernels cannot be trusted there. Set the "
+                    'rasterizer to "torch".'
+                )
+            largest = max(largest, error)
+    return largest
+
+
+def errors(found: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float]:
+    """The largest difference of each kind, as a share of the largest expected value of its kind."""
+    return {
+        name: float((found[name] - value).abs().max() / value.abs().max().clamp_min(1e-12))
+        for name, value in expected.items()
+    }

@@ -1,0 +1,118 @@
+"""Which fragments count: a range of camera z for each tile of a picture (fragment ownership).
+
+A fragment is one Gaussian at one pixel; its z is the camera z of the Gaussian's mean. Rasterizers sort
+Gaussians by tile, and within a tile by z, so a window for each tile is a filter of that list and needs no
+kernel of its own. Windows that tile z in each tile part its list into runs: drawn each by itself and folded,
+they give the whole picture, whatever the side of the tiles.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from abcd_ns.engine.render.tile_grid import TileGrid
+
+
+@dataclass(frozen=True)
+class ZWindow:
+    """In each tile of a crop, fragments are drawn where near <= z < far.
+
+    An empty interval (near >= far) draws nothing. Infinities are allowed.
+    """
+
+    grid: TileGrid
+    near: Float[Tensor, "t"]
+    far: Float[Tensor, "t"]
+
+    @staticmethod
+    def everything(grid: TileGrid, device: torch.device | str, dtype: torch.dtype) -> "ZWindow":
+        """All of z, everywhere."""
+        infinity = torch.full((grid.tiles,), math.inf, device=device, dtype=dtype)
+        return ZWindow(grid, -infinity, infinity)
+
+    def holds(self, tile: Int[Tensor, "q"], z: Float[Tensor, "q"]) -> Bool[Tensor, "q"]:
+        """Whether fragments at z count in a tile, for pairs of both."""
+        return (z >= self.near.index_select(0, tile)) & (z < self.far.index_select(0, tile))
+
+    def before(self, other: "ZWindow") -> "ZWindow":
+        """The part of this window in front of another one."""
+        return ZWindow(self.grid, self.near, torch.minimum(self.far, other.near))
+
+    def behind(self, other: "ZWindow") -> "ZWindow":
+        """The part of this window behind another one."""
+        return ZWindow(self.grid, torch.maximum(self.near, other.far), self.far)
+
+    def on(self, grid: TileGrid) -> "ZWindow":
+        """The same window on the tiles of a crop of this crop, as large as these or parts of them.
+
+        Raises:
+            ValueError: the grid's tiles are no parts of these, or its crop is not within this one.
+        """
+        if grid == self.grid:
+            return self
+        own, inner = self.grid.crop, grid.crop
+        inside = own.x <= inner.x and inner.x + inner.width <= own.x + own.width
+        inside = inside and own.y <= inner.y and inner.y + inner.height <= own.y + own.height
+        if self.grid.side % grid.side or not inside:
+            raise ValueError(f"a window on {self.grid} says nothing about {grid}")
+        tile = self.grid.holding(grid, torch.arange(grid.tiles, device=self.near.device))
+        return ZWindow(grid, self.near.index_select(0, tile), self.far.index_select(0, tile))
+
+
+@torch.no_grad()
+def showing(
+    grid: TileGrid,
+    tile: Int[Tensor, "q"],
+    z: Float[Tensor, "q"],
+    weight: Float[Tensor, "q"],
+    visible: float,
+) -> ZWindow:
+    """The range of camera z, in each tile, in which a set of Gaussians shows: the window of a visit.
+
+    Frozen fragments in front of this range and behind it can be drawn once for a visit; those in it have to
+    be sorted in with the Gaussians that are trained. So the range must hold every fragment that matters, and
+    the narrower it is, the less is drawn in each step. A cell's own depth range is neither: it leaves out
+    what reaches out of the cell, and holds much empty space.
+
+    Args:
+        tile, z, weight: of each pair of a Gaussian and a tile, sorted by tile and then by z; the weight is
+            the sum of alpha T over the tile's pixels.
+        visible: what the fragments in front of the range, and those behind it, weigh less than, together and
+            as a mean over the tile; 0 takes all.
+
+    Returns:
+        A window that holds all else. Where there is nothing it is empty, and lies in the midst of what
+        the crop shows.
+    """
+    ends = torch.searchsorted(tile, torch.arange(grid.tiles, device=tile.device), right=True)
+    share = weight.double() / grid.pixels(tile.device).index_select(0, tile)
+    so_far, mass = _from_zero(share), _from_zero(share * z)
+    starts = torch.cat((ends.new_zeros(1), ends[:-1]))
+    before, after = so_far[starts], so_far[ends]
+    # With what is in front of each pair, and with what is behind it; rounding must not lose any at 0.
+    head = so_far[1:] - before.index_select(0, tile)
+    tail = after.index_select(0, tile) - so_far[:-1]
+    every = visible <= 0
+    near = _extreme(grid, tile, torch.where((head >= visible) | every, z, math.inf), "amin")
+    far = _extreme(grid, tile, torch.where((tail >= visible) | every, z, -math.inf), "amax")
+    near, far, empty = torch.minimum(near, far), torch.maximum(near, far), near.isinf()
+    # Half open: the next number after the last depth.
+    far = torch.nextafter(far, torch.full_like(far, math.inf))
+
+    held = after - before
+    midst = torch.where(held > 0, (mass[ends] - mass[starts]) / held, mass[-1] / so_far[-1])
+    midst = midst.nan_to_num(0.0).to(z)
+    return ZWindow(grid, torch.where(empty, midst, near), torch.where(empty, midst, far))
+
+
+def _extreme(grid: TileGrid, tile: Int[Tensor, "q"], z: Float[Tensor, "q"], which: str) -> Float[Tensor, "t"]:
+    start = z.new_full((grid.tiles,), math.inf if which == "amin" else -math.inf)
+    return start.scatter_reduce(0, tile, z, which)
+
+
+def _from_zero(values: Float[Tensor, "q"]) -> Float[Tensor, "q+1"]:
+    """Sums of the first 0, 1, 2, ... values."""
+    return torch.cat((values.new_zeros(1), values.cumsum(0)))

@@ -1,0 +1,127 @@
+"""Which blocks can be seen where, by their bounds alone: what cannot be seen is neither read nor drawn.
+
+A block's bounds are a few numbers, known once the block was read. Without them, one visit in a large scene
+would read every block of it for every part of space that it draws.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from abcd_ns.engine.space.tree import Box, in_float64
+from abcd_ns.engine.space.visibility import (
+    BLUR_PIXELS,
+    half_diagonal,
+    reach_radius,
+    widest_slant,
+    world_size,
+)
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+BOUNDS_SLANT = 3.0
+"""The largest `widest_slant` that bounds allow for: fields of view up to about 140 degrees."""
+ROUNDING = 2.0
+"""Frusta are this much wider than what they must hold, px; generously."""
+EVERYWHERE = Box(torch.full((3,), -torch.inf).double(), torch.full((3,), torch.inf).double())
+
+
+def bounds_of(gaussians: Gaussians) -> Box | None:
+    """A box that holds the means and, but for the screen's slack, all that any view may draw of them.
+
+    None without Gaussians; all of space where a mean or a size is not finite.
+    """
+    if len(gaussians) == 0:
+        return None
+    means = in_float64(gaussians.means).cpu()
+    radius = BOUNDS_SLANT * in_float64(reach_radius(gaussians.scales)).cpu()[:, None]
+    lower, upper = (means - radius).amin(dim=0), (means + radius).amax(dim=0)
+    if not bool((lower.isfinite() & upper.isfinite()).all()):
+        return EVERYWHERE
+    return Box(lower, upper)
+
+
+def intersection(a: Box, b: Box) -> Box | None:
+    """What two boxes share, their faces included; None if they are apart."""
+    lower, upper = torch.maximum(a.lower, b.lower), torch.minimum(a.upper, b.upper)
+    return Box(lower, upper) if bool((lower <= upper).all()) else None
+
+
+class Frusta:
+    """What some crops look at: the space between five planes each, kept on the CPU.
+
+    Args:
+        tile_side: of the tiles in which fragments are given to cells, px; see intervals.py.
+    """
+
+    def __init__(self, seen: Iterable[tuple[View, Crop]], tile_side: int) -> None:
+        self.seen = tuple(seen)
+        planes = [_planes(view, crop, ROUNDING + screen_slack(tile_side)) for view, crop in self.seen]
+        self._planes = torch.stack(planes) if planes else torch.zeros(0, 5, 4, dtype=torch.float64)
+
+    def may_show(self, boxes: Sequence[Box]) -> Bool[Tensor, "n v"]:
+        """Whether something in each box may be drawn in each crop; False is certain.
+
+        A box is out of sight if all its corners are beyond one of the planes.
+        """
+        if not boxes:
+            return torch.zeros(0, len(self.seen), dtype=torch.bool)
+        corners = _corners(torch.stack([torch.stack((box.lower, box.upper)) for box in boxes]))
+        inward = torch.einsum("nca,vpa->nvpc", corners, self._planes[..., :3]) + self._planes[..., 3:]
+        # A corner without end may give NaN, which is not below 0: then the box may show.
+        return ~(inward < 0).all(dim=3).any(dim=2)
+
+
+def screen_slack(tile_side: int) -> float:
+    """How far beyond its own size a Gaussian may count on screen, px: blur, and half a tile's diagonal."""
+    return BLUR_PIXELS + half_diagonal(tile_side)
+
+
+def _planes(view: View, crop: Crop, margin: float) -> Float64[Tensor, "5 4"]:
+    """(a, b) of each plane, a x + b >= 0 being the side that is seen."""
+    matrix, K = in_float64(view.viewmat).cpu(), in_float64(view.K).cpu()
+    x, y, z = matrix[:3]
+    near = z.clone()
+    near[3] -= view.near
+    planes = [near]
+    for row, axis, start, size in ((x, 0, crop.x, crop.width), (y, 1, crop.y, crop.height)):
+        pixel = K[axis, axis] * row + K[axis, 2] * z  # the pixel's coordinate times z
+        planes.append(pixel - (start - margin) * z)
+        planes.append((start + size + margin) * z - pixel)
+    return torch.stack(planes)
+
+
+def _corners(boxes: Float64[Tensor, "n 2 3"]) -> Float64[Tensor, "n 8 3"]:
+    choice = torch.cartesian_prod(*[torch.arange(2)] * 3)
+    return torch.stack([boxes[:, choice[:, axis], axis] for axis in range(3)], dim=2)
+
+
+class Optics:
+    """Bounds over all views, for tests of reach that do not depend on the view.
+
+    Args:
+        tile_side: of the tiles in which fragments are given to cells, px; see intervals.py.
+    """
+
+    def __init__(self, views: Sequence[View], tile_side: int) -> None:
+        centers = torch.stack([view.center.double().cpu() for view in views])
+        self._middle = centers.mean(dim=0)
+        self._spread = float((centers - self._middle).norm(dim=1).max())
+        self._widest = min(views, key=lambda view: float(view.K.diagonal()[:2].min()))
+        self._pixels = screen_slack(tile_side)
+        self.slant = max(widest_slant(view) for view in views)
+
+    def slack(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """What the screen adds to the reach of Gaussians with these means, as the farthest camera would see
+        it; world units."""
+        distance = (means - self._middle.to(means)).norm(dim=1) + self._spread
+        return world_size(self._pixels, distance, self._widest)
+
+    def drawn_within(self, bounds: Box) -> Box:
+        """Where fragments of Gaussians with these bounds may lie, whatever the view; the slack included."""
+        if self.slant > BOUNDS_SLANT or not bool(bounds.lower.isfinite().all()):
+            return EVERYWHERE
+        # The slack grows with the distance from a point, which is largest at a corner.
+        corners = _corners(torch.stack((bounds.lower, bounds.upper))[None])[0]
+        return bounds.grown(float(self.slack(corners).max()))

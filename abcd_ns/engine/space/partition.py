@@ -1,0 +1,189 @@
+"""How space is cut into blocks: a k-d tree balanced by count, or a regular grid."""
+
+import math
+from itertools import count
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from abcd_ns.engine.space.tree import BlockTree, Box, in_float64, tree_from_rows
+
+MAX_CELLS = 65_536
+"""The most cells that a grid may have: far more than any scene needs, few enough to fit in memory."""
+
+
+def best_split(
+    points: Float[Tensor, "n 3"], box: Box, share: float = 0.5, weights: Float[Tensor, "n"] | None = None
+) -> tuple[int, float]:
+    """Where to cut `box` so that `share` of the weight of its points falls to the left.
+
+    Takes the axis along which the points reach furthest, outliers aside, unless equal coordinates make
+    that cut miss its share by over a tenth of the weight and another axis does better. Points that all
+    coincide (or are missing) cannot be shared out: then an empty cell is cut off.
+
+    Args:
+        points: inside `box`, finite.
+        share: 0 to 1.
+        weights: >= 0; 1 each if left out.
+
+    Returns:
+        (axis, threshold), for BlockTree.split. The threshold lies strictly inside the box, and strictly
+        between two points' coordinates where float64 has room there.
+    """
+    points = in_float64(points).cpu()
+    weights = torch.ones(len(points), dtype=torch.float64) if weights is None else in_float64(weights).cpu()
+    total = float(weights.sum())
+    best: tuple[float, int, float] | None = None
+    for axis in _axes_by_extent(points):
+        cut = _cut_along(points[:, axis], weights, share * total)
+        if cut is not None and (best is None or cut[0] < best[0]):
+            best = (cut[0], axis, cut[1])
+        if best is not None and best[0] <= 0.1 * total:
+            break
+    if best is not None:
+        return best[1], best[2]
+    return _cut_off(box, points[0].tolist() if len(points) else [0.0] * 3)
+
+
+def build_kd(
+    points: Float[Tensor, "n 3"], num_blocks: int, weights: Float[Tensor, "n"] | None = None
+) -> BlockTree:
+    """A tree of `num_blocks` cells with equal numbers of points (or sums of weights); deterministic.
+
+    Counts differ by at most one where all coordinates are distinct. Points that coincide stay together,
+    so with few distinct points some blocks start empty, but there are always `num_blocks`.
+
+    Raises:
+        ValueError: `num_blocks` < 1, a point that is not finite, or weights that are not finite and >= 0.
+    """
+    if num_blocks < 1:
+        raise ValueError(f"cannot build {num_blocks} blocks: ask for 1 or more")
+    _check_finite(points)
+    weights = points.new_ones(len(points)) if weights is None else weights
+    if not bool((weights.isfinite() & (weights >= 0)).all()):
+        raise ValueError("weights must be finite and 0 or more")
+    points, weights = in_float64(points).cpu(), in_float64(weights).cpu()
+    everything = Box(torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double())
+    return _flatten(_kd_node(points, weights, everything, num_blocks))
+
+
+def build_grid(
+    points: Float[Tensor, "n 3"], counts: tuple[int, int, int] | None = None, cell_size: float | None = None
+) -> BlockTree:
+    """A regular grid, as nested splits, over where the points are (outliers aside).
+
+    Give either `counts`, the cells on each axis, or `cell_size`, their edge in world units. The outermost
+    cells reach to infinity.
+
+    Raises:
+        ValueError: both or neither given, not positive, over MAX_CELLS cells, or a point that is not finite.
+    """
+    if (counts is None) == (cell_size is None):
+        raise ValueError("a grid needs either counts or cell_size, and not both")
+    if (counts is not None and min(counts) < 1) or (cell_size is not None and not 0 < cell_size < math.inf):
+        raise ValueError(f"a grid needs positive counts or a positive cell_size, got {counts or cell_size}")
+    _check_finite(points)
+    start, stop = _robust_range(in_float64(points).cpu())
+    extents = (stop - start).tolist()
+    if counts is not None:
+        # Without any extent every cell size is as good as another; 1 keeps the planes apart.
+        sizes = [(extent or 1.0) / n for extent, n in zip(extents, counts, strict=True)]
+    else:
+        sizes = [float(cell_size)] * 3
+        # Capped so that the product below stays small enough for an integer.
+        counts = tuple(math.ceil(min(max(extent / cell_size, 1.0), 2.0 * MAX_CELLS)) for extent in extents)
+    if math.prod(counts) > MAX_CELLS:
+        raise ValueError(f"the grid would have over {MAX_CELLS} cells: make them fewer or larger")
+    grid = zip(start.tolist(), sizes, counts, strict=True)
+    return _flatten(_grid_node([[lo + size * i for i in range(1, n)] for lo, size, n in grid]))
+
+
+def _kd_node(points: Tensor, weights: Tensor, box: Box, k: int) -> tuple | None:
+    """The subtree of `k` cells over these points, as nested (axis, threshold, left, right); None is a leaf.
+
+    Rounding does not add up on the way down: of q k + r points with r < k, the left half of the cells gets
+    q (k // 2) and r's share, rounded. So q stays the same in all subtrees, and leaves get q or q + 1.
+    """
+    if k == 1:
+        return None
+    axis, threshold = best_split(points, box, (k // 2) / k, weights)
+    below = points[:, axis] < threshold
+    lower, upper = box.lower.clone(), box.upper.clone()
+    upper[axis] = lower[axis] = threshold
+    left = _kd_node(points[below], weights[below], Box(box.lower, upper), k // 2)
+    right = _kd_node(points[~below], weights[~below], Box(lower, box.upper), k - k // 2)
+    return axis, threshold, left, right
+
+
+def _grid_node(planes: list[list[float]]) -> tuple | None:
+    """The subtree over the cells between sorted `planes` of each axis, nested as in _kd_node."""
+    axis = max(range(3), key=lambda a: len(planes[a]))
+    if not planes[axis]:
+        return None
+    middle = len(planes[axis]) // 2
+    below = [p[:middle] if a == axis else p for a, p in enumerate(planes)]
+    above = [p[middle + 1 :] if a == axis else p for a, p in enumerate(planes)]
+    return axis, planes[axis][middle], _grid_node(below), _grid_node(above)
+
+
+def _robust_range(points: Float64[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+    """The 5th and 95th percentile on each axis; zeros without points."""
+    points = points if len(points) else points.new_zeros((1, 3))
+    tail = int(0.05 * (len(points) - 1))
+    return points.kthvalue(tail + 1, dim=0).values, points.kthvalue(len(points) - tail, dim=0).values
+
+
+def _axes_by_extent(points: Float64[Tensor, "n 3"]) -> list[int]:
+    """Axes from the widest to the narrowest; by the full range where the bulk of the points coincides."""
+    start, stop = _robust_range(points)
+    robust = (stop - start).tolist()
+    full = (points.amax(dim=0) - points.amin(dim=0)).tolist() if len(points) else robust
+    return sorted(range(3), key=lambda axis: (-robust[axis], -full[axis]))
+
+
+def _cut_along(
+    values: Float64[Tensor, "n"], weights: Float64[Tensor, "n"], target: float
+) -> tuple[float, float] | None:
+    """(miss, threshold) of the cut with about `target` weight below it; None if all values are equal."""
+    values, order = values.sort(stable=True)
+    gaps = (values[:-1] < values[1:]).nonzero()[:, 0]
+    if not len(gaps):
+        return None
+    misses = (weights[order].cumsum(dim=0)[gaps] - target).abs()
+    best = int(misses.argmin())
+    low, high = values[gaps[best] : gaps[best] + 2].tolist()
+    middle = low / 2 + high / 2  # Not (low + high) / 2, which may overflow.
+    return float(misses[best]), middle if low < middle < high else high
+
+
+def _cut_off(box: Box, point: list[float]) -> tuple[int, float]:
+    """(axis, threshold) of some plane through `box`, near `point` where the box gives no other hint."""
+    lower, upper = box.lower.tolist(), box.upper.tolist()
+    axis = max(range(3), key=lambda a: (math.isinf(lower[a]) + math.isinf(upper[a]), upper[a] - lower[a]))
+    lo, hi = lower[axis], upper[axis]
+    if math.isinf(lo):
+        return axis, point[axis] if math.isinf(hi) else hi - max(1.0, abs(hi))
+    return axis, lo + max(1.0, abs(lo)) if math.isinf(hi) else lo / 2 + hi / 2
+
+
+def _flatten(nested: tuple | None) -> BlockTree:
+    """The tree of nested (axis, threshold, left, right), blocks numbered from left to right."""
+    rows: list[tuple] = []
+    blocks = count()
+
+    def add(part: tuple | None) -> int:
+        node = len(rows)
+        rows.append((-1, 0.0, -1, -1, next(blocks)) if part is None else ())
+        if part is not None:
+            rows[node] = (part[0], part[1], add(part[2]), add(part[3]), -1)
+        return node
+
+    add(nested)
+    return tree_from_rows(rows)
+
+
+def _check_finite(points: Tensor) -> None:
+    bad = int((~points.isfinite()).any(dim=1).sum())
+    if bad:
+        raise ValueError(f"{bad} of {len(points)} points are NaN or infinite: drop them first")

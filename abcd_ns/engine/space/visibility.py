@@ -1,0 +1,100 @@
+"""What of a block can be seen where: footprints in the image, and reach into cells."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+DRAWN_SIGMAS = 3.33
+"""How far out a Gaussian is drawn, in standard deviations on screen. Fragments under alpha = 1/255 are
+skipped, and opacity is at most 1, so exp(-d^2 / 2) >= 1/255: d <= sqrt(2 ln 255) = 3.3291."""
+
+BLUR_VARIANCE = 0.3
+"""The variance that is added to every projected Gaussian (gsplat's eps2d), px^2."""
+BLUR_PIXELS = DRAWN_SIGMAS * math.sqrt(BLUR_VARIANCE)
+"""How far out it is drawn on that account alone, px."""
+
+
+def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int = 16) -> Crop | None:
+    """The smallest aligned crop that holds everything that some projected Gaussians can draw.
+
+    Args:
+        extent: where that is: (left, top, right, bottom), px; see Rasterizer.extents.
+        margin: grow by this many px (a loss that looks at neighbouring pixels needs it).
+        align: move the edges outward to multiples of this many px, or to the image's border. With the
+            rasterizer's tile size (gsplat's is 16) no pixel is missed: it draws a Gaussian on all of
+            each tile that its square touches, which may be beyond the square.
+
+    Returns:
+        The crop, or None if nothing is in the image.
+    """
+    if margin < 0 or align < 1:
+        raise ValueError(f"a footprint needs margin >= 0 and align >= 1, got {margin} and {align}")
+    x0, y0, x1, y1 = extent
+    if x0 > x1:
+        return None
+    x, width = _aligned_span(x0, x1, view.width, margin, align)
+    y, height = _aligned_span(y0, y1, view.height, margin, align)
+    return Crop(x, y, width, height)
+
+
+def reach_radius(scales: Float[Tensor, "n 3"], sigma: float = DRAWN_SIGMAS) -> Float[Tensor, "n"]:
+    """`sigma` standard deviations along each Gaussian's longest axis, world units; `scales` are logs."""
+    return sigma * scales.amax(dim=1).exp()
+
+
+def half_diagonal(side: int) -> float:
+    """From the middle of a tile of `side` px to its farthest point, px."""
+    return side / math.sqrt(2)
+
+
+def world_size(pixels: float, depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:
+    """How large so many px are at camera z = `depths`, at most; world units: z / f for each."""
+    return depths * (pixels / min(float(view.K[0, 0]), float(view.K[1, 1])))
+
+
+def widest_slant(view: View) -> float:
+    """How much longer a Gaussian may be drawn at its own camera z than it is: 1 / cos of the widest angle.
+
+    Splatting projects along the line of sight onto the plane of the mean's camera z: there an offset
+    (dx, dy, dz) lands at (dx - dz x/z, dy - dz y/z), longer by sqrt(1 + (x/z)^2 + (y/z)^2) at most. gsplat
+    clamps x/z at the image's border plus 0.15 of its width (0.3 tan of half the field of view); y/z alike.
+    """
+    limits = []
+    for size, focal, middle in (
+        (view.width, float(view.K[0, 0]), float(view.K[0, 2])),
+        (view.height, float(view.K[1, 1]), float(view.K[1, 2])),
+    ):
+        limits.append((max(middle, size - middle) + 0.15 * size) / focal)
+    return math.hypot(1.0, *limits)
+
+
+def reaches(
+    gaussians: Gaussians, box: Box, slack: Float[Tensor, "n"] | float = 0.0, slant: float = 2.0
+) -> Bool[Tensor, "n"]:
+    """Whether any fragment of each Gaussian may lie in `box`, from any view: False is certain.
+
+    True where the distance from the mean to the box is at most slant * reach_radius + slack.
+
+    Args:
+        slack: what the screen adds, world units: its blur (at most, as sqrt(a^2 + b^2) <= a + b), and half a
+            tile's diagonal, as a fragment's place is looked up on the ray through the middle of its tile.
+        slant: the largest `widest_slant` of the views in question. 2 covers fields of view up to about
+            90 degrees horizontally by 60 vertically.
+    """
+    means = gaussians.means
+    outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
+    return outside.norm(dim=1) <= slant * reach_radius(gaussians.scales) + slack
+
+
+def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -> tuple[int, int]:
+    """(first pixel, number of pixels) of [low, high] grown, aligned outward and clipped to 0 .. size."""
+    start = (math.floor(max(low, 0.0)) - margin) // align * align
+    stop = -((-math.ceil(min(high, float(size))) - margin) // align) * align
+    start, stop = max(start, 0), min(stop, size)
+    return start, stop - start

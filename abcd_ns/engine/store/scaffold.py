@@ -1,0 +1,85 @@
+"""The warm-up: as many Gaussians as the memory of one visit holds, all over the scene, trained at once.
+
+Blocks that begin among neighbours which are still blobs learn little from them, and each block's first
+visits are spent on that. A scaffold is a coarse picture of everything that fits where one block fits, needs
+no layers, and takes little of the time. The remaining Gaussians wait in reserve, then each in its block,
+unseen until that is visited for the first time: neighbours look to each other as they were trained to look.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.initialize import split_off
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store.special_blocks import RESERVE
+from abcd_ns.engine.types import Gaussians
+
+REVEALED_OPACITY = 0.02
+"""Of a Gaussian from the reserve: enough to be drawn and to learn, too little to spoil what is there."""
+REVEALED_SCALE = 0.5
+"""Its size, as a share of the distance to its neighbours."""
+WAITING = -100.0
+"""Logit of the opacity of a Gaussian that waits in its block for the first visit."""
+
+
+def put_to_wait(reserve: BlockState) -> BlockState:
+    """The reserve as it joins a trained scaffold: small, and not to be seen before its block is visited."""
+    old = reserve.gaussians
+    unseen = torch.full_like(old.opacities, WAITING)
+    scales = old.scales + math.log(REVEALED_SCALE)
+    return replace(reserve, gaussians=replace(old, opacities=unseen, scales=scales))
+
+
+def drawn(gaussians: Gaussians) -> Gaussians:
+    """Without those that wait."""
+    waits = _waits(gaussians)
+    return gaussians[~waits] if bool(waits.any()) else gaussians
+
+
+def revealed(gaussians: Gaussians) -> Gaussians:
+    """Those that waited, faint; the others as they are."""
+    waits = _waits(gaussians)
+    if not bool(waits.any()):
+        return gaussians
+    faint = math.log(REVEALED_OPACITY / (1 - REVEALED_OPACITY))
+    return replace(gaussians, opacities=gaussians.opacities.masked_fill(waits[:, None], faint))
+
+
+def _waits(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    return gaussians.opacities[:, 0] == WAITING
+
+
+def part(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
+    """By block, the rows that `owner` [n] gives it; the clocks stay those of `state`."""
+    return {block: state[owner == block] for block in owner.unique().tolist()}
+
+
+def join(states: list[BlockState]) -> BlockState:
+    """All in one, in order, under the clocks of the first."""
+    joined = states[0]
+    for state in states[1:]:
+        joined = joined.joined_by(state)
+    return joined
+
+
+def blocks_at_rest(
+    tree: BlockTree, gaussians: Gaussians, keep: int | None = None, seed: int = 0
+) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
+    """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
+
+    Args:
+        keep: begin with a scaffold of so many, the others, if any, in reserve; None for no warm-up.
+    """
+    if keep is None:
+        at_rest = part(BlockState.fresh(gaussians), tree.assign(gaussians.means))
+        nobody = BlockState.fresh(gaussians[:0])
+        return {b: at_rest.get(b, nobody).to_tensors() for b in range(tree.num_blocks)}
+    scaffold, waiting = split_off(gaussians, keep, seed)
+    reserve = BlockState.fresh(waiting).to_tensors()
+    return {**blocks_at_rest(tree, scaffold), RESERVE: reserve}

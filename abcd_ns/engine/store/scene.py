@@ -1,0 +1,283 @@
+"""Where the blocks of a scene are to be found: at rest in RAM and on disk, one of them live in parameters."""
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import accumulate, pairwise
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.space.culling import bounds_of
+from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.block_memory import BlockMemory
+from abcd_ns.engine.store.scaffold import drawn, part, revealed
+from abcd_ns.engine.store.special_blocks import INBOX, LIVE
+from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+
+
+@runtime_checkable
+class BlockScene(Protocol):
+    """Gaussians by block."""
+
+    tree: BlockTree
+
+    def gaussians(self, block: int) -> Gaussians:
+        """The block's Gaussians, without a graph, wherever they are kept."""
+        ...
+
+    def version(self, block: int) -> int:
+        """Changes whenever the block's Gaussians do."""
+        ...
+
+    def count(self, block: int) -> int:
+        """How many Gaussians the block has."""
+        ...
+
+    def bounds(self, block: int) -> Box | None:
+        """`bounds_of` the block's Gaussians."""
+        ...
+
+
+class MemoryScene:
+    """A scene that is one list of Gaussians in memory, parted by a tree."""
+
+    def __init__(self, tree: BlockTree, gaussians: Gaussians) -> None:
+        self.tree = tree
+        owner = tree.assign(gaussians.means)
+        if bool((owner.diff() < 0).any()):
+            gaussians = gaussians[owner.argsort(stable=True)]
+        sizes = owner.bincount(minlength=tree.num_blocks).tolist()
+        ends = list(accumulate(sizes, initial=0))
+        # Where they come block by block, as in a checkpoint, blocks share their memory.
+        self._blocks = [gaussians[start:end] for start, end in pairwise(ends)]
+        self._bounds: dict[int, Box | None] = {}
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._blocks[block]
+
+    def version(self, block: int) -> int:  # noqa: ARG002 - the scene never changes
+        return 0
+
+    def count(self, block: int) -> int:
+        return len(self._blocks[block])
+
+    def bounds(self, block: int) -> Box | None:
+        if block not in self._bounds:
+            self._bounds[block] = bounds_of(self._blocks[block])
+        return self._bounds[block]
+
+
+class StoredScene:
+    """A scene at rest in a ParameterStore, read block by block, with the live block laid over it.
+
+    Blocks that were read stay in RAM, least recently used first out, within `ram_bytes`.
+    """
+
+    def __init__(self, tree: BlockTree, store: ParameterStore, ram_bytes: int = 2 << 30) -> None:
+        self.tree = tree
+        self.store = store
+        """What is durable; to be read and written by way of the scene alone while there is one."""
+        self.ram_bytes = ram_bytes
+        self._memory = BlockMemory(ram_bytes)
+        self._unsaved: dict[int, BlockState] = {}
+        self._writer = WriteBehind(store, self._saved)
+        self._numbers, self._versions = itertools.count(1), dict[int, int]()
+        self._bounds: dict[int, tuple[int, Box | None]] = {}
+        self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
+        self._rested = time.monotonic()
+        self._mail: dict[int, BlockState] = {}
+        self.inbox: BlockState | None = None
+        """All Gaussians that wait for their blocks' visits, in the order in which they came."""
+        self._sort(self.state(INBOX) if self.has(INBOX) else None)
+
+    # -- changes -------------------------------------------------------------------------------------
+
+    def rest(
+        self, tree: BlockTree, blocks: Mapping[int, BlockState], state: dict[str, Any], within: float = 0.0
+    ) -> None:
+        """Take in the blocks that changed, under `tree`, and the run's state, as one moment of the run.
+
+        Args:
+            blocks: on the CPU, by block or special number; they belong to the scene from now on, as `state`
+                does.
+            within: this is written so many seconds after the last write began. With 0 all is durable when
+                this returns, and also where what waits to be written exceeds `ram_bytes`.
+
+        Raises:
+            StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
+                written by the next `rest` or `flush`.
+        """
+        with self._writer.lock:
+            header = None if tree is self.tree else {**self.store.header, "tree": tree.to_json()}
+            self.tree = tree
+            for number, block in blocks.items():
+                self._memory.forget(number)
+                self._unsaved[number] = block
+                self._versions[number] = next(self._numbers)
+            if header is not None or INBOX in blocks:
+                self._sort(blocks.get(INBOX, self.inbox))
+            self._memory.shrink(self.unsaved_bytes)
+            self._rested = time.monotonic()
+            self._writer.put(Snapshot(dict(blocks), header, state), within or math.inf)
+        if within <= 0 or self.unsaved_bytes > self.ram_bytes:
+            self.flush()
+        self._writer.check()
+
+    def _sort(self, inbox: BlockState | None) -> None:
+        """Find out who waits for which block."""
+        before, self.inbox, self._mail = self._mail, inbox, {}
+        if inbox is not None and len(inbox):
+            self._mail = part(inbox, self.tree.assign(inbox.gaussians.means))
+        for block in before.keys() | self._mail.keys():
+            old, new = (
+                mail[block].gaussians.means if block in mail else None for mail in (before, self._mail)
+            )
+            if old is None or new is None or not torch.equal(old, new):
+                self._versions[block] = next(self._numbers)
+
+    def _saved(self, snapshot: Snapshot) -> None:
+        with self._writer.lock:
+            for number, block in snapshot.blocks.items():
+                if self._unsaved.get(number) is block:
+                    del self._unsaved[number]
+                    if number not in (LIVE, INBOX):  # nobody reads them from here
+                        self._memory.put(number, block)
+            self._memory.shrink(self.unsaved_bytes)
+
+    def is_due(self, within: float) -> bool:
+        """Whether something should be put to rest again: nothing was for so many seconds; 0 is no limit."""
+        return 0 < within <= time.monotonic() - self._rested
+
+    def flush(self) -> None:
+        """Return when all that was put to rest is durable; what failed before is tried again.
+
+        Raises:
+            StoreError: the disk refused; nothing is lost as long as the process lives.
+        """
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Write what waits, and let go of the store. Harmless when done twice.
+
+        Raises:
+            StoreError: the disk refused.
+        """
+        try:
+            self.flush()
+        finally:
+            self.store.close()
+
+    def lay_over(self, block: int | None, live: Callable[[], Gaussians]) -> None:
+        """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest."""
+        self._live = (block, live)
+
+    def lift(self) -> None:
+        """No block is live any more."""
+        self._live = None
+
+    # -- what is there -------------------------------------------------------------------------------
+
+    @property
+    def is_live_as_a_whole(self) -> bool:
+        """Whether all blocks are live, and `count` is right in sum alone."""
+        return self._live is not None and self._live[0] is None
+
+    def has(self, number: int) -> bool:
+        """Whether there is such a block, or anything under such a special number."""
+        return number in self._unsaved or number in self.store.blocks
+
+    def rows(self, number: int) -> int:
+        """Gaussians at rest under a number, the mail of a block left out; nothing is read."""
+        block = self._unsaved.get(number)
+        return self.store.counts(number) if block is None else len(block)
+
+    def clocks(self, number: int) -> Clocks:
+        """How far a block had come when it was put to rest; nothing is read."""
+        block = self._unsaved.get(number)
+        return BlockState.clocks_of(self.store.meta(number)) if block is None else block.clocks
+
+    def mail(self, block: int) -> BlockState | None:
+        """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
+        return self._mail.get(block)
+
+    def state(self, number: int) -> BlockState:
+        """A block, or what is kept under another number, at rest and whole, without its mail."""
+        with self._writer.lock:
+            if number in self._unsaved:
+                return self._unsaved[number]
+            found = self._memory.state(number)
+            if found is None:
+                found = BlockState.from_tensors(*self.store.load(number))
+                self._memory.put(number, found)
+                self._memory.shrink(self.unsaved_bytes)
+            return found
+
+    def read_ahead(self, block: int) -> None:
+        """Have `state` of a block at hand soon; returns at once."""
+        with self._writer.lock:
+            if block not in self._unsaved and self._memory.state(block) is None:
+                self._writer.do(partial(self.state, block))
+
+    def gaussians(self, block: int) -> Gaussians:
+        if self._live is not None and self._live[0] is None:
+            everything = self._live[1]().detach()
+            return everything[self.tree.assign(everything.means) == block]
+        if self._live is not None and self._live[0] == block:
+            return self._live[1]().detach()
+        return drawn(self._with_mail(block))
+
+    def at_rest(self, block: int) -> Gaussians:
+        """The block as a visit will find it, whatever is live."""
+        return revealed(self._with_mail(block))
+
+    def _with_mail(self, block: int) -> Gaussians:
+        mail, stored = self.mail(block), self.stored(block)
+        return stored if mail is None else Gaussians.cat([stored, mail.gaussians])
+
+    def stored(self, number: int) -> Gaussians:
+        """The Gaussians at rest under a number, without mail."""
+        with self._writer.lock:
+            if number in self._unsaved:
+                return self._unsaved[number].gaussians
+            found = self._memory.gaussians(number)
+            if found is None:
+                found = Gaussians(**self.store.load_names(number, PARAM_NAMES))
+                self._memory.put(number, found)
+                self._memory.shrink(self.unsaved_bytes)
+            return found
+
+    @property
+    def unsaved_bytes(self) -> int:
+        """RAM that blocks take which are not on disk yet."""
+        return sum(block.nbytes for block in self._unsaved.values())
+
+    @property
+    def cached_bytes(self) -> int:
+        """RAM that blocks at rest take."""
+        with self._writer.lock:
+            return self._memory.nbytes + self.unsaved_bytes
+
+    def version(self, block: int) -> int:
+        return self._versions.get(block, 0)
+
+    def count(self, block: int) -> int:
+        if self._live is not None and self._live[0] is None:
+            # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
+            return len(self._live[1]()) if block == 0 else 0
+        if self._live is not None and self._live[0] == block:
+            return len(self._live[1]())
+        return self.rows(block) + len(self.mail(block) or ())
+
+    def bounds(self, block: int) -> Box | None:
+        if self._live is not None and self._live[0] in (None, block):
+            return bounds_of(self.gaussians(block))
+        version = self.version(block)
+        if block not in self._bounds or self._bounds[block][0] != version:
+            self._bounds[block] = (version, bounds_of(self.at_rest(block)))
+        return self._bounds[block][1]

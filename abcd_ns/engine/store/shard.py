@@ -1,0 +1,112 @@
+"""One block's tensors in one safetensors file, which is written once and never changed."""
+
+import errno
+import hashlib
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from abcd_ns.engine.store.atomic import replacing
+from abcd_ns.engine.store.manifest import Shard, StoreError
+
+_CHUNK = 1 << 20
+
+
+def write_shard(
+    folder: Path, block: int, generation: int, tensors: Mapping[str, Tensor], meta: dict[str, Any]
+) -> Shard:
+    """Write a block and sync it; the folder is left for the caller to sync.
+
+    Raises:
+        OSError, safetensors.SafetensorError: the disk refused; nothing is left behind.
+    """
+    path = folder / f"block-{block:06d}-{generation:08d}.safetensors"
+    with replacing(path) as temporary:
+        save_file(_plain(tensors), temporary)
+        with open(temporary, "rb") as file:
+            checksum = _checksum(file)
+            nbytes = file.tell()
+    rows = tensors["means"].shape[0] if "means" in tensors else 0
+    return Shard(path.name, generation, nbytes, checksum, rows, meta)
+
+
+def verify_shard(path: Path, shard: Shard) -> None:
+    """Compare every byte of the file with the manifest.
+
+    Raises:
+        StoreError: the file has changed since it was written.
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as file:
+        if os.fstat(file.fileno()).st_size != shard.nbytes or _checksum(file) != shard.checksum:
+            raise StoreError(f"{path} is damaged: its checksum is wrong. Go back to a pinned generation.")
+
+
+def read_shard(path: Path, names: Iterable[str] | None) -> dict[str, Tensor]:
+    """The tensors of these names, or all, on the CPU.
+
+    Raises:
+        KeyError: no tensor of this name.
+        OSError, safetensors.SafetensorError: the file cannot be read.
+    """
+    with _opened(path) as file:
+        present = set(file.keys())
+        wanted = sorted(present) if names is None else list(names)
+        for name in wanted:
+            if name not in present:
+                raise KeyError(f"{path} has no tensor {name!r}; it has {sorted(present)}.")
+        # Copies own their memory: views of the mapped file would crash the process if the disk failed later.
+        return {name: file.get_tensor(name).clone() for name in wanted}
+
+
+def _opened(path: Path) -> safe_open:
+    try:
+        return safe_open(path, framework="pt", device="cpu")
+    except RuntimeError as error:  # torch maps the file, and has no OSError of its own
+        if not path.exists():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from error
+        raise OSError(str(error)) from error
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Give a file a second name, or a second copy where links are impossible. Replaces `target`."""
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except FileNotFoundError:
+        raise
+    except OSError:  # another file system, or one without links
+        with replacing(target) as temporary:
+            shutil.copyfile(source, temporary)
+
+
+def data_nbytes(tensors: Mapping[str, Tensor]) -> int:
+    """Bytes that the tensors take in a file, without its header."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+
+
+def _plain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """As safetensors wants them: on the CPU, contiguous, and none sharing memory with another."""
+    plain: dict[str, Tensor] = {}
+    storages: set[int] = set()
+    for name, tensor in tensors.items():
+        value = tensor.detach().to("cpu", memory_format=torch.preserve_format).contiguous()
+        storage = value.untyped_storage().data_ptr()
+        plain[name] = value.clone() if storage in storages else value
+        storages.add(storage)
+    return plain
+
+
+def _checksum(file: BinaryIO) -> str:
+    """blake2b of what is left of an open file, read in pieces."""
+    digest = hashlib.blake2b(digest_size=16)
+    while piece := file.read(_CHUNK):
+        digest.update(piece)
+    return digest.hexdigest()

@@ -1,0 +1,175 @@
+"""Writes to a store beside the training: snapshots of a run, each whole, one after the other.
+
+A thread does it, which lives as long as there is something to write and no longer. It is a daemon: a process
+that ends takes it along, which is as if the process had been killed.
+
+Crews fork the training process, and a thread does not live on in a fork. So a fork waits until the thread is
+between two jobs, and takes place with the lock held and free on both sides afterwards: no job, and nothing
+that a job holds within torch, the store or the C library, is ever cut in two. The child writes nothing. It
+reads what was in RAM when it was forked, which holds all that was not on disk, and else shards of blocks that
+have not changed since; those stay on disk as long as it lives, for only the end of the visit changes blocks.
+"""
+
+import math
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.store import ParameterStore
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What a commit brings: everything as it was at one moment between two steps. Nobody changes it."""
+
+    blocks: dict[int, BlockState]
+    """Those that have changed."""
+    header: dict[str, Any] | None
+    """None where it has not changed."""
+    state: dict[str, Any]
+    """The run's, as JSON."""
+
+    def after(self, earlier: "Snapshot | None") -> "Snapshot":
+        """Both as one commit."""
+        if earlier is None:
+            return self
+        header = earlier.header if self.header is None else self.header
+        return Snapshot({**earlier.blocks, **self.blocks}, header, self.state)
+
+
+class WriteBehind:
+    """At most one snapshot is being written and one waits, which later ones are added to.
+
+    Args:
+        written: told of every snapshot that has become durable; on the thread, without the lock.
+    """
+
+    def __init__(self, store: ParameterStore, written: Callable[[Snapshot], None]) -> None:
+        self._store, self._written = store, written
+        self.lock = threading.Condition()
+        """Guards all of this; whoever shares data with jobs uses it, too. It must not be held in a fork."""
+        self._waiting: Snapshot | None = None
+        self._due, self._began = math.inf, time.monotonic()
+        self._chore: Callable[[], object] | None = None
+        self._error: BaseException | None = None
+        self._busy = False
+        self._thread: threading.Thread | None = None
+        _all.add(self)
+
+    def put(self, snapshot: Snapshot, within: float) -> None:
+        """Write it, with what waits already, so many seconds after the last write began."""
+        with self.lock:
+            self._waiting = snapshot.after(self._waiting)
+            self._due = min(self._due, self._began + within)
+            self._wake()
+
+    def check(self) -> None:
+        """See that the last write went well.
+
+        Raises:
+            StoreError: it did not. Nothing of it is lost: it waits for the next.
+        """
+        with self.lock:
+            error, self._error = self._error, None
+            if error is not None:
+                raise error
+
+    def do(self, chore: Callable[[], object]) -> None:
+        """Do this on the thread as soon as it has nothing to write, instead of what was to be done so."""
+        with self.lock:
+            self._chore = chore
+            self._wake()
+
+    def flush(self) -> None:
+        """Write all that waits, and return when it is durable; what failed before is tried again.
+
+        Raises:
+            StoreError: the disk refused; all that waited still does.
+        """
+        with self.lock:
+            self._error = None
+            if self._waiting is not None:
+                self._due = -math.inf
+                self._wake()
+            while self._error is None and (self._waiting is not None or self._busy):
+                self.lock.wait()
+            self.check()
+
+    def _wake(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="store", daemon=True)
+            self._thread.start()
+        self.lock.notify_all()
+
+    def _run(self) -> None:
+        while (job := self._next_job()) is not None:
+            try:
+                job()
+            finally:
+                with self.lock:
+                    self._busy = False
+                    self.lock.notify_all()
+
+    def _next_job(self) -> Callable[[], object] | None:
+        """What is to be done next; waits for its time. None ends the thread."""
+        with self.lock:
+            while True:
+                left = self._due - time.monotonic()
+                if self._waiting is not None and left <= 0:
+                    job = partial(self._write, self._waiting)
+                    self._waiting, self._due, self._began = None, math.inf, time.monotonic()
+                elif self._chore is not None:
+                    job, self._chore = partial(_try, self._chore), None
+                elif self._waiting is not None and left < math.inf:
+                    self.lock.wait(left)
+                    continue
+                else:
+                    self._thread = None
+                    return None
+                self._busy = True
+                return job
+
+    def _write(self, snapshot: Snapshot) -> None:
+        blocks = {number: state.to_tensors() for number, state in snapshot.blocks.items()}
+        try:
+            self._store.commit(blocks, header=snapshot.header, state=snapshot.state)
+        except BaseException as error:  # whatever it is, it is for the thread that trains
+            with self.lock:
+                self._waiting = snapshot if self._waiting is None else self._waiting.after(snapshot)
+                self._due, self._error = math.inf, error
+            if not isinstance(error, Exception):
+                raise
+        else:
+            self._written(snapshot)
+
+
+def _try(chore: Callable[[], object]) -> None:
+    with suppress(Exception):  # whoever needs what it was for will meet the error
+        chore()
+
+
+_all: "weakref.WeakSet[WriteBehind]" = weakref.WeakSet()
+_held: list[WriteBehind] = []
+
+
+def _before_fork() -> None:
+    for writer in sorted(_all, key=id):  # two threads that fork take the locks in the same order
+        writer.lock.acquire()
+        while writer._busy:
+            writer.lock.wait()
+        _held.append(writer)
+
+
+def _after_fork() -> None:
+    while _held:
+        _held.pop().lock.release()
+
+
+os.register_at_fork(before=_before_fork, after_in_parent=_after_fork, after_in_child=_after_fork)

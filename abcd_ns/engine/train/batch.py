@@ -1,0 +1,116 @@
+"""What one step of training is given, and what it draws."""
+
+import random
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.layers.compositing import sandwich
+from abcd_ns.engine.layers.painter import Parts
+from abcd_ns.engine.render import Raster, Shot, ZWindow
+from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.cutouts import random_part
+from abcd_ns.engine.transfer import upload
+from abcd_ns.engine.types import Crop, View
+
+BACKGROUNDS = 1024
+"""Steps whose backgrounds are copied to a device together."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One view that a step trains on."""
+
+    view: View
+    crop: Crop
+    layers: Parts | None
+    near: Splats | None
+    window: ZWindow | None
+    background: Float[Tensor, "3"]
+    share: float = 1.0
+    """Of the pixels that might have been drawn in this step, those that are: the crop's."""
+
+    @property
+    def shot(self) -> Shot:
+        """What the rasterizer is to draw."""
+        return Shot(self.view, self.crop, self.near, None if self.near is None else self.window)
+
+    def picture(self, raster: Raster) -> Float[Tensor, "h w 3"]:
+        """What the rasterizer drew, between the layers and on the background, 0..1."""
+        if self.layers is None:
+            rgb = raster.color + raster.transmittance[..., None] * self.background
+        else:
+            rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
+        return rgb.clamp(0, 1)
+
+    def loss(
+        self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig
+    ) -> Float[Tensor, ""]:
+        """Photometric, as this crop's part of the loss of the whole image; where it was drawn by lot, so that
+        the expectation is the part of all that might have been (see `random_part`)."""
+        found = photometric_loss(
+            picture,
+            photo,
+            full_pixels=self.view.full.pixels,
+            full_windows=ssim_windows(self.view.height, self.view.width),
+            ssim_lambda=config.ssim_lambda,
+            pixel_loss=config.pixel_loss,
+        )
+        return found / self.share
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one step trains on."""
+
+    step: int
+    samples: tuple[Sample, ...]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """The active block within its surroundings, as a batch shows it."""
+
+    pictures: tuple[Float[Tensor, "_h _w 3"], ...]
+    """Of each sample's crop, background included, 0..1."""
+    transmittances: tuple[Float[Tensor, "_h _w"], ...]
+    """Of the active block and what was sorted in with it."""
+    infos: tuple[dict[str, Any], ...]
+
+
+def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "3"]:
+    """What lies behind the scene in the sample at `place` of a step's batch; depends on nothing else."""
+    if config.background == "random":
+        drawn = random.Random(f"background {config.seed} {step} {place}").getrandbits(62)
+        return torch.rand(3, generator=torch.Generator().manual_seed(drawn))
+    return torch.full((3,), float(config.background == "white"))
+
+
+class Backgrounds:
+    """`background` on the device: of many steps in one copy."""
+
+    def __init__(self, config: TrainingConfig, device: torch.device) -> None:
+        self._config, self._device = config, device
+        self._tables: dict[int, tuple[int, Float[Tensor, "s 3"]]] = {}
+
+    def at(self, step: int, place: int) -> Float[Tensor, "3"]:
+        """What lies behind the scene in the sample at `place` of a step's batch."""
+        if self._device.type == "cpu":
+            return background(self._config, step, place)
+        first = step - step % BACKGROUNDS
+        known, table = self._tables.get(place, (None, None))
+        if known != first:
+            drawn = (background(self._config, first + k, place) for k in range(BACKGROUNDS))
+            table = upload(torch.stack(list(drawn)), self._device)
+            self._tables[place] = first, table
+        return table[step - first]
+
+
+def part_to_draw(config: TrainingConfig, crop: Crop, step: int, place: int) -> Crop:
+    """What the sample at `place` of a step's batch is drawn of a crop; depends on nothing else."""
+    return random_part(crop, config.crop_pixels, random.Random(f"part {config.seed} {step} {place}"))

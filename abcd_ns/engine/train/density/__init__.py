@@ -1,0 +1,1 @@
+"""Density control: which Gaussians are added, moved and removed, within a budget."""

@@ -1,0 +1,319 @@
+"""Growing and pruning the active block, by gsplat's own strategies on the block's own clock.
+
+gsplat's strategies keep a schedule in absolute steps of one global run. Here the schedule is in shares of
+the run and in the block's own steps, so it is kept in this file and the strategies are told, through the
+step number they are given, either to gather statistics or to refine now.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any, Literal
+
+import torch
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
+from gsplat.strategy import ops as gsplat_ops
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
+from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
+
+# Step numbers as gsplat sees them. It refines on multiples of REFINE, resets opacities on multiples of
+# `reset_every` (never, with these numbers) and prunes by size where step > reset_every.
+GATHER, REFINE = 1, 6
+BEFORE_RESET, AFTER_RESET = 7, 4
+
+COUNTED = ("grad2d", "count")
+"""What the default strategy adds up for each Gaussian, under gsplat's names."""
+REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
+REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
+"""Shares of a visit after which a block among others is neither refined nor reset."""
+MCMC_MIN_OPACITY = 0.005
+MCMC_DEFAULT_CAP = 1_000_000
+
+
+Infos = tuple[dict[str, Any], ...]
+"""gsplat's `info` of one or more drawings."""
+
+
+@dataclass
+class DensityConfig:
+    """When and how the number of Gaussians changes. Thresholds are splatfacto's, times are relative."""
+
+    strategy: Literal["default", "mcmc", "off"] = "default"
+    """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""
+    refine_start: float = 1 / 60
+    """Share of the run, its warm-up left out, before the first refinement (500 of 30,000 steps in
+    splatfacto)."""
+    refine_stop: float = 0.5
+    """Share of the run, its warm-up left out, after which the number of Gaussians no longer changes."""
+    refine_every: int = 0
+    """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
+    where a block sees every step, as splatfacto has it, and 30 elsewhere."""
+    warmup_passes: int = 1
+    """Times that each of a block's views is used before the block's first refinement."""
+    reset_every: int = 3000
+    """A block's own steps between opacity resets (`default` strategy); 0 means never."""
+    cull_alpha_thresh: float = 0.005
+    """Opacity under which a Gaussian is pruned (`default` strategy)."""
+    cull_scale_thresh: float = 0.5
+    """Standard deviation, in scene units, over which a Gaussian is pruned once opacities were reset."""
+    densify_grad_thresh: float = 0.0008
+    """Mean norm of the screen-space gradient over which a Gaussian is cloned or split."""
+    densify_size_thresh: float = 0.01
+    """Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
+    use_absgrad: bool = True
+    """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum."""
+    max_gaussians: int = 0
+    """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
+    to begin with, a random choice of them begins."""
+    noise_lr: float = 5e5
+    """Strength of the exploration noise of `mcmc`."""
+    opacity_reg: float = 0.01
+    """Weight of the mean opacity in the loss (`mcmc`)."""
+    scale_reg: float = 0.01
+    """Weight of the mean standard deviation in the loss (`mcmc`)."""
+
+    @property
+    def limit(self) -> int | None:
+        """Gaussians in the whole scene at most, or None."""
+        if self.max_gaussians > 0:
+            return self.max_gaussians
+        return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
+
+
+def for_blocks(config: DensityConfig, blocks: int) -> DensityConfig:
+    """The options of a scene of so many blocks: nothing is left to choose."""
+    chosen = REFINE_EVERY_SCENE if blocks == 1 else REFINE_EVERY_BLOCK
+    return replace(config, refine_every=config.refine_every or chosen)
+
+
+@dataclass(frozen=True)
+class DensityClock:
+    """Where the run and the active block stand; all that decides whether to refine."""
+
+    progress: float
+    """Share of the run, its warm-up left out, that is done: 0..1."""
+    steps: int
+    """Views that were drawn to train the block so far, this step's included."""
+    taken: int
+    """This step's."""
+    views: int
+    """Views that see the block."""
+    room: int | None
+    """Gaussians that may still be added to the scene; None for no limit."""
+    seed: int
+    """Of the random numbers drawn in this step."""
+    refined: int | None = None
+    """`steps` when the block was last refined; None refines at the very step that it is due."""
+    resets: int | None = None
+    """Resets of the opacities that the block has had; None resets at the very step that one is due."""
+    spent: float = 0.0
+    """Share of the visit that is done, for what is left must make good what growing and resets upset before
+    others see the block; 0 where there are no others."""
+
+    def reached(self, every: int) -> bool:
+        """Whether `steps` has come to a multiple of `every` in this step."""
+        return self.steps // every > (self.steps - self.taken) // every
+
+
+class DensityControl:
+    """Applies the configured strategy to the live block."""
+
+    def __init__(self, config: DensityConfig) -> None:
+        self.config = config
+        self._binomials = binomials()
+
+    @property
+    def absgrad(self) -> bool:
+        """Whether the rasterizer must leave `absgrad` on `means2d`."""
+        return self.config.strategy == "default" and self.config.use_absgrad
+
+    def before_backward(self, infos: Infos) -> None:
+        """Keep the gradient of the projected means, by which the default strategy judges."""
+        for info in infos:
+            if self.config.strategy == "default" and info["means2d"].requires_grad:
+                info["means2d"].retain_grad()
+
+    def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
+        """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
+        config = self.config
+        if config.strategy != "mcmc":
+            return params["means"].new_zeros(())
+        opacity = torch.sigmoid(params["opacities"]).sum()
+        scale = torch.exp(params["scales"]).sum() / 3
+        return (config.opacity_reg * opacity + config.scale_reg * scale) / max(scene_gaussians, 1)
+
+    def is_due(self, clock: DensityClock) -> bool:
+        """Whether this step refines."""
+        warm = clock.steps >= self.config.warmup_passes * clock.views
+        running = self.config.refine_start <= clock.progress < self.config.refine_stop
+        if not (warm and running):
+            return False
+        every = max(self.config.refine_every, clock.views, 1)
+        if clock.refined is None:
+            return clock.reached(every)
+        return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= every
+
+    def refines(self, clock: DensityClock, infos: Infos) -> bool:
+        """Whether this step refines: it is due, and where gradients decide there are any.
+
+        Args:
+            infos: of the step's drawings, after backward.
+        """
+        return self.is_due(clock) and (self.config.strategy != "default" or bool(_with_gradient(infos)))
+
+    def resets(self, clock: DensityClock) -> bool:
+        """Whether this step resets opacities (`default` strategy); that needs no gradients."""
+        every = self.config.reset_every
+        if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
+            return False
+        if clock.resets is None:
+            return clock.reached(every)
+        return clock.spent <= RESET_UNTIL and clock.steps // every > clock.resets
+
+    def count(self, means: Tensor, infos: Infos) -> dict[str, Tensor]:
+        """What drawings add to a block's statistics, after backward; by name, each [n].
+
+        Args:
+            means: of the block, [n, 3].
+        """
+        if self.config.strategy != "default":
+            return {}
+        with_gradient = _with_gradient(infos)
+        if not with_gradient or len(means) == 0:
+            return {}
+        views = [view for info in with_gradient for view in zip(*self._norms(info), strict=True)]
+        norms, seen = (reduce(torch.add, parts) for parts in zip(*views, strict=True))
+        return dict(zip(COUNTED, (norms, seen), strict=True))
+
+    def _norms(self, info: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """What DefaultStrategy._update_state adds up: norms of the gradients in each view, and 1 where there
+        is one, [v, n]. It picks rows, whose number the host has to wait for; here the others are 0.
+        """
+        means2d = info["means2d"]
+        gradient = means2d.absgrad if self.absgrad else means2d.grad
+        width, height = (info[side] / 2.0 * info["n_cameras"] for side in ("width", "height"))
+        norms = torch.stack((gradient[..., 0] * width, gradient[..., 1] * height), dim=-1).norm(dim=-1)
+        # An accelerator may have skipped the step that these are of.
+        seen = (info["radii"] > 0) & norms.isfinite()
+        return torch.where(seen, norms, 0.0), seen.to(norms.dtype)
+
+    def after_step(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        growth: dict[str, Tensor],
+        infos: Infos,
+        clock: DensityClock,
+    ) -> dict[str, Tensor]:
+        """Gather statistics and, when it is time, refine. Call after Adam's step.
+
+        Args:
+            growth: the block's statistics so far, each [n].
+            infos: of the step's drawings, after backward.
+
+        Returns:
+            The block's statistics from now on. The global random generator is left as it was.
+        """
+        if self.config.strategy == "off" or len(params["means"]) == 0:
+            return growth
+        if self.config.strategy == "default":
+            if clock.progress >= self.config.refine_stop:
+                return growth
+            infos = _with_gradient(infos)
+            growth = added(growth, self.count(params["means"], infos))
+            if not (self.refines(clock, infos) or self.resets(clock)):
+                return growth
+        device = params["means"].device
+        cuda = [device] if device.type == "cuda" else []
+        with torch.random.fork_rng(devices=cuda), _operators_for(device):
+            torch.manual_seed(clock.seed)
+            if self.config.strategy == "mcmc":
+                self._step_mcmc(params, optimizers, clock)
+                return {}
+            return self._step_default(params, optimizers, growth, infos, clock)
+
+    def _step_default(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        growth: dict[str, Tensor],
+        infos: Infos,
+        clock: DensityClock,
+    ) -> dict[str, Tensor]:
+        config = self.config
+        has_reset = 0 < config.reset_every < clock.steps
+        strategy = DefaultStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            prune_scale3d=config.cull_scale_thresh,
+            refine_start_iter=0,
+            refine_every=REFINE,
+            reset_every=AFTER_RESET if has_reset else BEFORE_RESET,
+            absgrad=config.use_absgrad,
+        )
+        state: dict[str, Any] = {"scene_scale": 1.0, **growth}
+        if self.refines(clock, infos):
+            strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, clock.room)
+            # Nothing is visible in this info, so the statistics are not gathered twice.
+            unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
+            strategy.step_post_backward(params, optimizers, state, REFINE, unseen)
+        if self.resets(clock):
+            gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
+        return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+
+    def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:
+        room = len(params["means"]) if clock.room is None else clock.room
+        strategy = MCMCStrategy(
+            cap_max=len(params["means"]) + max(room, 0),
+            noise_lr=self.config.noise_lr,
+            refine_start_iter=0,
+            refine_every=REFINE,
+            min_opacity=MCMC_MIN_OPACITY,
+        )
+        step = REFINE if self.is_due(clock) else GATHER
+        learning_rate = optimizers["means"].param_groups[0]["lr"]
+        self._binomials = self._binomials.to(params["means"].device)
+        strategy.step_post_backward(
+            params, optimizers, {"binoms": self._binomials}, step, {}, lr=learning_rate
+        )
+
+
+def _with_gradient(infos: Infos) -> Infos:
+    return tuple(info for info in infos if info["means2d"].grad is not None)
+
+
+def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Statistics of more drawings added to a block's."""
+    sums = {name: growth[name] + value if name in growth else value for name, value in more.items()}
+    return {**growth, **sums}
+
+
+def _threshold_within(growth: dict[str, Tensor], threshold: float, room: int | None) -> float:
+    """The gradient over which to grow, such that no more than `room` Gaussians are added."""
+    gradients = growth["grad2d"] / growth["count"].clamp_min(1)
+    if room is None or int((gradients > threshold).sum()) <= room:
+        return threshold
+    # gsplat grows where gradient > threshold, so the (room + 1)-th largest is the first that must not.
+    return float(gradients.sort(descending=True).values[max(room, 0)])
+
+
+@contextmanager
+def _operators_for(device: torch.device) -> Iterator[None]:
+    """gsplat 1.4.0's MCMC calls two CUDA operators by name; elsewhere, lend it torch ones for the call. And
+    it gives back the allocator's memory after each refinement, only to ask for it anew: it had better not."""
+    lent: list[tuple[Any, str, Any]] = [(torch.cuda, "empty_cache", lambda: None)]
+    if device.type != "cuda":
+        lent.append((gsplat_ops, "compute_relocation", compute_relocation))
+        lent.append((gsplat_ops, "quat_scale_to_covar_preci", covariances))
+    originals = [(owner, name, getattr(owner, name)) for owner, name, _ in lent]
+    try:
+        for each in lent:
+            setattr(*each)
+        yield
+    finally:
+        for each in originals:
+            setattr(*each)

@@ -1,0 +1,301 @@
+"""Notices what goes wrong in the live block, counts it, tells it, and mends what can be mended.
+
+In any run: gradients, moments and values that are no numbers. Where blocks are trained within layers, since
+there others have to live with the result: giants, Gaussians that nothing can show, and visits that left their
+pictures worse than they found them. A run in which nothing goes wrong is the same with or without all this,
+on a CPU bit for bit: healthy tensors are read, never written.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.events import Announcer, Mended, VisitUndone
+from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.settle import at_rest
+from abcd_ns.engine.train.health.health_rules import (
+    GIANT_ANGLE,
+    HIDDEN,
+    SHOWS,
+    is_worse,
+    loss_rise,
+    stand_ins,
+    unsound,
+)
+from abcd_ns.engine.train.health.step_guard import StepGuard
+from abcd_ns.engine.train.health_record import BlockHealth, Ledger
+from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.transfer import StepNumbers
+from abcd_ns.engine.types import Gaussians, View
+
+LEAST_DAMPING = 1 / 16
+"""Of learning rates, however often a block's visits were undone."""
+
+
+class Health:
+    """Watches the live block of a coordinator.
+
+    Hooks into the optimizers, so that no caller can forget to ask: what they step with is numbers.
+
+    Args:
+        may_act: where there are several blocks, also hold back giants, and undo visits.
+        may_drop: and drop Gaussians that nothing can show.
+    """
+
+    def __init__(
+        self,
+        scene: StoredScene,
+        params: Params,
+        optimizers: Optimizers,
+        announce: Announcer,
+        *,
+        may_act: bool,
+        may_drop: bool,
+    ) -> None:
+        self._may_act, self._may_drop = may_act, may_drop
+        self._scene, self._params, self._optimizers, self._announce = scene, params, optimizers, announce
+        self._active: ActiveVisit | None = None
+        self._ledger: Ledger = {}
+        self._attached: Tensor | None = None
+        self._resumed = False
+        self._bad: Tensor | None = None
+        self._losses: list[tuple[int, Tensor]] = []
+        self._shares: list[Tensor] = []
+        self._numbers = StepNumbers(params["means"].device)
+        self._guard = StepGuard(optimizers) if self._numbers.are_late else None
+        self._skips, self._psnr = True, math.nan
+        for optimizer in optimizers.values():
+            optimizer.register_step_pre_hook(self._clean_gradients)
+
+    @property
+    def acts(self) -> bool:
+        """Whether giants are held back and visits undone."""
+        return self._may_act and self._scene.tree.num_blocks > 1
+
+    @property
+    def damping(self) -> float:
+        """Share of the learning rates that the visit under way is given."""
+        return self._record.damping if self._active is not None else 1.0
+
+    def begin_visit(self, active: ActiveVisit, ledger: Ledger) -> None:
+        """A block was attached.
+
+        Args:
+            ledger: the run's, to be written to.
+        """
+        self._active, self._ledger = active, ledger
+        self._attached, self._bad, self._shares = self._params["means"], None, []
+        self._resumed = active.saved
+        self._skips, self._psnr = True, math.nan
+
+    def see(self, share: Float[Tensor, ""]) -> None:
+        """Take note of how large a part of a picture the live block was."""
+        if self._active is not None and not self._active.shown:
+            self._shares.append(share)
+
+    def note(self, losses: Sequence[tuple[int, Float[Tensor, ""]]]) -> None:
+        """Remember the loss of each view in this step: (view, loss) pairs."""
+        self._losses = list(losses) if self.acts else []
+
+    def end_step(self, psnrs: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
+        """Call after the optimizers stepped.
+
+        Args:
+            psnrs: of what the step drew, dB.
+
+        Returns:
+            Whether the step's gradients were all numbers, as far as is known; and the mean PSNR, dB: on an
+            accelerator of the step before, NaN in a visit's first.
+        """
+        self._send(psnrs)
+        self._read(all_but=int(self._numbers.are_late))
+        if self._bad is None:
+            return True, self._psnr
+        self._count("gradients", int(self._bad.sum()))
+        self._bad = None
+        self._mend()
+        return False, self._psnr
+
+    @torch.no_grad()
+    def hold_back_giants(self, views: Iterable[View]) -> None:
+        """Shrink Gaussians that are too large for every camera, along the axes that are.
+
+        Photos may agree on such a Gaussian, as a far wall say. But its place in the order is that of its
+        mean: from anywhere else it may come before what it lies behind, and veil half the picture.
+        """
+        scales, means = self._params["scales"], self._params["means"]
+        nearest = means.new_full((len(means),), math.inf)
+        for view in views:
+            away = (means - view.center.to(means)).norm(dim=1).clamp_min(view.near)
+            nearest = torch.minimum(nearest, away)
+        allowed = (GIANT_ANGLE * nearest).log()[:, None]
+        over = scales > allowed
+        rows = over.any(dim=1).nonzero()[:, 0]
+        if len(rows) == 0:
+            return
+        scales[rows] = torch.where(over[rows], allowed[rows], scales[rows])
+        self._forget_moments("scales", rows)
+        self._count("giants", len(rows))
+
+    def end_visit(self, active: ActiveVisit, detach: Callable[[], BlockState]) -> BlockState:
+        """What the visit leaves behind: the live block, mended, or the block as it was before.
+
+        The clocks go on in either case, so that what ended badly is not tried again at once.
+
+        Args:
+            detach: takes the live block out.
+        """
+        self.look_over()
+        state, record = detach(), self._record
+        record.visits += 1
+        record.hidden = not active.shown
+        self._active = self._attached = None
+        if not self.acts or active.is_whole:
+            return state
+        rise = loss_rise(list(active.objective.values()))
+        record.rises += rise is not None and rise[1] > rise[0]
+        if rise is not None and is_worse(*rise):
+            return self._undo(active, state, rise, record)
+        record.damping = min(2 * record.damping, 1.0)
+        return self._drop_transparent(active, state) if self._may_drop else state
+
+    def _drop_transparent(self, active: ActiveVisit, state: BlockState) -> BlockState:
+        """The block without the Gaussians that no picture can show: every picture stays as it is."""
+        shows = torch.sigmoid(state.gaussians.opacities[:, 0]) >= SHOWS
+        if bool(shows.all()):
+            return state
+        self._tell(active, "transparent", int((~shows).sum()))
+        return state[shows]
+
+    def look_over(self) -> None:
+        """Mend all that is no number in the live block; call when a visit ends, and before saving."""
+        self._read()
+        self._mend()
+
+    def _undo(
+        self, active: ActiveVisit, state: BlockState, rise: tuple[float, float, float], record: BlockHealth
+    ) -> BlockState:
+        record.undone += 1
+        record.damping = max(record.damping / 2, LEAST_DAMPING)
+        self._announce(VisitUndone(active.number, active.geometry.block, rise[0], rise[1]))
+        before = at_rest(self._scene, active.geometry.block)
+        clocks = replace(state.clocks, adam_views=before.clocks.adam_views)
+        return replace(before, clocks=clocks)
+
+    # -- numbers -------------------------------------------------------------------------------------
+
+    def _clean_gradients(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:  # noqa: ARG002
+        if self._guard is not None and self._skips and self._guard.works:
+            self._guard.tell(optimizer)
+            return
+        for parameter in optimizer.param_groups[0]["params"]:
+            if parameter.grad is None:
+                continue
+            # One pass over memory; an overflow of the squares counts, as it would in Adam's second moment.
+            size = float(torch.linalg.vector_norm(parameter.grad))
+            if not math.isfinite(size):
+                self._zero_bad_rows(parameter.grad)
+
+    def _zero_bad_rows(self, gradient: Float[Tensor, "n ..."]) -> None:
+        bad = ~torch.isfinite(gradient.square()).flatten(1).all(dim=1)
+        gradient[bad] = 0.0
+        if self._bad is not None and self._bad.shape != bad.shape:  # another block, in exact joint training
+            self._count("gradients", int(self._bad.sum()))
+            self._bad = None
+        self._bad = bad if self._bad is None else self._bad | bad
+
+    @torch.no_grad()
+    def _mend(self) -> None:
+        for name, optimizer in self._optimizers.items():
+            adam = optimizer.state.get(self._params[name], {})
+            for moment in MOMENTS:
+                if moment in adam and not math.isfinite(float(torch.linalg.vector_norm(adam[moment]))):
+                    bad = ~torch.isfinite(adam[moment]).flatten(1).all(dim=1)
+                    adam[moment][bad] = 0.0
+                    self._count("moments", int(bad.sum()))
+        live = live_gaussians(self._params)
+        rows = unsound(live).nonzero()[:, 0]
+        if len(rows) == 0:
+            return
+        sound = self._known(live, rows)
+        for name, value in live.items():
+            value[rows] = getattr(sound, name).to(value)
+            self._forget_moments(name, rows)
+        self._count("values", len(rows))
+
+    def _known(self, live: Gaussians, rows: Tensor) -> Gaussians:
+        """Numbers for `rows`: as they are at rest where rows still are what they were, else stand-ins."""
+        active = self._active
+        if active is not None and self._params["means"] is self._attached:
+            before = at_rest(self._scene, active.geometry.block, self._resumed).gaussians
+            if len(before) == len(live):
+                kept = before[rows.cpu()]
+                if not bool(unsound(kept).any()):
+                    return kept
+        return stand_ins(live[~unsound(live)], len(rows))
+
+    def _forget_moments(self, name: str, rows: Tensor) -> None:
+        adam = self._optimizers[name].state.get(self._params[name], {})
+        for moment in MOMENTS:
+            if moment in adam:
+                adam[moment][rows] = 0.0
+
+    # -- accounts ------------------------------------------------------------------------------------
+
+    def _send(self, psnrs: Sequence[Float[Tensor, ""]]) -> None:
+        """All that the step tells, as one small tensor."""
+        losses, self._losses = self._losses, []
+        shares, self._shares = self._shares, []
+        if self._active is None:
+            losses = []
+        if self._active is None or self._active.shown:
+            shares = []
+        parts = {"losses": [loss for _, loss in losses], "shares": shares, "psnrs": list(psnrs)}
+        if self._guard is not None:
+            parts["bad"], self._guard.found = self._guard.found, []
+        self._numbers.send([view for view, _ in losses], parts)
+
+    def _read(self, all_but: int = 0) -> None:
+        """Take note of what steps told, but for the last so many."""
+        for views, numbers in self._numbers.read(all_but):
+            self._note_losses(views, numbers["losses"])
+            if self._active is not None and not self._active.shown and numbers["shares"]:
+                self._active.shown = float(torch.tensor(numbers["shares"]).max()) > HIDDEN
+            psnrs = numbers["psnrs"]
+            self._psnr = sum(psnrs) / len(psnrs) if psnrs else math.nan
+            skipped = int(sum(numbers.get("bad", ())))
+            if skipped and self._skips:  # from now on row by row, so that the others are trained
+                self._skips = False
+                self._guard.stop()
+                self._mend()
+            self._count("gradients", skipped)
+
+    def _note_losses(self, views: Sequence[int], losses: Sequence[float]) -> None:
+        for view, loss in zip(views, losses, strict=True):
+            if math.isfinite(loss):
+                first = self._active.objective.get(view, [loss])[0]
+                seen = view in self._active.objective
+                self._active.objective[view] = [first, loss] if seen else [first]
+
+    @property
+    def _record(self) -> BlockHealth:
+        block = -1 if self._active is None else self._active.geometry.block
+        return self._ledger.setdefault(block, BlockHealth())
+
+    def _count(self, what: str, count: int) -> None:
+        self._tell(self._active, what, count)
+
+    def _tell(self, active: ActiveVisit | None, what: str, count: int) -> None:
+        if count:
+            block = -1 if active is None else active.geometry.block
+            record = self._ledger.setdefault(block, BlockHealth())
+            setattr(record, what, getattr(record, what) + count)
+            number = 0 if active is None else active.number
+            self._announce(Mended(number, None if block < 0 else block, what, count))

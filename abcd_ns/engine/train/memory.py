@@ -1,0 +1,174 @@
+"""How many Gaussians fit on the device: a model to plan with, and a look before memory is taken.
+
+The model adds up what a visit must hold, part by part, and rounds up. `tests/simulated/test_memory.py`
+holds it against live tensors, by pixel and by Gaussian, and `abcd scale` measures what a CPU run takes; the
+numbers below have not been compared with a GPU's.
+"""
+
+import math
+from dataclasses import dataclass
+
+import psutil
+import torch
+
+from abcd_ns.engine.layers.painter import LEAST_PASS
+from abcd_ns.engine.layers.visit_layers import BYTES_PER_PIXEL, PARTS_BYTES
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.schedule import views_per_step, views_per_warm_up_step
+from abcd_ns.errors import UserError
+
+FLOAT = 4
+"""Bytes."""
+PROJECTED_FLOATS = 50
+"""Of a Gaussian in one view: its splat (11 numbers), copies sorted by tile, the gradients of all these."""
+PIXEL_FLOATS = 120
+"""Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
+DRAWN_FLOATS = 24
+"""Of a pixel that is drawn into layers: colour, transmittance, depth and the last of its Gaussians, of two
+layers at once, and these once more while they are rounded."""
+LAYER_SHARE = 1 / 8
+"""Of the device's budget, for the layers of a visit."""
+PHOTO_SHARE = 1 / 8
+"""Of the device's budget, for photos that are kept there."""
+LIVE_COPIES = 5
+"""Of each value while a block is live: the parameter, its gradient, two moments, and the block at rest."""
+
+
+@dataclass(frozen=True)
+class DeviceNeeds:
+    """What training takes on the device, bytes: the larger of what a step and what drawing layers takes.
+
+    Args:
+        pixels: of the largest image.
+        batch: views in a step.
+        crop_pixels: of a view that a step trains on at most; 0 is no limit.
+        levels: layers of one view that are held, at most, while the blocks around a visited one are folded:
+            as many as the tree of blocks is deep, and one. 0 where a block is the whole scene.
+        keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
+            budget of its own for them.
+    """
+
+    pixels: int
+    batch: int
+    sh_degree: int = 3
+    crop_pixels: int = 0
+    levels: int = 2
+    keeps: bool = True
+
+    @property
+    def parameter_bytes(self) -> int:
+        """Of one Gaussian's parameters: 59 floats with spherical harmonics of degree 3."""
+        return FLOAT * (11 + 3 * (self.sh_degree + 1) ** 2)
+
+    @property
+    def gaussian_bytes(self) -> int:
+        """Of one Gaussian in training: parameters, gradient, two moments; three of them once more while the
+        block is refined; and what its views' drawings hold."""
+        return 7 * self.parameter_bytes + self.batch * PROJECTED_FLOATS * FLOAT
+
+    @property
+    def step_bytes(self) -> int:
+        """Of a step's pictures."""
+        drawn = min(self.crop_pixels or self.pixels, self.pixels)
+        return self.batch * drawn * PIXEL_FLOATS * FLOAT
+
+    @property
+    def drawing_bytes(self) -> int:
+        """Of whole views while F and B are drawn, which is before the first step: layers while they are
+        folded, a view that is being drawn, and the least pass of frozen Gaussians. A larger pass takes no
+        more than gradients and refining of a block of half its size do, which have not begun."""
+        if self.levels == 0:
+            return 0
+        parts = max(PARTS_BYTES, self.levels * BYTES_PER_PIXEL * self.pixels)
+        frozen = LEAST_PASS * (self.parameter_bytes + PROJECTED_FLOATS * FLOAT)
+        return parts + self.pixels * DRAWN_FLOATS * FLOAT + frozen
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Whatever the block: what is held in a step or while layers are drawn."""
+        return max(self.step_bytes, self.drawing_bytes)
+
+    def bytes_for(self, gaussians: int) -> int:
+        """The peak of a visit to a block of so many Gaussians, layers and photos that are kept left out."""
+        return self.fixed_bytes + gaussians * self.gaussian_bytes
+
+    def layer_bytes(self, budget: int) -> int:
+        """What of `budget` bytes is for the layers of a visit."""
+        return int(LAYER_SHARE * budget) if self.keeps and self.levels else 0
+
+    def photo_bytes(self, budget: int) -> int:
+        """What of `budget` bytes is for photos."""
+        return int(PHOTO_SHARE * budget) if self.keeps else 0
+
+    def left(self, budget: int) -> int:
+        """What of `budget` bytes is left for training, when layers and photos have theirs."""
+        return budget - self.layer_bytes(budget) - self.photo_bytes(budget)
+
+    def block_limit(self, budget: int) -> int:
+        """Gaussians that a block may have for its visits to stay within `budget` bytes; may be 0 or less."""
+        return (self.left(budget) - self.fixed_bytes) // self.gaussian_bytes
+
+
+def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
+    """Gaussians of the warm-up: where not given, as many as take no more than a visit to a block does.
+
+    Args:
+        block: Gaussians of the largest block, one of several.
+        pixels: of the largest image.
+    """
+    batches = (
+        views_per_step(config.batch, 2, config.batch_limit),
+        views_per_warm_up_step(config.batch, config.batch_limit),
+    )
+    visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, config.crop_pixels) for n in batches)
+    # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
+    room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
+    return config.scaffold_gaussians or room // warm_up.gaussian_bytes
+
+
+def levels_of(blocks: int) -> int:
+    """`DeviceNeeds.levels` of a balanced tree of so many blocks."""
+    return 0 if blocks == 1 else math.ceil(math.log2(blocks)) + 1
+
+
+def fewest_blocks(gaussians: int, limit: int, full: float) -> int:
+    """Equal blocks for so many Gaussians, none of them above the share `full` of `limit`."""
+    return max(1, math.ceil(gaussians / max(full * limit, 1.0)))
+
+
+class OutOfRoomError(UserError):
+    """A block is too large for the memory that is free."""
+
+
+def bytes_for(gaussians: int, sh_degree: int) -> int:
+    """What a live block of so many Gaussians takes, pictures not counted."""
+    return gaussians * (11 + 3 * (sh_degree + 1) ** 2) * FLOAT * LIVE_COPIES
+
+
+def drawing_bytes(sh_degree: int) -> int:
+    """What a Gaussian takes while it is drawn without gradients: its parameters, once more as the rasterizer
+    wants them, and what one view sees of it."""
+    return FLOAT * (2 * (11 + 3 * (sh_degree + 1) ** 2) + PROJECTED_FLOATS)
+
+
+def free_bytes(device: torch.device) -> int:
+    """What `device` has left, memory that torch holds in reserve included."""
+    if device.type != "cuda":
+        return psutil.virtual_memory().available
+    reserve = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + reserve
+
+
+def check_room(gaussians: int, sh_degree: int, device: torch.device) -> None:
+    """Refuse a block that cannot fit.
+
+    Raises:
+        OutOfRoomError: the memory that is free does not suffice; says what would.
+    """
+    needed, free = bytes_for(gaussians, sh_degree), free_bytes(device)
+    if needed > free:
+        raise OutOfRoomError(
+            f"A block of {gaussians:,} Gaussians takes {needed / 2**30:.1f} GiB, but {device} has "
+            f"{free / 2**30:.1f} GiB left; set --pipeline.training.density.max-gaussians, or more "
+            "--pipeline.blocks."
+        )

@@ -1,0 +1,177 @@
+"""Where a run stands: integers and plans, in JSON, so that a run can stop anywhere and go on exactly."""
+
+import copy
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from abcd_ns.engine.layers.visit_layers import VisitGeometry
+from abcd_ns.engine.space.influence import Influence
+from abcd_ns.engine.store.special_blocks import WHOLE
+from abcd_ns.engine.train.health_record import BlockHealth, Ledger
+from abcd_ns.engine.train.schedule import VisitPlan
+
+UNLIMITED = 2**31
+"""Steps of a visit that something else ends."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long a run may be. With both limits the one that is reached first counts."""
+
+    steps: int | None = None
+    """Optimisation steps for the whole scene."""
+    seconds: float | None = None
+    """Seconds of training, drawing layers included, evaluation and saving not."""
+
+    def __post_init__(self) -> None:
+        if self.steps is None and self.seconds is None:
+            raise ValueError("a run needs a budget of steps or of seconds")
+
+    def progress(self, steps: int, seconds: float) -> float:
+        """The share of the run that is done, 0..1."""
+        by_steps = steps / self.steps if self.steps else 0.0
+        by_time = seconds / self.seconds if self.seconds else 0.0
+        return min(max(by_steps, by_time), 1.0)
+
+
+@dataclass
+class ActiveVisit:
+    """The visit that is under way."""
+
+    number: int
+    geometry: VisitGeometry
+    sh_degree: int
+    """In use from the visit's first step to its last, so that its layers stay right."""
+    steps: int
+    views: tuple[int, ...]
+    """Indices of the views in use, of those that see the block."""
+    looked_at: tuple[int, ...] = ()
+    """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
+    crew: int = 1
+    """Members that share the views of each step, see `crew`."""
+    done: int = 0
+    saved: bool = False
+    """Whether the live block was put to rest in the middle of the visit, see special_blocks.LIVE."""
+    sole: bool = False
+    """Whether the block is the whole scene: then the visit lasts as long as the run, if the block need not be
+    cut."""
+    layer_seconds: float = 0.0
+    """Training time that went into drawing F and B."""
+    began: float = 0.0
+    """Training time when the visit began."""
+    since: float = 0.0
+    """Share of the run that was done then."""
+    until: float = 1.0
+    """Share of the run at which the visit ends, whatever its steps."""
+    shown: bool = False
+    """Whether any picture has shown the block so far."""
+    objective: dict[int, list[float]] = field(default_factory=dict)
+    """By view, its loss when the visit first used it and, from its second use on, when it last did."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether this is the warm-up, in which the scaffold of all blocks is trained at once."""
+        return self.geometry.block == WHOLE
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether what is trained has nothing around it, and may go on for as long as the run."""
+        return self.is_whole or self.sole
+
+
+@dataclass
+class RunState:
+    """All that the coordinator knows besides the blocks themselves."""
+
+    step: int = 0
+    """Optimisation steps taken in the whole scene."""
+    sweep: int = 0
+    visit: int = 0
+    """Visits begun so far."""
+    warm: float = 0.0
+    """Share of the run that the warm-up took; 0 until it is over."""
+    queue: list[VisitPlan] = field(default_factory=list)
+    """Visits of this sweep still to come."""
+    views: dict[int, int] = field(default_factory=dict)
+    """By block, how many views were worth training it on when last looked at; 0 means that none is."""
+    influence: Influence = field(default_factory=dict)
+    """As far as known; blocks that are missing are trained on all views that see them."""
+    trained: int = 0
+    """Gaussians of the blocks that were visited in this sweep, when their visits began."""
+    frozen: int = 0
+    """Gaussians that were drawn around them."""
+    health: Ledger = field(default_factory=dict)
+    """What had to be mended, by block."""
+    active: ActiveVisit | None = None
+    seconds: float = 0.0
+    """Training time up to the last save."""
+
+    def count_drawn(self, trained: int, frozen: int) -> None:
+        """A visit has drawn its layers."""
+        self.trained, self.frozen = self.trained + trained, self.frozen + frozen
+
+    def inherit(self, new: int, parent: int) -> None:
+        """`new` was a part of `parent`: what is known of that holds for it too; it is visited next to it."""
+        for known in (self.views, self.influence):
+            if parent in known:
+                known[new] = copy.copy(known[parent])
+        places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
+        for place in reversed(places):
+            self.queue.insert(place + 1, VisitPlan(new, self.queue[place].steps))
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON, which shares nothing with this state; `from_json` gives an equal one."""
+        active = self.active and {
+            **vars(self.active),
+            "geometry": self.active.geometry.to_json(),
+            "views": list(self.active.views),
+            "looked_at": list(self.active.looked_at),
+            "objective": {str(view): list(losses) for view, losses in self.active.objective.items()},
+        }
+        queue = [[plan.block, plan.steps] for plan in self.queue]
+        views = {str(block): count for block, count in self.views.items()}
+        known = {str(b): {str(v): value for v, value in row.items()} for b, row in self.influence.items()}
+        health = {str(block): dict(vars(record)) for block, record in self.health.items()}
+        changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
+        return {**vars(self), **changed}
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> "RunState":
+        """The inverse of `to_json`; of nothing, as in a store that is new, a run that has not begun."""
+        if not data:
+            return RunState()
+        active = data["active"]
+        if active is not None:
+            geometry = VisitGeometry.from_json(active["geometry"])
+            views = {name: tuple(active[name]) for name in ("views", "looked_at")}
+            losses = {int(view): list(found) for view, found in active.get("objective", {}).items()}
+            active = ActiveVisit(**{**active, **views, "geometry": geometry, "objective": losses})
+        queue = [VisitPlan(*plan) for plan in data["queue"]]
+        views = {int(block): count for block, count in data["views"].items()}
+        known = {int(b): {int(v): value for v, value in row.items()} for b, row in data["influence"].items()}
+        health = {int(block): BlockHealth(**record) for block, record in data.get("health", {}).items()}
+        changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
+        return RunState(**{**data, **changed})
+
+
+class Stopwatch:
+    """Seconds of training; can be paused for what does not count."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._before = seconds
+        self._since: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        return self._before + running
+
+    def start(self) -> None:
+        """Count from now on; harmless when it already does."""
+        if self._since is None:
+            self._since = time.perf_counter()
+
+    def pause(self) -> None:
+        """Stop counting until `start`."""
+        self._before, self._since = self.seconds, None

@@ -1,0 +1,106 @@
+"""Blocks that outgrow what the device holds are cut in two where they come to rest."""
+
+from abcd_ns.engine.events import Announcer, BlockSplit
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.space.partition import best_split
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store.scaffold import part
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.settle import inbox_without, with_mail, without
+from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.train.run_state import RunState
+
+FULL = 0.75
+"""Share of its limit over which a block is cut: the next visit needs room to grow."""
+
+
+def split_full(
+    tree: BlockTree, settled: dict[int, BlockState], limit: int, sole: int = 0
+) -> tuple[BlockTree, dict[int, BlockState], dict[int, int]]:
+    """Cut each block with more than FULL of `limit` Gaussians in equal halves, and those again if need be.
+
+    Both parts keep the block's clocks. Gaussians that coincide stay together, however many they are.
+
+    Args:
+        settled: blocks that are about to be put to rest; special numbers are left alone.
+        limit: 0 is none.
+        sole: the limit of a block that is the whole scene; 0 is `limit`.
+
+    Returns:
+        The tree with the cuts, everything to be put to rest, and of each new block the one that it was part
+        of.
+    """
+    parents: dict[int, int] = {}
+    waiting = sorted(block for block in settled if block < tree.num_blocks)
+    settled = dict(settled)
+    while waiting:
+        block = waiting.pop(0)
+        state = settled[block]
+        if not is_full(len(state), tree.num_blocks, limit, sole):
+            continue
+        means = state.gaussians.means
+        new, cut = tree.num_blocks, tree.split(block, *best_split(means, tree.cell(block)))
+        leaves = cut.assign(means) == new
+        if bool(leaves.all()) or not bool(leaves.any()):
+            continue
+        tree, parents[new] = cut, block
+        settled |= {block: state[~leaves], new: state[leaves]}
+        waiting += [block, new]
+    return tree, settled, parents
+
+
+def is_full(gaussians: int, blocks: int, limit: int, sole: int) -> bool:
+    """Whether a block of so many Gaussians, in a scene of so many blocks, is to be cut; see `split_full`."""
+    return limit > 0 and gaussians > FULL * (max(limit, sole) if blocks == 1 else limit)
+
+
+def with_full(scene: StoredScene, settled: dict[int, BlockState], limit: int) -> dict[int, BlockState]:
+    """What is about to be put to rest, and the blocks that are full with those that wait for their visit: for
+    these there might be no room in it."""
+    inbox = settled.get(INBOX)
+    if not limit or inbox is None:
+        return settled
+    waiting = part(inbox, scene.tree.assign(inbox.gaussians.means))
+    full = {b: mail for b, mail in waiting.items() if scene.rows(b) + len(mail) > FULL * limit}
+    joined = {block: scene.state(block).joined_by(mail) for block, mail in full.items()}
+    return {**settled, **joined, INBOX: without(scene, inbox, full)} if full else settled
+
+
+def cut_full(
+    scene: StoredScene,
+    settled: dict[int, BlockState],
+    state: RunState,
+    limit: int,
+    sole: int,
+    announce: Announcer,
+) -> tuple[BlockTree, dict[int, BlockState]]:
+    """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole.
+
+    Args:
+        settled, limit, sole: as of `split_full`.
+
+    Returns:
+        The tree with the cuts, and everything to be put to rest.
+    """
+    tree, settled, parents = split_full(scene.tree, with_full(scene, settled, limit), limit, sole)
+    for new, parent in parents.items():
+        state.inherit(new, parent)
+        announce(BlockSplit(parent, new, len(settled[parent]), len(settled[new])))
+    return tree, settled
+
+
+def cut_at_rest(scene: StoredScene, state: RunState, limit: int, sole: int = 0) -> None:
+    """Cut the blocks of a run that goes on with smaller limits than it had; nothing where all are in order.
+
+    A block whose visit was under way is left for its end.
+
+    Args:
+        limit, sole: as of `split_full`.
+    """
+    for block in range(scene.tree.num_blocks) if limit else ():
+        if scene.count(block) <= FULL * limit or state.active is not None:
+            continue
+        large = {block: with_mail(scene, block), **inbox_without(scene, {block})}
+        tree, parts = cut_full(scene, large, state, limit, sole, Announcer())
+        if tree is not scene.tree:
+            scene.rest(tree, parts, state.to_json())

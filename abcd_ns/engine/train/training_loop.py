@@ -1,0 +1,37 @@
+"""The plainest caller of a coordinator: for tests, benchmarks, and anyone without nerfstudio."""
+
+from collections.abc import Callable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.render.loss import psnrs
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.types import Crop
+
+PhotoReader = Callable[[int, Crop], Float[Tensor, "h w 3"]]
+"""Gives the pixels of a crop of a view's photo, 0..1, by the view's index."""
+
+
+def train(coordinator: Coordinator, photo: PhotoReader, steps: int | None = None) -> None:
+    """Take `steps` optimisation steps, or go on until the coordinator's budget is used up."""
+    taken = 0
+    while not coordinator.finished and (steps is None or taken < steps):
+        train_step(coordinator, photo)
+        taken += 1
+
+
+def train_step(coordinator: Coordinator, photo: PhotoReader) -> None:
+    """Render a batch, take its loss' gradient, step every optimizer, report back."""
+    batch = coordinator.next_batch()
+    read = (photo(sample.view.index, sample.crop) for sample in batch.samples)
+    photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
+    rendered = coordinator.render(batch)
+    loss = coordinator.loss(batch, rendered.pictures, photos)
+    for optimizer in coordinator.optimizers.values():
+        optimizer.zero_grad(set_to_none=True)
+    if loss.requires_grad:
+        loss.backward()
+    for optimizer in coordinator.optimizers.values():
+        optimizer.step()
+    coordinator.after_step(rendered, psnrs(rendered.pictures, photos))

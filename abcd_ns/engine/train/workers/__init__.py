@@ -1,0 +1,1 @@
+"""Processes that share the views of a step on a CPU with many cores."""

@@ -1,0 +1,132 @@
+"""A process forked from this one, which draws shares of steps as this one would.
+
+Forking hands over everything: scene, views, photos, kernels. That works where no GPU is in use and no thread
+pool has to be carried over, so the helper computes in a single thread.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any, NoReturn
+
+import torch
+
+from abcd_ns.engine.train.density.control import COUNTED
+from abcd_ns.engine.train.workers.share import DrawShare, Part, Task
+from abcd_ns.engine.train.workers.shared_memory import SharedRows
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+
+PATIENCE = 600.0
+"""Seconds without an answer after which a helper counts as lost."""
+PR_SET_PDEATHSIG = 1
+"""Of Linux' prctl: a signal for this process when its parent ends, however that ends."""
+
+
+class Room:
+    """What processes share: the block's parameters, and for one helper what it gives back.
+
+    Args:
+        params: written by the training process, read by all helpers.
+        rows: Gaussians at most.
+    """
+
+    def __init__(self, params: SharedRows, like: Gaussians, rows: int) -> None:
+        self.params = params
+        self.gradients = SharedRows.like(like, rows)
+        self.counts = SharedRows(dict.fromkeys(COUNTED, ()), rows)
+
+    def give(self, part: Part) -> bool:
+        """Write what a share adds; whether there were counts."""
+        self.gradients.write(part.gradients)
+        self.counts.write(part.counts)
+        return bool(part.counts)
+
+    def take(self, rows: int, counted: bool) -> Part:
+        """Read it: shared memory, to be used before the next step."""
+        gradients = {name: self.gradients.rows(name, rows) for name in PARAM_NAMES}
+        return Part(gradients, {n: self.counts.rows(n, rows) for n in COUNTED} if counted else {})
+
+    def leaves(self, rows: int) -> Gaussians:
+        """The parameters, to be differentiated by."""
+        names = PARAM_NAMES
+        return Gaussians(**{n: self.params.rows(n, rows).clone().requires_grad_() for n in names})
+
+
+class HelperProcess:
+    """A helper, as the process sees it that forked it.
+
+    Args:
+        begin: called in the new process; gives what draws its shares.
+    """
+
+    def __init__(self, room: Room, begin: Callable[[], DrawShare]) -> None:
+        self._room = room
+        self._pipe, theirs = Pipe()
+        self.pid = os.fork()
+        """Its identifier."""
+        if self.pid == 0:
+            self._pipe.close()
+            _live(theirs, begin, room)
+        theirs.close()
+        self._ends = weakref.finalize(self, _end, os.getpid(), self.pid)
+
+    def ask(self, rows: int, task: Task) -> None:
+        """Let it begin a step, on the parameters that are in the room."""
+        with suppress(OSError):  # then no answer will come
+            self._pipe.send((rows, task))
+
+    def answer(self) -> Any | None:
+        """The next thing that it says: Drawn, then whether there are counts. None if it is lost."""
+        with suppress(OSError, EOFError):
+            if self._pipe.poll(PATIENCE):
+                return self._pipe.recv()
+        return None
+
+    def end(self) -> None:
+        """Kill it. Harmless when it has ended."""
+        self._ends()
+        self._pipe.close()
+
+
+def can_fork(device: torch.device) -> bool:
+    """Whether this machine and this process are made for it: on Linux, without a GPU."""
+    return sys.platform == "linux" and device.type == "cpu" and not torch.cuda.is_available()
+
+
+def _end(parent: int, pid: int) -> None:
+    if os.getpid() != parent:  # a helper that was forked later knows it, too
+        return
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+    with suppress(ChildProcessError):
+        os.waitpid(pid, 0)
+
+
+def _live(pipe: Connection, begin: Callable[[], DrawShare], room: Room) -> NoReturn:
+    """All of a helper's life. Whatever goes wrong in it ends it; who waits for it then does the work."""
+    status = 1
+    try:
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the training process decides
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        torch.set_num_threads(1)
+        _serve(pipe, room, begin())
+        status = 0
+    finally:
+        os._exit(status)  # none of the training process' own exits and handlers
+
+
+def _serve(pipe: Connection, room: Room, draw: DrawShare) -> None:
+    with suppress(EOFError):
+        while True:
+            rows, task = pipe.recv()
+            share = draw(room.leaves(rows), task)
+            pipe.send(share.drawn)
+            pipe.send(room.give(share.differentiate()))

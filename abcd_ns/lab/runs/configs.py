@@ -1,0 +1,127 @@
+"""nerfstudio's configuration of one job: as `ns-train` would have it, without viewer and evaluation."""
+
+import copy
+from pathlib import Path
+
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
+from nerfstudio.engine.trainer import TrainerConfig
+
+from abcd_ns import methods
+from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.job import HELD_OUT_EVERY, Job
+from abcd_ns.lab.runs.options import change_options
+from abcd_ns.nerfstudio.config import AbcdPipelineConfig, AbcdTrainerConfig
+from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+
+ENDLESS = 10**9
+"""Steps of a run that its seconds end."""
+
+
+_REGISTERED = {
+    "abcd": methods.abcd,
+    "abcd-ablated": methods.abcd_ablated,
+    "abcd-partition": methods.abcd_partition,
+    "abcd-exact": methods.abcd_exact,
+    "abcd-paper": methods.abcd_paper,
+    "abcd-monolithic": methods.abcd_monolithic,
+}
+
+
+class SplatfactoData(FullImageDatamanager[AbcdDataset]):
+    """Splatfacto's own datamanager on the very photos and cameras that ABCD reads."""
+
+
+def trainer_config(job: Job, out: Path) -> TrainerConfig:
+    """What the job trains with; its files go to `job.folder(out)`."""
+    config = _splatfacto(job) if job.method == "splatfacto" else _abcd(job)
+    settings = job.settings
+    config.output_dir, config.experiment_name, config.timestamp = out, "runs", job.folder(out).name
+    config.machine.seed = job.seed
+    config.max_num_iterations = ENDLESS if settings.steps is None else settings.steps
+    # "tensorboard" is the value of `vis` that starts no viewer and asks no service for an account.
+    config.vis = "tensorboard"
+    config.viewer.quit_on_train_completion = True
+    config.logging.local_writer.enable = False
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    config.steps_per_save = 0
+    return config
+
+
+def check_scene(job: Job) -> None:
+    """Look at the scene as a worker would, photos included.
+
+    Raises:
+        UserError: it cannot be trained on.
+    """
+    _parser(job).setup().check()
+
+
+def check_options(job: Job) -> None:
+    """Whether the options of the job's variant exist and go together.
+
+    Raises:
+        UserError: they do not.
+    """
+    pipeline = _abcd(job).pipeline
+    pipeline.model.mirror(pipeline.training)
+    if pipeline.blocks < 1:
+        raise UserError(f"{job.variant.name}: blocks must be 1 or more, not {pipeline.blocks}.")
+
+
+def registered(method: str) -> AbcdTrainerConfig | None:
+    """The configuration that `ns-train` knows a method of ABCD's by, not a copy; None for any other."""
+    return _REGISTERED[method].config if method in _REGISTERED else None
+
+
+def default_options(method: str) -> AbcdPipelineConfig:
+    """The method's pipeline as it is registered; not a copy."""
+    return _REGISTERED[method].config.pipeline
+
+
+def _abcd(job: Job) -> AbcdTrainerConfig:
+    config: AbcdTrainerConfig = copy.deepcopy(_REGISTERED[job.method].config)
+    settings, pipeline = job.settings, config.pipeline
+    pipeline.datamanager.data = Path(settings.data)
+    pipeline.datamanager.dataparser = _parser(job)
+    if job.method != "abcd-monolithic":
+        pipeline.blocks = settings.blocks
+    if job.method == "abcd-paper":
+        # One visit to each cell; cells that no view sees leave their steps to the others.
+        pipeline.training.visit_steps = -(-settings.steps // settings.blocks)
+    pipeline.max_seconds = settings.seconds
+    pipeline.training.seed = job.seed
+    pipeline.training.density.max_gaussians = settings.max_gaussians
+    if not settings.densify:
+        pipeline.training.density.strategy = "off"
+    change_options(pipeline, job.variant)
+    return config
+
+
+def _splatfacto(job: Job) -> TrainerConfig:
+    # Here and not above: this import starts every installed plugin.
+    from nerfstudio.configs.method_configs import method_configs
+
+    config: TrainerConfig = copy.deepcopy(method_configs["splatfacto"])
+    config.pipeline.datamanager = FullImageDatamanagerConfig(
+        _target=SplatfactoData,
+        data=Path(job.settings.data),
+        dataparser=_parser(job),
+        cache_images_type="uint8",
+    )
+    if not job.settings.densify:
+        config.pipeline.model.stop_split_at = 0
+    return config
+
+
+def _parser(job: Job) -> AbcdDataParserConfig:
+    settings = job.settings
+    return AbcdDataParserConfig(
+        data=Path(settings.data),
+        downscale_factor=settings.downscale,
+        eval_mode="interval",
+        eval_interval=HELD_OUT_EVERY,
+    )

@@ -1,0 +1,146 @@
+"""A training run that is watched: its clock, its curve of held-out quality, and what it reports of itself."""
+
+import time
+from collections.abc import Callable
+
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+
+from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitEnded
+from abcd_ns.engine.train.run_state import Budget, Stopwatch
+from abcd_ns.lab.runs.evaluate import mean_psnr
+from abcd_ns.lab.runs.job import Settings
+from abcd_ns.lab.runs.run import CurvePoint
+
+
+class CurveRecorder:
+    """Scores the held-out views at given moments of a run, while the run's stopwatch is paused.
+
+    Args:
+        moments: shares of the run, rising; 1 and above are left to whoever ends the run.
+        progress: the share of the run that is done.
+        steps: optimisation steps taken.
+        measure: the score, dB.
+        count: Gaussians that are drawn.
+    """
+
+    def __init__(
+        self,
+        moments: tuple[float, ...],
+        stopwatch: Stopwatch,
+        progress: Callable[[], float],
+        steps: Callable[[], int],
+        measure: Callable[[], float],
+        count: Callable[[], int],
+    ) -> None:
+        self.points: list[CurvePoint] = []
+        self.seconds = 0.0
+        """Spent on evaluation."""
+        self._left = [moment for moment in moments if moment < 1]
+        self._stopwatch, self._progress, self._steps = stopwatch, progress, steps
+        self._measure, self._count = measure, count
+
+    def look(self) -> None:
+        """Call after every step."""
+        progress = self._progress()
+        if progress >= 1 or not self._left or progress < self._left[0]:
+            return
+        self._left = [moment for moment in self._left if moment > progress]
+        self._stopwatch.pause()
+        began = time.perf_counter()
+        seconds, steps = self._stopwatch.seconds, self._steps()
+        self.points.append(CurvePoint(seconds, steps, self._measure(), self._count()))
+        self.seconds += time.perf_counter() - began
+        self._stopwatch.start()
+
+
+class Training:
+    """A trainer that is set up, with a curve recorder in it."""
+
+    def __init__(self, trainer: Trainer, settings: Settings) -> None:
+        self.trainer, self.pipeline = trainer, trainer.pipeline
+        self.layer_seconds = 0.0
+        self.coordinator = getattr(trainer.pipeline, "coordinator", None)
+        if self.coordinator is None:
+            self._follow_steps(settings)
+        else:
+            self._follow_events(settings)
+
+    def _follow_events(self, settings: Settings) -> None:
+        coordinator = self.coordinator
+        self.stopwatch = coordinator.stopwatch
+        self.recorder = CurveRecorder(
+            settings.moments,
+            self.stopwatch,
+            lambda: coordinator.progress,
+            lambda: coordinator.state.step,
+            self._score_aloud,
+            lambda: self.gaussians,
+        )
+
+        def listen(event: Event) -> None:
+            if isinstance(event, StepTaken):
+                self.recorder.look()
+            elif isinstance(event, VisitEnded):
+                self.layer_seconds += event.layer_seconds
+
+        coordinator.announce.subscribe(listen)
+
+    def _score_aloud(self) -> float:
+        found = mean_psnr(self.pipeline)
+        self.coordinator.announce(HeldOutScored(found, None))
+        return found
+
+    def _follow_steps(self, settings: Settings) -> None:
+        """For a trainer that is not ABCD's: count the time here, and stop when it is up."""
+        trainer, budget = self.trainer, Budget(settings.steps, settings.seconds)
+        self.stopwatch = Stopwatch()
+
+        def progress() -> float:
+            return budget.progress(trainer.step + 1, self.stopwatch.seconds)
+
+        self.recorder = CurveRecorder(
+            settings.moments,
+            self.stopwatch,
+            progress,
+            lambda: trainer.step + 1,
+            lambda: mean_psnr(self.pipeline),
+            lambda: self.gaussians,
+        )
+
+        def begin_step(step: int) -> None:  # noqa: ARG001 - nerfstudio passes it
+            self.stopwatch.start()
+
+        def end_step(step: int) -> None:  # noqa: ARG001
+            self.recorder.look()
+            if progress() >= 1:
+                self.stopwatch.pause()
+                self.steps_taken = trainer.step + 1
+                trainer.stop_training = True
+
+        location = TrainingCallbackLocation
+        trainer.callbacks += [
+            TrainingCallback([location.BEFORE_TRAIN_ITERATION], begin_step),
+            TrainingCallback([location.AFTER_TRAIN_ITERATION], end_step),
+        ]
+
+    def warm_up(self) -> None:
+        """Compile what will be drawn with, before the clock runs."""
+        if self.coordinator is None:
+            return
+        self.pipeline.model.draws_with().warm_up()
+
+    @property
+    def steps(self) -> int:
+        """Optimisation steps taken by a run that is over."""
+        return self.steps_taken if self.coordinator is None else self.coordinator.state.step
+
+    @property
+    def blocks(self) -> int:
+        """1 where the method knows of none."""
+        return 1 if self.coordinator is None else self.coordinator.scene.tree.num_blocks
+
+    @property
+    def gaussians(self) -> int:
+        """In the whole scene."""
+        return self.pipeline.model.num_points if self.coordinator is None else self.coordinator.count()

@@ -1,0 +1,159 @@
+"""One run in a process of its own: `python -m abcd_ns.lab.runs.worker JOB.json`.
+
+Reads a job, trains as `ns-train` does, and writes run.json and pictures beside the job. Whatever it prints is
+the run's log; its last line tells what went wrong.
+"""
+
+import random
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import torch
+from PIL import Image
+from torch import Tensor
+
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.configs import trainer_config
+from abcd_ns.lab.runs.evaluate import (
+    draw_held_out,
+    mean,
+    ordering_gap,
+    score,
+    squared_gap,
+)
+from abcd_ns.lab.runs.job import Job, evenly
+from abcd_ns.lab.runs.records import decode, encode, read_json, write_json
+from abcd_ns.lab.runs.run import CurvePoint, Run, ViewScore
+from abcd_ns.lab.runs.training import Training
+from abcd_ns.nerfstudio.config import AbcdTrainerConfig
+from abcd_ns.nerfstudio.machine import (
+    describe_versions,
+    disk_bytes,
+    peak_device_bytes,
+    peak_rss_bytes,
+    without_home,
+)
+from abcd_ns.nerfstudio.metrics import lpips_missing
+from abcd_ns.nerfstudio.pipeline import STORE
+
+RUN_FILE = "run.json"
+"""Written when all is done, beside the job."""
+
+
+def run(job: Job, folder: Path) -> Run:
+    """Train and score.
+
+    Args:
+        folder: `job.folder(out)`; gets nerfstudio's files, and pictures of some held-out views.
+
+    Raises:
+        UserError, SystemExit: the scene or an option cannot be used; said on the console.
+    """
+    config = trainer_config(job, folder.parent.parent.parent)
+    if isinstance(config, AbcdTrainerConfig):
+        config.check()
+    seed_everything(job.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    config.save_config()
+    trainer.setup()
+    training = Training(trainer, job.settings)
+    training.warm_up()
+    trainer.train()
+    total = time.time() - psutil.Process().create_time() - training.recorder.seconds
+    memory = _memory()
+    scores, gaps = score_held_out(training, job, folder / "pictures")
+    return _record(job, training, total, scores, gaps, folder, memory)
+
+
+def seed_everything(seed: int) -> None:
+    """As nerfstudio's `ns-train` does before it sets a trainer up."""
+    random.seed(seed)
+    np.random.seed(seed)
+    torch.manual_seed(seed)
+
+
+def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[ViewScore], list[float]]:
+    """Scores and squared ordering gaps of all held-out views; photo and picture of some of them as PNG."""
+    shown = set(evenly(len(training.pipeline.datamanager.eval_dataset), job.settings.pictures))
+    scores, gaps = [], []
+    for drawn in draw_held_out(training.pipeline):
+        scores.append(score(drawn))
+        gaps.append(squared_gap(drawn))
+        if drawn.view.row in shown:
+            pictures.mkdir(exist_ok=True)
+            save_png(pictures / f"photo-{drawn.view.row:04d}.png", drawn.view.photo)
+            save_png(pictures / f"merged-{drawn.view.row:04d}.png", drawn.merged)
+    return scores, gaps
+
+
+def save_png(path: Path, picture: Tensor) -> None:
+    """Write a picture, float [h, w, 3] in 0..1, with 8 bits a channel."""
+    Image.fromarray((picture * 255).round().byte().cpu().numpy()).save(path)
+
+
+def _memory() -> dict[str, int | str | None]:
+    allocated, reserved = peak_device_bytes()
+    return {
+        "peak_rss_bytes": peak_rss_bytes(),
+        "peak_device_bytes": allocated,
+        "peak_device_note": "no CUDA device" if allocated is None else None,
+        "peak_reserved_bytes": reserved,
+    }
+
+
+def _record(
+    job: Job,
+    training: Training,
+    total: float,
+    scores: list[ViewScore],
+    gaps: list[float],
+    folder: Path,
+    memory: dict[str, int | str | None],
+) -> Run:
+    def mean_of(name: str) -> float | None:
+        return mean([getattr(view, name) for view in scores])
+
+    names = ("psnr", "ssim", "lpips", "psnr_merged", "ssim_merged")
+    means = {name: mean_of(name) for name in names}
+    gap, note = ordering_gap(gaps, training.blocks)
+    end = CurvePoint(training.stopwatch.seconds, training.steps, means["psnr_merged"], training.gaussians)
+    return Run(
+        method=job.method,
+        scene=job.settings.scene,
+        seed=job.seed,
+        blocks=training.blocks,
+        steps=training.steps,
+        train_seconds=end.seconds,
+        total_seconds=total,
+        **means,
+        lpips_reason=without_home(lpips_missing() or "") or None,
+        ordering_gap_db=gap,
+        ordering_gap_note=note,
+        gaussians=training.gaussians,
+        **memory,
+        store_bytes=disk_bytes(folder / "abcd" / STORE),
+        layer_seconds=training.layer_seconds,
+        curve=(*training.recorder.points, end),
+        views=tuple(scores),
+        versions=describe_versions(),
+    )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the job in the file named by the only argument; exit code 0, or 2 for an error of the user's."""
+    (path,) = map(Path, sys.argv[1:] if args is None else args)
+    job = decode(Job, read_json(path), str(path))
+    try:
+        found = run(job, path.resolve().parent)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    write_json(path.with_name(RUN_FILE), encode(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

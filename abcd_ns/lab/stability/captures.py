@@ -1,0 +1,133 @@
+"""A11, A12, A16: too few views, poses and exposures that are off, and a far background."""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.initialize import random_points
+from abcd_ns.engine.types import View
+from abcd_ns.lab.stability.lab import METHODS, Lab, Method, Stage, make_stage
+from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.world import TABLE, Ball, World
+
+FEW = 3
+TURN_DEGREES, SHIFT = 0.5, 0.01
+"""Of noisy poses: standard deviations; the shift in distances of the cameras."""
+GAINS = (1.0, 1.5)
+FAR = 50.0
+MARGIN = 0.3
+"""dB that a fault may cost ABCD more than one block."""
+
+
+def random_turn(degrees: float, generator: torch.Generator) -> Tensor:
+    """[3, 3] a rotation by a normally distributed angle about a random axis."""
+    axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    angle = math.radians(degrees) * float(torch.randn((), generator=generator))
+    x, y, z = axis.tolist()
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.matrix_exp(angle * cross)
+
+
+def with_noisy_poses(stage: Stage, degrees: float, shift: float, seed: int = 0) -> Stage:
+    """The same photos, under poses that are off; those of the held-out views are right."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def move(view: View) -> View:
+        turn = random_turn(degrees, generator)
+        matrix = view.viewmat.double().clone()
+        matrix[:3] = turn @ matrix[:3]
+        matrix[:3, 3] += shift * torch.randn(3, generator=generator, dtype=torch.float64)
+        return replace(view, viewmat=matrix.float())
+
+    return replace(stage, views=[move(view) for view in stage.views])
+
+
+def with_gains(stage: Stage, gains: tuple[float, ...] = GAINS) -> Stage:
+    """Every other photo brighter, as a camera that chooses its exposure leaves them; clipped at white."""
+    chosen = {index: gains[k % len(gains)] for k, index in enumerate(stage.photos)}
+    photos = {index: (chosen[index] * photo).clamp(0, 1) for index, photo in stage.photos.items()}
+    return replace(stage, photos=photos)
+
+
+def with_random_points(stage: Stage, count: int, extent: float) -> Stage:
+    """Without a reconstruction: points at random places."""
+    points, colors = random_points(count, extent)
+    return replace(stage, points=points, colors=colors)
+
+
+PAIR: tuple[Method, ...] = ("abcd", "abcd-monolithic")
+
+
+def table() -> Stage:
+    """What faults are put into."""
+    return make_stage()
+
+
+def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:
+    """What each fault costs each method, against the same method without it: ABCD no more than one block.
+
+    What blocks cost without any fault is another question, see A19.
+    """
+    clean = {method: lab.compared(table(), method, "table") for method in METHODS}
+    numbers = {f"clean {method}": value for method, value in clean.items()}
+    said = {method: f"{value:.2f} dB without" for method, value in clean.items()}
+    passed, worse = True, False
+    for name, stage in cases.items():
+        found = {method: lab.compared(stage, method) for method in PAIR}
+        for method, value in found.items():
+            said[method] += f", {value:.2f} ({value - clean[method]:+.2f}) with {name}"
+            numbers[f"{name} {method}"] = value
+        costs = {method: clean[method] - found[method] for method in PAIR}
+        passed &= costs["abcd"] <= costs["abcd-monolithic"] + MARGIN
+        worse |= found["abcd"] < found["abcd-monolithic"]
+    return Finding(passed, said, numbers, worse)
+
+
+def sparse(lab: Lab) -> Finding:
+    """A11: few views; a random start."""
+    stage = table()
+    random = with_random_points(stage, len(stage.points), 1.2)
+    return lost(lab, {f"{FEW} views": stage.only(FEW), "a random start": random})
+
+
+def inexact(lab: Lab) -> Finding:
+    """A12: poses that are off, exposures that differ."""
+    stage = table()
+    noisy = with_noisy_poses(stage, TURN_DEGREES, SHIFT)
+    return lost(lab, {"noisy poses": noisy, "two exposures": with_gains(stage)})
+
+
+def far_shell(lab: Lab) -> Finding:
+    """A16: half of each picture is a shell 50 times as far away as the cameras stand."""
+    world = World((*TABLE.surfaces[:-1], Ball((0.0, 0.0, 0.0), FAR)))
+    return lost(lab, {"a far shell": make_stage(world)})
+
+
+SCENARIOS = (
+    Scenario(
+        "A11",
+        "sparse, unbalanced views; a random start costs 4 to 5 dB (RAIN-GS)",
+        f"{FEW} of 16 cameras; points at random places",
+        "PSNR falls by no more than one block's does, and 0.3 dB",
+        sparse,
+        cost=6,
+    ),
+    Scenario(
+        "A12",
+        "noisy poses, changing exposure (H3DGS #55, VastGaussian)",
+        f"poses off by {TURN_DEGREES} degrees and {SHIFT:.0%}; every other photo 1.5 times as bright",
+        "PSNR falls by no more than one block's does, and 0.3 dB",
+        inexact,
+        cost=5,
+    ),
+    Scenario(
+        "A16",
+        "sky and far background lost (H3DGS #39, Inria #300)",
+        f"a textured shell {FAR:g} times as far away as the cameras stand",
+        "PSNR falls by no more than one block's does, and 0.3 dB",
+        far_shell,
+        cost=2,
+    ),
+)

@@ -1,0 +1,194 @@
+"""`abcd stability`: make methods fail, and see what ABCD does."""
+
+import shlex
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import TimeRemainingColumn as TimeLeft
+
+from abcd_ns.errors import UserError
+from abcd_ns.lab.stability.catalogue import SCENARIOS
+from abcd_ns.lab.stability.curves import Curve, Study, studies
+from abcd_ns.lab.stability.lab import Lab
+from abcd_ns.lab.stability.outcome import Outcome, Scenario
+from abcd_ns.lab.stability.real import read_stage, real_scenarios
+from abcd_ns.lab.stability.report import (
+    RESULTS_FILE,
+    SCHEMA,
+    Report,
+    headline,
+    print_outcome,
+    write_report,
+)
+from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+
+
+def stability(
+    *,
+    out: Path,
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None,
+    downscale: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="A1 A3 ...", help_behavior_hint="")] = (),
+    quick: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")] = False,
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+) -> int:
+    """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
+
+    All methods draw the same number of views. OUT gets stability.json, table.md and charts of held-out PSNR
+    against the number of blocks, steps a visit, the age of layers, views, noise of poses and
+    exposure. Needs no GPU and no data; some 10 minutes on two cores.
+
+    Args:
+        out: Folder for the results; absent, empty, or one of an earlier call.
+        data: A capture as for `ns-train abcd --data`; adds scenarios R1 to R5 on it.
+        downscale: Divides the width and height of its photos.
+        only: Scenarios to carry out, by id, without the charts.
+        quick: A third of the training, no charts: to see that everything works. Its rules may fail.
+        seed: Of every training.
+
+    Raises:
+        UserError: an option cannot be used, or OUT holds something else.
+    """
+    claim(out)
+    if downscale < 1:
+        raise UserError(f"--downscale is {downscale}; it must be at least 1.")
+    if seed < 0:
+        raise UserError(f"--seed is {seed}; it must be at least 0.")
+    console = Console()
+    known = dict(SCENARIOS)
+    if data is not None:
+        stage = read_stage(data, downscale)
+        known |= {scenario.id: scenario for scenario in real_scenarios(stage, data.resolve().name)}
+    chosen = choose(only, known)
+    wanted = () if only or quick else studies()
+    began = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    made = (_command(data, out), describe_machine(), describe_versions())
+    paths: list[Path] = []
+
+    def keep(outcomes: Sequence[Outcome], curves: Sequence[Curve]) -> None:
+        paths[:] = write_report(Report(SCHEMA, began, *made, tuple(outcomes), tuple(curves)), out)
+
+    with tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder, _bar(console) as progress:
+        meter = Meter(progress, sum(scenario.cost for scenario in chosen) + sum(map(len, wanted)))
+        lab = Lab(Path(folder), quick=quick, seed=seed, tick=meter.step)
+        outcomes = carry_out(lab, chosen, wanted, meter, keep)
+    for path in paths:
+        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
+    console.print(headline(outcomes), highlight=False, soft_wrap=True)
+    return 0 if all(outcome.passed for outcome in outcomes) else 1
+
+
+def _command(data: Path | None, out: Path) -> str:
+    """The command line that was typed, with the names of folders instead of where they are."""
+    names = {str(path): path.resolve().name for path in (data, out) if path is not None}
+    return shlex.join(["abcd", *(names.get(word, word) for word in sys.argv[1:])])
+
+
+def choose(only: Sequence[str], known: dict[str, Scenario]) -> list[Scenario]:
+    """The scenarios asked for, in their order; all if none is named.
+
+    Raises:
+        UserError: there is none of that id.
+    """
+    wanted = {name.upper() for name in only}
+    for name in sorted(wanted - set(known)):
+        hint = "; R1 to R5 need --data" if name.startswith("R") else ""
+        raise UserError(f"--only {name}: there is no such scenario{hint}; there are {', '.join(known)}.")
+    return [scenario for name, scenario in known.items() if not wanted or name in wanted]
+
+
+def claim(out: Path) -> None:
+    """Make `out` a folder of this command.
+
+    Raises:
+        UserError: it is a file, or holds something else.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out} is a file; name a folder.")
+    if out.is_dir() and any(out.iterdir()) and not (out / RESULTS_FILE).exists():
+        raise UserError(f"--out {out} is not empty and holds no stability report; name another folder.")
+    out.mkdir(parents=True, exist_ok=True)
+
+
+class Meter:
+    """How far the command is: a bar, what is going on, and steps of training so far."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self.console, self._progress, self._steps = progress.console, progress, 0
+        self._task = progress.add_task("", total=total, steps=0)
+
+    def begin(self, what: str) -> None:
+        """Say what is going on."""
+        self._progress.update(self._task, description=what[:44])
+
+    def advance(self, by: int = 1) -> None:
+        """So much is done."""
+        self._progress.advance(self._task, by)
+
+    def step(self) -> None:
+        """One step of training was taken."""
+        self._steps += 1
+        self._progress.update(self._task, steps=self._steps)
+
+
+def carry_out(
+    lab: Lab,
+    scenarios: Sequence[Scenario],
+    wanted: Sequence[Study],
+    meter: Meter,
+    keep: Callable[[Sequence[Outcome], Sequence[Curve]], None],
+) -> list[Outcome]:
+    """Every scenario and every curve, one after the other.
+
+    Args:
+        keep: given all that is there after each of them, so that a call that is broken off leaves something.
+    """
+    outcomes: list[Outcome] = []
+    curves: list[Curve] = []
+    for scenario in scenarios:
+        meter.begin(f"{scenario.id} {scenario.fails}")
+        outcomes.append(examine(lab, scenario))
+        meter.advance(scenario.cost)
+        print_outcome(outcomes[-1], meter.console)
+        keep(outcomes, curves)
+    for study in wanted:
+        meter.begin(f"chart: {study.title}")
+        for curve in study.make(lab):
+            meter.advance()
+            curves += [] if curve is None else [curve]
+        meter.console.print(f"      chart: {study.title}", highlight=False)
+        keep(outcomes, curves)
+    return outcomes
+
+
+def examine(lab: Lab, scenario: Scenario) -> Outcome:
+    """Carry out one scenario."""
+    torch.manual_seed(0)
+    began = time.perf_counter()
+    found = scenario.run(lab)
+    return Outcome(
+        scenario.id,
+        scenario.fails,
+        scenario.done,
+        scenario.rule,
+        found.passed,
+        found.worse,
+        found.said,
+        {name: float(value) for name, value in found.numbers.items()},
+        round(time.perf_counter() - began, 1),
+    )
+
+
+def _bar(console: Console) -> Progress:
+    what, steps = TextColumn("{task.description}"), TextColumn("{task.fields[steps]:,} steps")
+    columns = (what, BarColumn(20), TaskProgressColumn(), steps, TimeElapsedColumn(), TimeLeft())
+    return Progress(*columns, console=console)

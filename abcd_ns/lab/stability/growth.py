@@ -1,0 +1,123 @@
+"""A5, A6, A7: density control that never ends, undoes what was learnt, or never begins."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import torch
+
+from abcd_ns.engine.events import VisitEnded, VisitUndone
+from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
+from abcd_ns.engine.train.memory import OutOfRoomError, check_room
+from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_visit
+from abcd_ns.lab.stability.lab import Lab, make_stage
+from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.world import ring
+
+CAP = 300
+CAMERAS = (1, 2, 3, 10, 100, 1000, 2900, 15_000)
+RESET_EVERY = 150
+"""A block's own views between resets: in the midst of visits and at their ends."""
+ALLOWED_RISE = 0.02
+"""Of the mean absolute error over all training photos, by one visit."""
+
+
+def noise(lab: Lab) -> Finding:
+    """A5: photos of noise, from twice as many points as there may be Gaussians; and a block too large."""
+    stage, said, numbers, passed = make_stage(views=ring(12), points=2 * CAP), {}, {}, True
+    draw = {"generator": torch.Generator().manual_seed(5)}
+    photos = {index: torch.rand(photo.shape, **draw) for index, photo in stage.photos.items()}
+    density = DensityConfig(max_gaussians=CAP, refine_start=0.0, refine_stop=1.0, densify_grad_thresh=1e-5)
+    for method in ("abcd", "abcd-monolithic"):
+        options = {"budget": lab.views_drawn(300), "blocks": 4, "density": density}
+        trained = lab.train(replace(stage, photos=photos), method, **options)
+        most = max(trained.counts)
+        numbers[f"most {method}"] = most
+        said[method] = f"never over {most} of {CAP}"
+        passed &= most <= CAP and trained.coordinator.finished
+    try:
+        check_room(10**12, 3, torch.device("cpu"))
+    except OutOfRoomError as error:
+        said["abcd"] += f'; "{str(error).split(";")[0]}"'
+    else:
+        passed = False
+    return Finding(passed, said, numbers)
+
+
+def resets(lab: Lab) -> Finding:
+    """A6: opacity resets that fall into visits and on their ends; the objective after every visit."""
+    stage, said, numbers = make_stage(views=ring(12), points=400), {}, {}
+    density = DensityConfig(reset_every=RESET_EVERY, refine_start=0.0, refine_stop=1.0)
+    for name, heal in (("abcd", True), ("abcd, not healing", False)):
+        options = {"budget": lab.views_drawn(600), "blocks": 3, "warmup": 0.0, "density": density}
+        coordinator = lab.coordinator(stage.start(), stage.views, heal=heal, **options)
+        errors, undone = [lab.error(coordinator, stage)], []
+
+        def listen(event, coordinator=coordinator, errors=errors, undone=undone) -> None:
+            if isinstance(event, VisitEnded):
+                errors.append(lab.error(coordinator, stage))
+            undone += [event] * isinstance(event, VisitUndone)
+
+        coordinator.announce.subscribe(listen)
+        lab.finish(coordinator, stage)
+        worst = max(after / before - 1 for before, after in pairwise(errors))
+        numbers |= {f"worst rise {name}": worst, f"undone {name}": len(undone), f"end {name}": errors[-1]}
+        said[name] = f"worst visit {worst:+.0%} error, {len(undone)} of {len(errors) - 1} visits undone"
+    return Finding(numbers["worst rise abcd"] <= ALLOWED_RISE, said, numbers)
+
+
+def refinements(cameras: int, sweep: int, config: DensityConfig, *, batch: int = 4, limit: int = 32) -> int:
+    """How often a block that `cameras` see is refined in one visit, once it is warm."""
+    control = DensityControl(for_blocks(config, 8))
+    steps = -(-passes_of_sweep(sweep, 4, 8) * views_per_visit(cameras, cameras, limit) // batch)
+    views, done = min(cameras, steps * batch), 10 * max(cameras, 1)
+    clocks = [
+        DensityClock(0.2, done + batch * (k + 1), batch, views, None, 0) for k in range(steps)
+    ]  # by the coordinator's rule, see Coordinator._density_clock
+    return sum(control.is_due(clock) for clock in clocks)
+
+
+def splatfacto_refines(cameras: int, steps: int = 15_000) -> int:
+    """nerfstudio 1.1.5: not before `cameras` + 100 steps after a reset, and resets are 3,000 steps apart."""
+    every, reset = 100, 3000
+    return sum(step % every == 0 and step % reset >= cameras + every for step in range(500, steps))
+
+
+def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no training
+    """A7: the schedule alone, for captures of 1 to 15,000 photos."""
+    least = {cameras: min(refinements(cameras, s, DensityConfig()) for s in range(6)) for cameras in CAMERAS}
+    never = [cameras for cameras in CAMERAS if splatfacto_refines(cameras) == 0]
+    too_short = [c for c in CAMERAS if passes_of_sweep(0, 4, 8) * views_per_visit(c, c, 32) < 30]
+    passed = all(count >= 1 for cameras, count in least.items() if cameras not in too_short)
+    said = {
+        "abcd": f"at least {min(c for n, c in least.items() if n not in too_short)} refinement in each visit "
+        f"of {min(set(CAMERAS) - set(too_short)):,} to {CAMERAS[-1]:,} cameras",
+        "splatfacto": f"none at all from {min(never):,} cameras on",
+    }
+    return Finding(passed, said, {f"least at {cameras}": count for cameras, count in least.items()})
+
+
+SCENARIOS = (
+    Scenario(
+        "A5",
+        "densification blows up; the cap is ignored at the start (desplat #5, gsplat #516)",
+        "photos of noise, growth at the least gradient, twice as many points as the cap; a block of 10^12",
+        "never over the cap, at any step; an error that names the fix before memory is taken",
+        noise,
+    ),
+    Scenario(
+        "A6",
+        "an opacity reset costs 2.7 to 7.6 dB (gsplat #1012)",
+        f"a reset after every {RESET_EVERY} of a block's views, in visits and at their ends",
+        f"no visit leaves the error over all photos more than {ALLOWED_RISE:.0%} higher",
+        resets,
+        cost=2,
+    ),
+    Scenario(
+        "A7",
+        "never densifies from 2,900 images on (nerfstudio #2927, #3743)",
+        "the schedule for 1 to 15,000 cameras, and splatfacto's",
+        "at least one refinement in each visit of 30 views or more; shorter ones, of fewer than 8 cameras, "
+        "gather statistics over several",
+        thousands,
+    ),
+)

@@ -1,0 +1,251 @@
+"""Trains small scenes with the bare engine, the same way for every method."""
+
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import Parameter
+
+from abcd_ns.engine.events import Event
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
+from abcd_ns.engine.gaussians.param_swap import Optimizers, nothing_live
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.render.loss import psnr
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.memory import scaffold_size
+from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.schedule import views_per_step, views_per_warm_up_step
+from abcd_ns.engine.train.training_loop import train_step
+from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.lab.stability.world import TABLE, World, ring
+
+Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
+METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
+SH_DEGREE = 1
+"""Nothing in these worlds shines."""
+STILL = DensityConfig(strategy="off")
+"""The number of Gaussians stays."""
+
+
+LIMITED = DensityConfig(max_gaussians=1000)
+"""As many Gaussians for every method, and few, for time."""
+BUDGET = 600
+"""Views that a run draws where methods are compared: few, so that what blocks cost shows."""
+BLOCKS = 4
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a capture gives: photos to train on, photos held out, points to begin with."""
+
+    views: list[View]
+    photos: dict[int, Float[Tensor, "h w 3"]]
+    """By the view's index."""
+    points: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
+    """0..255."""
+    held_out: list[View]
+    truth: list[Float[Tensor, "h w 3"]]
+    """Their photos."""
+
+    def __call__(self, index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
+        """The training loop's photo reader."""
+        return self.photos[index][crop.slices]
+
+    def start(self) -> Gaussians:
+        """The first Gaussians."""
+        return gaussians_from_points(self.points.float(), self.colors, sh_degree=SH_DEGREE)
+
+    def only(self, count: int) -> "Stage":
+        """With `count` of the training views, evenly spread."""
+        total = len(self.views)
+        chosen = [self.views[k * total // count] for k in range(count)]
+        return replace(self, views=chosen)
+
+
+def make_stage(
+    world: World = TABLE,
+    views: list[View] | None = None,
+    held_out: list[View] | None = None,
+    points: int = 400,
+) -> Stage:
+    """Photograph a world; on a ring of 16 cameras unless told otherwise, held out between them."""
+    views = ring(16) if views is None else views
+    held_out = ring(8, turn=0.17) if held_out is None else held_out
+    where, colors = world.points(views, points)
+    photos = {view.index: world.photo(view) for view in views}
+    return Stage(views, photos, where, colors, held_out, [world.photo(view) for view in held_out])
+
+
+@dataclass
+class Trained:
+    """What a run left behind."""
+
+    coordinator: Coordinator
+    psnr: float
+    """Held-out, dB."""
+    events: list[Event]
+    counts: list[int] = field(default_factory=list)
+    """Gaussians in the scene after each step."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The whole scene in one list."""
+        return merged(self.coordinator)
+
+    def of(self, kind: type) -> list:
+        """The events of one kind."""
+        return [event for event in self.events if isinstance(event, kind)]
+
+
+class Lab:
+    """Where scenarios are carried out: a folder for stores, a rasterizer, somebody to tell of progress.
+
+    Args:
+        compile: of the rasterizer; "never" where last bits must not depend on the machine.
+        quick: a third of the work, to see that everything runs.
+        seed: of every training that names none.
+        tick: called after every training step.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        compile: Literal["auto", "never"] = "auto",
+        quick: bool = False,
+        seed: int = 0,
+        tick: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.quick, self.seed, self.tick = quick, seed, tick
+        self._scores: dict[str, float] = {}
+        self.rasterizer = TorchRasterizer(compile)
+        self._folder = folder
+
+    def views_drawn(self, usual: int) -> int:
+        """The budget of a run, in views."""
+        return usual // 3 if self.quick else usual
+
+    def coordinator(
+        self,
+        start: Gaussians,
+        views: list[View],
+        method: Method = "abcd",
+        *,
+        budget: int,
+        blocks: int = BLOCKS,
+        tree: BlockTree | None = None,
+        kind: type[Coordinator] = Coordinator,
+        optimizers: tuple[dict[str, Parameter], Optimizers] | None = None,
+        **training,
+    ) -> Coordinator:
+        """A coordinator over a new store.
+
+        Args:
+            budget: views drawn in the whole run; every method gets as many, in steps of as many as it takes.
+            optimizers: parameters and their optimizers; new ones if left out.
+            training: options of TrainingConfig.
+        """
+        usual = {"sh_degree": start.sh_degree, "layers": method != "abcd-ablated", "seed": self.seed}
+        options = {**usual, **training}
+        tree = tree or build_kd(start.means, blocks)
+        if method == "abcd-monolithic":
+            tree = build_kd(start.means, 1)
+        config = TrainingConfig(**options)
+        start = thin_out(start, config.density.limit, config.seed)
+        store = ParameterStore.create(Path(tempfile.mkdtemp(dir=self._folder)) / "store", {})
+        warms = config.warmup > 0 and tree.num_blocks > 1
+        largest, pixels = math.ceil(len(start) / tree.num_blocks), max(v.width * v.height for v in views)
+        keep = scaffold_size(config, largest, pixels) if warms else None
+        store.commit(blocks_at_rest(tree, start, keep, config.seed))
+        params, adam = optimizers or nothing_live(start.sh_degree)
+        scene = StoredScene(tree, store)
+        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views)))
+        return kind(config, steps, scene, views, self.rasterizer, params, adam)
+
+    def train(
+        self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options
+    ) -> Trained:
+        """Train on a stage from its points, or from `start`, and score the held-out views.
+
+        Args:
+            options: of `coordinator`.
+        """
+        start = stage.start() if start is None else start
+        coordinator = self.coordinator(start, stage.views, method, **options)
+        events: list[Event] = []
+        coordinator.announce.subscribe(events.append)
+        counts = self.finish(coordinator, stage)
+        return Trained(coordinator, self.score(coordinator, stage.held_out, stage.truth), events, counts)
+
+    def compared(self, stage: Stage, method: Method, name: str | None = None, **options) -> float:
+        """Held-out PSNR under the conditions of comparisons, dB.
+
+        Args:
+            name: of the stage; its score is kept, and not found anew where nothing else is said.
+        """
+        key = f"{name} {method}"
+        is_known = name is not None and not options
+        if is_known and key in self._scores:
+            return self._scores[key]
+        usual = {"budget": self.views_drawn(BUDGET), "density": LIMITED}
+        found = self.train(stage, method, **{**usual, **options}).psnr
+        if is_known:
+            self._scores[key] = found
+        return found
+
+    def finish(self, coordinator: Coordinator, stage: Stage, steps: int | None = None) -> list[int]:
+        """Train on until the budget is used up, or for `steps`; the number of Gaussians after each step."""
+        counts: list[int] = []
+        while not coordinator.finished and (steps is None or len(counts) < steps):
+            train_step(coordinator, stage)
+            counts.append(coordinator.count())
+            self.tick()
+        return counts
+
+    @torch.no_grad()
+    def pictures(self, gaussians: Gaussians, views: list[View]) -> list[Float[Tensor, "h w 3"]]:
+        """Merged pictures on black, 0..1."""
+        degree = gaussians.sh_degree
+        return [self.rasterizer(gaussians, view, sh_degree=degree).color.clamp(0, 1) for view in views]
+
+    def score(self, coordinator: Coordinator, views: list[View], photos: list[Tensor]) -> float:
+        """Mean PSNR of merged pictures, dB."""
+        drawn = self.pictures(merged(coordinator), views)
+        return sum(float(psnr(a, b)) for a, b in zip(drawn, photos, strict=True)) / len(views)
+
+    def error(self, coordinator: Coordinator, stage: Stage) -> float:
+        """The full objective, near enough: the mean absolute error over all training photos."""
+        drawn = self.pictures(merged(coordinator), stage.views)
+        errors = [(a - stage.photos[v.index]).abs().mean() for a, v in zip(drawn, stage.views, strict=True)]
+        return float(torch.stack(errors).mean())
+
+
+def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int) -> int:
+    """Steps that draw about so many views of `views`, in the warm-up and after it."""
+    batch, batch_warm = views_per_step(config.batch, blocks), views_per_warm_up_step(config.batch)
+    warmup = config.warmup if blocks > 1 else 0.0
+    steps = drawn / (warmup * batch_warm + (1 - warmup) * batch)
+    longest = config.scaffold_passes * views / batch_warm
+    if 0 < longest < warmup * steps:
+        steps = longest + (drawn - longest * batch_warm) / batch
+    return max(round(steps), 1)
+
+
+def merged(coordinator: Coordinator) -> Gaussians:
+    """All blocks in one list, in the order of the blocks, without a graph."""
+    scene = coordinator.scene
+    return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)]).detach()

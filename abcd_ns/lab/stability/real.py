@@ -1,0 +1,125 @@
+"""The same faults in a capture of one's own: sparse views, noisy poses, exposure, repetition, far offsets."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from abcd_ns.engine.space.near_plane import near_plane
+from abcd_ns.engine.types import View
+from abcd_ns.errors import UserError
+from abcd_ns.lab.stability.captures import GAINS, PAIR, SHIFT, TURN_DEGREES, with_gains, with_noisy_poses
+from abcd_ns.lab.stability.lab import Lab, Stage
+from abcd_ns.lab.stability.outcome import Finding, Scenario, against_one_block, db
+from abcd_ns.lab.stability.sizes import surveyed
+
+BUDGET = 600
+"""Views drawn in a run."""
+SPARSE = 8
+THOUSANDS = 3000
+"""Photos of a capture that shows everything over and over."""
+OFFSET = 5e6
+MOST_POINTS = 4000
+"""More points than this are thinned out, for time."""
+
+
+def read_stage(data: Path, downscale: int) -> Stage:
+    """A capture as `ns-train abcd --data` reads it; every 8th view held out. All photos are kept in RAM;
+    masks and alpha channels are left aside.
+
+    Raises:
+        UserError: it cannot be used; the message says why.
+    """
+    # Here and not above: loads nerfstudio.
+    from abcd_ns.data.photos import Photos
+    from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+    from abcd_ns.nerfstudio.views import views_of
+
+    parser = AbcdDataParserConfig(data=data, downscale_factor=downscale).setup()
+    splits = {}
+    for split in ("train", "test"):
+        outputs = parser.get_dataparser_outputs(split)
+        photos = Photos(outputs.metadata["photos"])
+        pictures = [photos.image(row)[..., :3].float() / 255 for row in range(len(photos))]
+        splits[split] = views_of(outputs.cameras), pictures, outputs.metadata
+    views, pictures, metadata = splits["train"]
+    if "points3D_xyz" not in metadata:
+        raise UserError(f"{data} has no points to begin with; the scenarios need some.")
+    points = metadata["points3D_xyz"]
+    near = near_plane(points, views)
+    chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
+    held_out, truth, _ = splits["test"]
+    return Stage(
+        [replace(view, near=near) for view in views],
+        dict(enumerate(pictures)),
+        points[chosen].double(),
+        metadata["points3D_rgb"][chosen].float(),
+        [replace(view, near=near) for view in held_out],
+        truth,
+    )
+
+
+def repeated(stage: Stage, count: int) -> Stage:
+    """`count` views: every one again and again, each time under a number of its own."""
+    views: list[View] = []
+    photos = {}
+    for number in range(count):
+        view = stage.views[number % len(stage.views)]
+        views.append(replace(view, index=number))
+        photos[number] = stage.photos[view.index]
+    return replace(stage, views=views, photos=photos)
+
+
+def real_scenarios(stage: Stage, name: str) -> tuple[Scenario, ...]:
+    """Scenarios R1 to R5, on a capture."""
+
+    def compared(changed: Stage):
+        def run(lab: Lab) -> Finding:
+            budget = lab.views_drawn(BUDGET)
+            return against_one_block({m: lab.train(changed, m, budget=budget, blocks=8).psnr for m in PAIR})
+
+        return run
+
+    def thousands(lab: Lab) -> Finding:
+        many, start = repeated(stage, THOUSANDS), stage.start()
+        trained = lab.train(many, budget=lab.views_drawn(BUDGET))
+        grown, visits = len(trained.gaussians) - len(start), trained.coordinator.state.visit
+        said = {"abcd": f"{db(trained.psnr)}, {visits} visits, {grown:+,} Gaussians"}
+        numbers = {"psnr": trained.psnr, "visits": visits, "grown": grown}
+        return Finding(trained.coordinator.finished and grown != 0, said, numbers)
+
+    def offset(lab: Lab) -> Finding:
+        budget = lab.views_drawn(BUDGET // 2)
+        at = [lab.train(surveyed(stage, d), budget=budget).psnr for d in (0.0, OFFSET)]
+        said = {"abcd": f"{db(at[0])} at 0, {db(at[1])} at {OFFSET:g} m"}
+        return Finding(abs(at[0] - at[1]) <= 0.05, said, {"at 0": at[0], "at offset": at[1]})
+
+    rule = "held-out PSNR at least one block's less 0.3 dB"
+    few = min(SPARSE, len(stage.views))
+    noisy = with_noisy_poses(stage, TURN_DEGREES, SHIFT)
+    noise = f"poses off by {TURN_DEGREES} degrees and {SHIFT:g} of the scene"
+    return (
+        Scenario("R1", "sparse views", f"{few} of {name}'s views", rule, compared(stage.only(few))),
+        Scenario("R2", "noisy poses", f"{name}: {noise}", rule, compared(noisy)),
+        Scenario(
+            "R3",
+            "changing exposure",
+            f"{name}: every other photo {GAINS[1]} times as bright",
+            rule,
+            compared(with_gains(stage)),
+        ),
+        Scenario(
+            "R4",
+            "never densifies with thousands of photos",
+            f"{name}: its views repeated up to {THOUSANDS:,}",
+            "the run ends and its blocks are refined",
+            thousands,
+        ),
+        Scenario(
+            "R5",
+            "UTM offsets eat float32",
+            f"{name} in coordinates that begin at {OFFSET:g}",
+            "PSNR within 0.05 dB",
+            offset,
+        ),
+    )

@@ -1,0 +1,68 @@
+"""Training against old pictures of the other blocks, which the engine refuses: to see what that does."""
+
+from typing import Any
+
+import torch
+
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.space.culling import bounds_of
+from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.types import Gaussians
+
+
+class Snapshot(BlockScene):
+    """All blocks as they were at one moment."""
+
+    def __init__(self, scene: BlockScene, generation: int) -> None:
+        self.tree, self._generation = scene.tree, generation
+        self._blocks = [
+            Gaussians(**{name: value.clone() for name, value in scene.gaussians(block).items()})
+            for block in range(scene.tree.num_blocks)
+        ]
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._blocks[block]
+
+    def version(self, block: int) -> int:  # noqa: ARG002 - all are of the same moment
+        return self._generation
+
+    def count(self, block: int) -> int:
+        return len(self._blocks[block])
+
+    def bounds(self, block: int) -> Box | None:
+        return bounds_of(self._blocks[block])
+
+
+class StaleCoordinator(Coordinator):
+    """Shows blocks to each other as they were some visits ago.
+
+    The number of Gaussians must stay (strategy "off", `migrate` off is not needed).
+
+    Args:
+        every: visits between two looks at the scene; 1 is always fresh.
+        damping: what a visit did is kept to this share; 1 keeps all.
+    """
+
+    def __init__(self, *args: Any, every: int = 1, damping: float = 1.0, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._every, self._damping = every, damping
+        self._seen: Snapshot | None = None
+        self._taken_at = 0
+
+    def _surroundings(self) -> BlockScene:
+        if self._seen is None or self.state.visit - self._taken_at >= self._every:
+            self._seen, self._taken_at = Snapshot(self.scene, self.state.visit), self.state.visit
+        return self._seen
+
+    def _detached(self) -> BlockState:
+        state = super()._detached()
+        active = self.state.active
+        if self._damping == 1.0 or active is None or active.is_whole:
+            return state
+        before = self.scene.at_rest(active.geometry.block)
+        mixed = {n: torch.lerp(getattr(before, n), v, self._damping) for n, v in state.gaussians.items()}
+        return BlockState(
+            Gaussians(**mixed), state.exp_avg, state.exp_avg_sq, state.growth, state.clocks
+        )  # moments are of the path, not of where it ends

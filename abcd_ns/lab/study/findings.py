@@ -1,0 +1,128 @@
+"""What a study says: the gap between best and worst, the knee of a curve, differences to the default."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean, stdev
+
+from abcd_ns.lab.study.results import Arm, StudyResults
+
+GOAL_DB = 0.5
+"""Between the best and the worst number of blocks, no more than this: no cliff."""
+KNEE_DB = 0.2
+"""How far below the best a smaller budget of Gaussians may be and still count as enough."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Best and worst of several arms."""
+
+    best: Arm
+    worst: Arm
+
+    @property
+    def decibels(self) -> float:
+        """How far the worst is behind."""
+        return self.best.psnr - self.worst.psnr
+
+
+@dataclass(frozen=True)
+class Difference:
+    """An arm against the default, seed by seed, dB."""
+
+    by_seed: tuple[float, ...]
+
+    @property
+    def mean(self) -> float:
+        """Over the seeds that both have."""
+        return fmean(self.by_seed)
+
+    @property
+    def deviation(self) -> float | None:
+        """Standard deviation over the seeds (n - 1); None for a single one."""
+        return None if len(self.by_seed) < 2 else stdev(self.by_seed)
+
+
+def find_gap(arms: Sequence[Arm]) -> Gap | None:
+    """Best and worst by PSNR; None with fewer than two arms."""
+    if len(arms) < 2:
+        return None
+    return Gap(max(arms, key=lambda arm: arm.psnr), min(arms, key=lambda arm: arm.psnr))
+
+
+def find_knee(arms: Sequence[Arm]) -> Arm | None:
+    """The arm with the smallest budget that is within KNEE_DB of the best; None with fewer than two arms."""
+    if len(arms) < 2:
+        return None
+    best = max(arm.psnr for arm in arms)
+    return min((arm for arm in arms if best - arm.psnr <= KNEE_DB), key=lambda arm: arm.value)
+
+
+def find_difference(arm: Arm, default: Arm) -> Difference | None:
+    """The arm against the default; None where no seed has both."""
+    theirs = {run.seed: run.psnr_merged for run in default.runs}
+    pairs = [run.psnr_merged - theirs[run.seed] for run in arm.runs if run.seed in theirs]
+    return Difference(tuple(pairs)) if pairs else None
+
+
+def find_default(results: StudyResults) -> Arm | None:
+    """The arm of the method as it is; None where its runs failed."""
+    return next((arm for arm in results.arms if arm.variant == "default"), None)
+
+
+def findings_of(results: StudyResults) -> tuple[str, ...]:
+    """What the study says, a sentence each."""
+    return {"blocks": _of_blocks, "gaussians": _of_gaussians, "options": _of_options}[results.study](results)
+
+
+def _of_blocks(results: StudyResults) -> tuple[str, ...]:
+    gap = find_gap(results.arms)
+    if gap is None:
+        return ()
+    verdict = "within" if gap.decibels <= GOAL_DB else "above"
+    return (
+        f"Best: {_blocks(gap.best)}, {gap.best.psnr:.2f} dB. Worst: {_blocks(gap.worst)}, "
+        f"{gap.worst.psnr:.2f} dB. Gap: {gap.decibels:.2f} dB, {verdict} the {GOAL_DB:g} dB of the goal.",
+    )
+
+
+def _of_gaussians(results: StudyResults) -> tuple[str, ...]:
+    found = []
+    for method in results.methods:
+        arms = results.of(method)
+        knee = find_knee(arms)
+        if knee is None:
+            continue
+        best = max(arms, key=lambda arm: arm.psnr)
+        text = (
+            f"{method}: a limit of {knee.value:,} Gaussians is enough: {knee.psnr:.2f} dB, within "
+            f"{KNEE_DB:g} dB of the best measured ({best.psnr:.2f} dB, limit {best.value:,})."
+        )
+        if knee.value == max(arm.value for arm in arms):
+            text += " It is the largest that was tried: more may be better."
+        elif knee.value == min(arm.value for arm in arms):
+            text += " It is the smallest that was tried: fewer may do."
+        found.append(text)
+    return tuple(found)
+
+
+def _of_options(results: StudyResults) -> tuple[str, ...]:
+    default = find_default(results)
+    if default is None:
+        return ("There is nothing to compare with: the default's runs failed.",)
+    found = [(arm, find_difference(arm, default)) for arm in results.arms if arm is not default]
+    known = [(arm, difference.mean) for arm, difference in found if difference is not None]
+    if not known:
+        return ()
+    best, worst = (pick(known, key=lambda pair: pair[1]) for pick in (max, min))
+    text = f"Best change: {best[0].variant}, {best[1]:+.2f} dB."
+    if best[1] <= 0:
+        text = f"No change is better than the default; nearest: {best[0].variant}, {best[1]:+.2f} dB."
+    if best[0] is not worst[0]:
+        text += f" Worst: {worst[0].variant}, {worst[1]:+.2f} dB."
+    if len(default.runs) < 2:
+        text += " One seed: differences of a few tenths of a dB may be chance."
+    return (text,)
+
+
+def _blocks(arm: Arm) -> str:
+    return "1 block" if arm.value == 1 else f"{arm.value} blocks"

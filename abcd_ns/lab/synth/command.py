@@ -1,0 +1,212 @@
+"""`abcd synth OUT`: draw a scene of walled courts into a COLMAP data set."""
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from PIL import Image
+from rich.console import Console
+
+from abcd_ns.errors import UserError
+from abcd_ns.lab.synth.cameras import Camera, Lens, court_cameras
+from abcd_ns.lab.synth.colmap_writer import write_model
+from abcd_ns.lab.synth.court import Layout, Site
+from abcd_ns.lab.synth.render import render
+from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points
+from abcd_ns.lab.synth.world import World
+from abcd_ns.late_bar import LateBar
+
+FORMAT = 1
+"""Raised whenever the same settings would draw another scene."""
+_MARKER = "synth.json"
+
+
+class SynthError(UserError):
+    """A setting or an output folder that the user has to change; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that decides what is drawn; see `synth`."""
+
+    courts: int
+    layout: Layout
+    views_per_court: int
+    width: int
+    height: int
+    seed: int
+    points_per_court: int
+    supersample: int
+
+    def __post_init__(self) -> None:
+        limits = {
+            "courts": (1, 10_000),
+            "views_per_court": (2, 10_000),
+            "width": (16, 8192),
+            "height": (16, 8192),
+            "seed": (0, 2**31 - 1),
+            "points_per_court": (1, 10_000_000),
+            "supersample": (1, 8),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                flag = "--" + name.replace("_", "-")
+                raise SynthError(f"{flag} is {value}; it must lie between {low} and {high}.")
+
+    @property
+    def command(self) -> str:
+        """The command line that draws the same scene."""
+        flags = [f"--{name.replace('_', '-')} {value}" for name, value in asdict(self).items()]
+        return "abcd synth OUT " + " ".join(flags)
+
+
+def synth(
+    out: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    courts: int = 2,
+    layout: Layout = "grid",
+    views_per_court: int = 24,
+    width: int = 320,
+    height: int = 240,
+    seed: int = 0,
+    points_per_court: int = 4000,
+    supersample: int = 2,
+    overwrite: bool = False,
+) -> None:
+    """Draw a scene of walled courts side by side, as a COLMAP data set.
+
+    The pictures come from a ray caster of their own, so they favour no method that is trained on them.
+    The same settings give the same bytes.
+
+    Args:
+        out: Folder for images/, sparse/0/ and SOURCE.md; must be empty, absent or an earlier result.
+        courts: Number of courts.
+        layout: Courts in a near-square grid or in one row.
+        views_per_court: Pictures taken inside each court.
+        width: Of the pictures, in pixels.
+        height: Of the pictures, in pixels.
+        seed: Chooses colours, objects, openings, sun and camera poses.
+        points_per_court: Sparse points to write per court, fewer where views overlap little.
+        supersample: Rays per pixel along each axis.
+        overwrite: Replace an earlier result of this command that has other settings or is incomplete.
+
+    Raises:
+        SynthError: a setting is out of range, or `out` holds something else.
+    """
+    settings = Settings(
+        courts, layout, views_per_court, width, height, seed, points_per_court, supersample
+    )  # fmt: skip
+    console = Console(stderr=True)
+    if not _prepare(out, settings, overwrite):
+        console.print(f"{out} already holds this scene; nothing to do.", highlight=False, soft_wrap=True)
+        return
+    _mark(out, settings, complete=False)
+    cameras, points = _draw(out, settings, console)
+    (out / "SOURCE.md").write_text(_source(settings, len(cameras), len(points.xyz)), encoding="utf-8")
+    _mark(out, settings, complete=True)
+    console.print(
+        f"{out}: {len(cameras)} pictures and {len(points.xyz)} points of {courts} courts.",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _draw(out: Path, settings: Settings, console: Console) -> tuple[list[Camera], SparsePoints]:
+    """Render and write everything, one court at a time."""
+    site = Site.plan(settings.courts, settings.layout, settings.seed)
+    lens = Lens(settings.width, settings.height)
+    world = World(site)
+    count = settings.views_per_court
+    cameras = [c for k in range(settings.courts) for c in court_cameras(site, k, count, lens, world.caster)]
+    (out / "images").mkdir(exist_ok=True)
+
+    def draw(camera: Camera) -> None:
+        picture = render(world, camera, lens, settings.supersample)
+        Image.fromarray(picture).save(out / "images" / camera.name, optimize=False)
+
+    parts, bar = [], LateBar("Drawing", len(cameras), console)
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool, bar:
+        for court in range(settings.courts):
+            own = range(court * count, (court + 1) * count)
+            for _ in pool.map(draw, (cameras[c] for c in own)):
+                bar.advance()
+            around = sorted([court, *site.neighbors(court)])
+            nearby = [c for k in around for c in range(k * count, (k + 1) * count)]
+            parts.append(court_points(world, cameras, own, nearby, lens, settings.points_per_court))
+    points = SparsePoints.cat(parts)
+    if not len(points.xyz):
+        raise SynthError("No point is seen by two views; raise --views-per-court or --points-per-court.")
+    write_model(out / "sparse" / "0", cameras, lens, points)
+    return cameras, points
+
+
+def _prepare(out: Path, settings: Settings, overwrite: bool) -> bool:
+    """Make `out` an empty folder of ours. False if it holds this very scene already."""
+    if out.exists() and not out.is_dir():
+        raise SynthError(f"{out} is a file; name a folder.")
+    earlier = _read_marker(out)
+    if earlier is None:
+        if out.is_dir() and any(out.iterdir()):
+            raise SynthError(f"{out} is not empty and holds no scene of this command; name another folder.")
+        out.mkdir(parents=True, exist_ok=True)
+        return True
+    if earlier == _marker(settings, complete=True) and not overwrite:
+        return False
+    if not overwrite:
+        state = "another scene" if earlier.get("complete") else "an unfinished scene"
+        raise SynthError(f"{out} holds {state}; pass --overwrite to replace it, or name another folder.")
+    for path in _own_paths(out):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    return True
+
+
+def _own_paths(out: Path) -> Iterator[Path]:
+    """What this command writes into a folder; --overwrite removes no more."""
+    return (out / name for name in ("images", "sparse", "SOURCE.md", _MARKER))
+
+
+def _marker(settings: Settings, complete: bool) -> dict:
+    return {"format": FORMAT, "complete": complete, "settings": asdict(settings)}
+
+
+def _mark(out: Path, settings: Settings, complete: bool) -> None:
+    text = json.dumps(_marker(settings, complete), indent=2) + "\n"
+    (out / _MARKER).write_text(text, encoding="utf-8")
+
+
+def _read_marker(out: Path) -> dict | None:
+    """What an earlier run left in `out`; None if there was none."""
+    path = out / _MARKER
+    if not path.is_file():
+        return None
+    try:
+        marker = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise SynthError(f"{path} is not readable as JSON; delete it or name another folder.") from error
+    if not isinstance(marker, dict) or "settings" not in marker:
+        raise SynthError(f"{path} was not written by this command; name another folder.")
+    return marker
+
+
+def _source(settings: Settings, pictures: int, points: int) -> str:
+    return f"""# Source
+
+{pictures} pictures of a procedural scene of {settings.courts} walled courts, drawn by ray casting (Embree),
+and a COLMAP model in `sparse/0` with {points} points whose observations are exact projections.
+
+- Made by `{settings.command}` (abcd-ns, scene format {FORMAT}); the same command draws the same bytes.
+- Seed: {settings.seed}.
+- No photograph, scan or other data set went into it.
+- Licence: Apache-2.0.
+"""

@@ -1,0 +1,129 @@
+"""Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
+
+import random
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+
+from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.transfer import upload
+from abcd_ns.engine.types import Crop
+
+if TYPE_CHECKING:
+    from abcd_ns.nerfstudio.config import AbcdDataManagerConfig
+
+BATCH = "abcd_batch"
+"""The key of a camera's metadata under which what to train on travels from here to the model."""
+
+
+class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
+    """The subset of cameras, the crop and the layers come from the coordinator; the photo from here."""
+
+    config: "AbcdDataManagerConfig"
+    train_dataset: AbcdDataset
+    eval_dataset: AbcdDataset
+
+    device_photo_bytes: int = 0
+    """Of decoded training photos and masks that may be kept on the device; of the others, crops are copied
+    there for each step. Of no use on the CPU."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._coordinator: Coordinator | None = None
+        self._on_device: dict[tuple[str, int], torch.Tensor] = {}
+        super().__init__(*args, **kwargs)
+        self._eval_order = random.Random(0)
+
+    @property
+    def dataset_type(self) -> type[AbcdDataset]:
+        """The class of both datasets."""
+        return AbcdDataset
+
+    def create_train_dataset(self) -> AbcdDataset:
+        """The training photos, under their share of RAM."""
+        budget = int(self.config.photo_cache_gb * 2**30) if self.config.photo_cache_gb else None
+        return AbcdDataset(self.train_dataparser_outputs, budget_bytes=budget)
+
+    def create_eval_dataset(self) -> AbcdDataset:
+        """The held-out photos; looked at one after the other, so none is kept."""
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        return AbcdDataset(outputs, budget_bytes=0)
+
+    def follow(self, coordinator: Coordinator) -> None:
+        """Serve what this coordinator asks for from now on."""
+        self._coordinator = coordinator
+
+    def photo(self, row: int, crop: Crop) -> torch.Tensor:
+        """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""
+        return self._pixels("photo", row, self.train_dataset.photos.image, crop).float() / 255
+
+    def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
+        """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""
+        return self._pixels("mask", row, self.train_dataset.photos.mask, crop)
+
+    def _pixels(
+        self, kind: str, row: int, read: Callable[[int], torch.Tensor | None], crop: Crop
+    ) -> torch.Tensor | None:
+        """A crop on the device, of what is kept there, or copied while the device goes on."""
+        kept = self._on_device.get((kind, row))
+        if kept is not None:
+            return kept[crop.slices]
+        whole, device = read(row), torch.device(self.device)
+        if whole is None:
+            return None
+        used = sum(each.nbytes for each in self._on_device.values())
+        if device.type == "cpu" or used + whole.nbytes > self.device_photo_bytes:
+            return upload(whole[crop.slices], device)
+        kept = self._on_device[kind, row] = upload(whole, device)
+        return kept[crop.slices]
+
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
+        """The next batch: its first camera with all of it in the metadata, and the crops of the photos."""
+        if self._coordinator is None:
+            raise RuntimeError("training samples come from a coordinator: call follow() first")
+        samples = self._coordinator.next_batch()
+        rows = [sample.view.index for sample in samples.samples]
+        camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
+        camera.metadata = {"cam_idx": rows[0], BATCH: samples}
+        crops = [sample.crop for sample in samples.samples]
+        photos = [self.photo(row, crop) for row, crop in zip(rows, crops, strict=True)]
+        batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
+        masks = [self.mask(row, crop) for row, crop in zip(rows, crops, strict=True)]
+        if any(mask is not None for mask in masks):
+            batch["mask"] = masks
+        return camera, batch
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002
+        """A random held-out camera and its whole photo."""
+        return self._held_out(self._eval_order.randrange(len(self.eval_dataset)))
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> "HeldOut":
+        """All held-out cameras and photos in order, read one at a time."""
+        return HeldOut(self)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a training photo; nerfstudio's logs divide by it."""
+        cameras = self.train_dataset.cameras
+        return int(cameras.width[0]) * int(cameras.height[0])
+
+    def _held_out(self, row: int) -> tuple[Cameras, dict[str, Any]]:
+        camera = self.eval_dataset.cameras[row : row + 1].to(self.device)
+        data = self.eval_dataset.get_data(row, image_type="uint8")
+        return camera, {**data, "image": data["image"].to(self.device)}
+
+
+class HeldOut:
+    """The held-out set as a sequence that holds one photo at a time."""
+
+    def __init__(self, datamanager: AbcdDataManager) -> None:
+        self._datamanager = datamanager
+
+    def __len__(self) -> int:
+        return len(self._datamanager.eval_dataset)
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
+        return (self._datamanager._held_out(row) for row in range(len(self)))

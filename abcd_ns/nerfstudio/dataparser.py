@@ -1,0 +1,193 @@
+"""From a folder to cameras, points and photos: what `ns-train abcd --data DIR` takes."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import (
+    DataParser,
+    DataParserConfig,
+    DataparserOutputs,
+    transform_poses_to_original_space,
+)
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from abcd_ns.data.input_errors import InputError, one_line
+from abcd_ns.data.normalize import Center, Orientation
+from abcd_ns.data.prepare import Prepared, check_masks, prepare
+
+
+@dataclass
+class AbcdDataParserConfig(DataParserConfig):
+    """A folder with a COLMAP model or a transforms.json, and photos. `--data DIR` alone is enough."""
+
+    _target: type = field(default_factory=lambda: AbcdDataParser)
+    """target class to instantiate"""
+    data: Path = Path()
+    """A folder with sparse/0, colmap/sparse/0 or sparse (COLMAP, .bin or .txt) and images, or with
+    transforms.json; or a transforms.json file itself. Where both are, COLMAP's model is taken."""
+    downscale_factor: int | None = None
+    """Divides the photos' width and height. None takes the smallest of 1, 2, 4, ... with which no photo is
+    wider or higher than 1,600 px, as splatfacto's data parsers do; 1 keeps photos as they are. images_N is
+    read where it fits the model; otherwise photos are reduced in memory by area averaging, to sizes rounded
+    down, and nothing is written. Intrinsics follow the sizes: fx x new width / old width, fy x new height /
+    old height."""
+    scale_factor: float = 1.0
+    """Multiplies the scene's size, after auto_scale_poses."""
+    scene_scale: float = 1.0
+    """Half the side of the scene box, in scaled units."""
+    orientation_method: Orientation = "up"
+    """How the scene is turned; "up" makes the mean of the cameras' up vectors +z."""
+    center_method: Center = "poses"
+    """What becomes the origin: the mean of the cameras, the point that they look at, or nothing."""
+    auto_scale_poses: bool = True
+    """Scale the scene until all camera coordinates lie within -1 to 1."""
+    eval_mode: Literal["auto", "interval", "all"] = "auto"
+    """"auto" follows train_list.txt, val_list.txt and test_list.txt, or transforms.json's train_filenames,
+    val_filenames and test_filenames; without them it is "interval", which holds out every eval_interval-th
+    view. "all" trains and evaluates on all views."""
+    eval_interval: int = 8
+    """Views 0, n, 2n, ... of the list sorted by name are held out; at least 2."""
+
+
+@dataclass
+class AbcdDataparserOutputs(DataparserOutputs):
+    """Keeps the way back to the original coordinates in float64: geo-referenced ones need the digits."""
+
+    def transform_poses_to_original_space(
+        self, poses: Float[Tensor, "n 3 4"], camera_convention: Literal["opengl", "opencv"] = "opencv"
+    ) -> Float[Tensor, "n 3 4"]:
+        """As nerfstudio's, in float64."""
+        return transform_poses_to_original_space(
+            poses.double(), self.dataparser_transform.double(), self.dataparser_scale, camera_convention
+        )
+
+
+class AbcdDataParser(DataParser):
+    """Reads the scene at the first call for a split; constructing it touches no file.
+
+    Raises (from `get_dataparser_outputs`):
+        InputError: the input cannot be used; all bad files are listed.
+    """
+
+    config: AbcdDataParserConfig
+    includes_time = False
+
+    def __init__(self, config: AbcdDataParserConfig):
+        super().__init__(config)
+        self.downscale_factor: int | None = None
+        """nerfstudio sets it to 1 where a trained scene is viewed or exported: photos may then be absent."""
+        self._prepared: Prepared | None = None
+
+    def check(self) -> None:
+        """Read the model, look at every photo and decode every mask, before anything costly is started.
+
+        Later calls of other methods reuse what was read.
+
+        Raises:
+            InputError: as `get_dataparser_outputs`, or a mask is of no use.
+        """
+        for split in ("train", "test"):
+            self.rows(split)
+        check_masks(self.prepared().sources)
+
+    @property
+    def largest_image(self) -> int:
+        """Pixels of the largest photo as it is trained on."""
+        return max(width * height for width, height in (source.size for source in self.prepared().sources))
+
+    @property
+    def factor(self) -> int:
+        """By which the photos' width and height are divided."""
+        return self.prepared().factor
+
+    @property
+    def points(self) -> int:
+        """How many the scene has; 0 where Gaussians begin at random."""
+        return len(self.prepared().points_in_model)
+
+    def prepared(self) -> Prepared:
+        """The whole scene, read and checked at the first call.
+
+        Raises:
+            InputError: the input cannot be used.
+        """
+        if self._prepared is None:
+            self._prepared = prepare(self.config, needs_photos=self.downscale_factor is None)
+            for note in (*self._prepared.chosen, *self._prepared.notes):
+                self.tell(note)
+        return self._prepared
+
+    def tell(self, note: str) -> None:
+        """Say what the user should know but need not repair."""
+        CONSOLE.print(one_line(note), style="yellow", markup=False, soft_wrap=True)
+
+    def rows(self, split: str) -> list[int]:
+        """Rows of the prepared scene's lists that belong to a split; see `split_rows`.
+
+        Raises:
+            InputError: as `prepared` and `split_rows`.
+        """
+        scene = self.prepared().scene
+        if scene.split_lists and self.config.eval_mode == "auto":
+            return scene.split_lists.rows([frame.name for frame in scene.frames], split)
+        return split_rows(len(scene.frames), split, self.config)
+
+    def _generate_dataparser_outputs(self, split: str = "train", **_kwargs: Any) -> AbcdDataparserOutputs:
+        prepared, rows = self.prepared(), self.rows(split)
+        sources = [prepared.sources[row] for row in rows]
+        masks = [source.mask_path for source in sources if source.mask_path]
+        original = prepared.similarity.after(prepared.scene.applied_transform, prepared.scene.applied_scale)
+        reach = self.config.scene_scale
+        return AbcdDataparserOutputs(
+            image_filenames=[source.path for source in sources],
+            cameras=_cameras(prepared, rows),
+            scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3], dtype=torch.float32)),
+            mask_filenames=masks or None,
+            metadata={"photos": sources, **prepared.points},
+            dataparser_transform=torch.from_numpy(original.matrix),
+            dataparser_scale=original.scale,
+        )
+
+
+def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int]:
+    """Rows of the name-sorted list of `count` views that belong to `split`, by eval_mode and eval_interval.
+
+    Args:
+        split: "train", or "val" or "test" for the views held out.
+
+    Raises:
+        InputError: eval_interval below 2.
+        ValueError: no such split.
+    """
+    if split not in ("train", "val", "test"):
+        raise ValueError(f"There is no split {split}; there are train, val and test.")
+    if config.eval_mode == "all":
+        return list(range(count))
+    if config.eval_interval < 2:
+        raise InputError(
+            f"--eval-interval is {config.eval_interval}; it must be at least 2, or --eval-mode all."
+        )
+    return [row for row in range(count) if (row % config.eval_interval == 0) == (split != "train")]
+
+
+def _cameras(prepared: Prepared, rows: list[int]) -> Cameras:
+    """nerfstudio's cameras [len(rows)], perspective, without distortion, float32."""
+    lenses = [prepared.lenses[row] for row in rows]
+    poses = np.stack([prepared.scene.frames[row].camera_to_world for row in rows])
+
+    def column(name: str, dtype: torch.dtype) -> Tensor:
+        return torch.tensor([[getattr(lens, name)] for lens in lenses], dtype=dtype)
+
+    return Cameras(
+        camera_to_worlds=torch.from_numpy(prepared.similarity.poses(poses).astype(np.float32)),
+        **{name: column(name, torch.float32) for name in ("fx", "fy", "cx", "cy")},
+        **{name: column(name, torch.int64) for name in ("width", "height")},
+        camera_type=CameraType.PERSPECTIVE,
+    )

@@ -1,0 +1,43 @@
+"""How close a picture is to its photo, by the measures splatfacto reports."""
+
+from functools import cache
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from pytorch_msssim import ssim
+from torch import Tensor
+
+from abcd_ns.engine.render.loss import SSIM_WINDOW, psnr
+
+ALEXNET = "alexnet-owt-7be5be79.pth"
+"""The file of AlexNet's weights, as torchvision names it in torch's hub folder."""
+
+
+def image_metrics(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> dict[str, float]:
+    """`psnr` (dB), `ssim` and, where LPIPS' weights are on this machine, `lpips`.
+
+    SSIM is left out of pictures smaller than its window.
+    """
+    a, b = (image.permute(2, 0, 1)[None] for image in (rendered, photo))
+    found = {"psnr": float(psnr(rendered, photo))}
+    if min(rendered.shape[:2]) >= SSIM_WINDOW:
+        found["ssim"] = float(ssim(a, b, data_range=1.0, size_average=True))
+    if lpips_missing() is None:
+        found["lpips"] = float(_lpips(str(rendered.device))(a.clamp(0, 1), b.clamp(0, 1)))
+    return found
+
+
+def lpips_missing() -> str | None:
+    """Why LPIPS cannot be computed, or None. Nothing is ever downloaded."""
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET
+    if weights.is_file():
+        return None
+    return f"LPIPS needs AlexNet's weights: put torchvision's {ALEXNET} into {weights.parent}"
+
+
+@cache
+def _lpips(device: str) -> torch.nn.Module:
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).to(device)

@@ -1,0 +1,349 @@
+"""Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
+
+import hashlib
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.colors import get_color
+from torch import Tensor
+from torch.nn import Parameter, ParameterDict
+
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
+from abcd_ns.engine.render import Raster, Rasterizer, make_rasterizer
+from abcd_ns.engine.render.loss import photometric_loss, psnrs, ssim_windows
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store.scene import BlockScene, MemoryScene, StoredScene
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.coordinator import Batch, Coordinator
+from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
+from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.datamanager import BATCH
+from abcd_ns.nerfstudio.metrics import image_metrics
+from abcd_ns.nerfstudio.room import FREE_SHARE
+from abcd_ns.nerfstudio.views import view_of
+from abcd_ns.viewer.pictures import BlockPictures, Choice, Cropped, Show, asked_by_viewer, bounded
+
+if TYPE_CHECKING:
+    from abcd_ns.nerfstudio.config import AbcdModelConfig
+
+VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
+"""What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
+
+
+class AbcdModel(SplatfactoModel):
+    """Draws batches for training and whole pictures for evaluation, viewer and export.
+
+    While training, the registered parameters are the live block alone and the rest of the scene is reached
+    through the coordinator. Otherwise (ns-eval, ns-export, ns-viewer, ns-render) they are the merged scene,
+    on the device or, where that has no room to draw it at once, on the CPU. `state_dict` gives the merged
+    scene in either case.
+    """
+
+    config: "AbcdModelConfig"
+
+    def populate_modules(self) -> None:
+        """Register empty parameters; what a run begins with is made when it begins."""
+        empty = Gaussians.empty(self.config.sh_degree)
+        self.gauss_params = ParameterDict({name: Parameter(value) for name, value in empty.items()})
+        self.camera_optimizer = self.config.camera_optimizer.setup(
+            num_cameras=self.num_train_data, device="cpu"
+        )
+        self._tree = build_kd(torch.zeros(0, 3), 1)
+        self.near = NEAR_PLANE
+        self.step = 0
+        self.crop_box: OrientedBox | None = None
+        random = self.config.background_color == "random"
+        self.background_color = (
+            torch.tensor(VIEWER_BACKGROUND) if random else get_color(self.config.background_color)
+        )
+        self.choice = Choice()
+        self._coordinator: Coordinator | None = None
+        self._rasterizer: Rasterizer | None = None
+        self._loaded_is_too_large = False
+        self._parted: tuple[Parameter, BlockTree, MemoryScene] | None = None
+
+    def follow(self, coordinator: Coordinator) -> None:
+        """From now on the scene is the coordinator's, and the registered parameters its live block."""
+        self._coordinator, self._parted = coordinator, None
+
+    def draws_with(self) -> Rasterizer:
+        """The rasterizer, made on first use."""
+        if self._rasterizer is None:
+            self._rasterizer = make_rasterizer(self.config.rasterizer, self.device)
+        return self._rasterizer
+
+    # -- the scene -----------------------------------------------------------------------------------
+
+    @property
+    def tree(self) -> BlockTree:
+        """How space is cut; while training, as it is now."""
+        return self._tree if self._coordinator is None else self._coordinator.scene.tree
+
+    def scene(self) -> BlockScene:
+        """The whole scene by blocks, the live one included."""
+        if self._coordinator is not None:
+            return self._coordinator.scene
+        means, tree = self.gauss_params["means"], self.tree
+        if self._parted is None or self._parted[0] is not means or self._parted[1] is not tree:
+            self._parted = means, tree, MemoryScene(tree, self.merged())
+        return self._parted[2]
+
+    def merged(self) -> Gaussians:
+        """The whole scene in one list, without a graph. Not a property: it may read everything from disk."""
+        if self._coordinator is None:
+            return live_gaussians(self.gauss_params).detach()
+        scene = self._coordinator.scene
+        return Gaussians.cat([scene.gaussians(block).to("cpu") for block in range(scene.tree.num_blocks)])
+
+    def initial_gaussians(self) -> Gaussians:
+        """What a run begins with: a Gaussian for each point, or random ones."""
+        config = self.config
+        if self.seed_points is None or config.random_init or len(self.seed_points[0]) == 0:
+            points, colors = random_points(config.num_random, config.random_scale)
+        else:
+            points, colors = (values.cpu() for values in self.seed_points)
+        return gaussians_from_points(points.float(), colors, sh_degree=config.sh_degree)
+
+    # -- checkpoints ---------------------------------------------------------------------------------
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """The merged scene under splatfacto's names, whatever is live."""
+        state = super().state_dict(*args, **kwargs)
+        if self._coordinator is not None:
+            prefix, merged = kwargs.get("prefix", ""), self.merged()
+            state.update({f"{prefix}gauss_params.{n}": value for n, value in merged.items()})
+            state[f"{prefix}_extra_state"]["checksum"] = checksum(merged)
+        return state
+
+    def load_state_dict(self, state: dict[str, Any], **kwargs: Any) -> None:
+        """As splatfacto's, on the CPU where the scene is too large for the device; torch.load alone would
+        accept altered bytes.
+
+        Raises:
+            UserError: the Gaussians are not those that were saved.
+        """
+        expected = state.get("_extra_state", {}).get("checksum")
+        count = len(state["gauss_params.means"])
+        self._loaded_is_too_large = count > self._room()
+        home = torch.device("cpu") if self._loaded_is_too_large else self.device
+        for name, value in list(self.gauss_params.items()):
+            self.gauss_params[name] = Parameter(torch.empty((count, *value.shape[1:]), device=home))
+        super(SplatfactoModel, self).load_state_dict(state, **kwargs)  # splatfacto's takes all to the device
+        if expected is not None and checksum(live_gaussians(self.gauss_params)) != expected:
+            raise UserError(
+                "This checkpoint is damaged: the checksum of its Gaussians is wrong. Go on with the run by "
+                "`ns-train --load-dir`, which saves another, or take an older one."
+            )
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What the Gaussians do not tell: how space is cut, and the near plane."""
+        return {"tree": self.tree.to_json(), "near": self.near}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Take over the cut of space and the near plane from a checkpoint."""
+        self._tree = BlockTree.from_json(state["tree"])
+        self.near = state.get("near", NEAR_PLANE)
+
+    # -- pictures ------------------------------------------------------------------------------------
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        """The crops of a training batch where the camera carries one, else the whole picture."""
+        batch = (camera.metadata or {}).get(BATCH)
+        if self.training and batch is not None:
+            return self._batch_outputs(batch)
+        return self._whole_outputs(self.view(camera))
+
+    def view(self, camera: Cameras) -> View:
+        """The camera as the engine draws it: from the scene's near plane on, and on the CPU."""
+        return replace(view_of(camera.to("cpu")), near=self.near)
+
+    def _batch_outputs(self, batch: Batch) -> dict[str, Any]:
+        if self._coordinator is None:
+            raise RuntimeError(
+                "a training batch needs the coordinator that it came from: call follow() first"
+            )
+        rendered = self._coordinator.render(batch)
+        return {
+            "rgb": list(rendered.pictures),
+            "accumulation": [1 - transmittance[..., None] for transmittance in rendered.transmittances],
+            "background": [sample.background for sample in batch.samples],
+            "batch": batch,
+            "rendered": rendered,
+        }
+
+    def _whole_outputs(self, view: View) -> dict[str, Tensor]:
+        background = self.background_color.to(self.device)
+        if asked_by_viewer():
+            view = bounded(view)
+            raster = self.draw_for_viewer(view)
+            layer = raster.layer
+        else:
+            raster = self.draw_merged(view)
+            layer = self.draw_composited(view) if self.config.render == "composited" else raster.layer
+        transmittance = layer.transmittance[..., None]
+        alpha = 1 - raster.transmittance[..., None]
+        # Where nothing is, splatfacto shows the farthest depth of the picture.
+        depth = torch.where(alpha > 0, raster.depth[..., None] / alpha.clamp_min(1e-10), raster.depth.max())
+        return {
+            "rgb": (layer.color + transmittance * background).clamp(0, 1),
+            "depth": depth,
+            "accumulation": 1 - transmittance,
+            "background": background.expand(view.height, view.width, 3),
+        }
+
+    @torch.no_grad()
+    def draw_merged(self, view: View) -> Raster:
+        """All Gaussians at once, sorted by depth: what every ordinary viewer shows.
+
+        Where the device should not hold them all they are drawn unit by unit, by fragments: these fold to the
+        same picture.
+        """
+        if self._is_too_large():
+            return self._by_units(view, "fragments").everything()
+        gaussians = self._crop(self.merged().to(self.device))
+        return self.draws_with()(
+            gaussians,
+            view,
+            sh_degree=self.config.sh_degree,
+            antialiased=self.config.rasterize_mode == "antialiased",
+        )
+
+    @torch.no_grad()
+    def draw_composited(self, view: View) -> Layer:
+        """Each block alone, then folded front to back: what block training composites."""
+        pictures = self._by_units(view, self.config.ownership, pass_gaussians=0)
+        return pictures.painter.picture(view, pictures.settings)
+
+    def draw_for_viewer(self, view: View) -> Raster:
+        """What the viewer's user chose to see."""
+        choice, block = self.choice, self.choice.block
+        if block is None and self._coordinator is not None:
+            active = self._coordinator.state.active
+            block = None if active is None or active.is_whole else active.geometry.block
+        chosen = choice.show is not Show.EVERYTHING and block is not None and block < self.tree.num_blocks
+        if not chosen:
+            return self.draw_merged(view)
+        return self._by_units(view, self.config.ownership).draw(choice.show, block)
+
+    def _by_units(self, view: View, ownership: Ownership, pass_gaussians: int | None = None) -> BlockPictures:
+        whole = self.scene()
+        if isinstance(whole, StoredScene) and whole.is_live_as_a_whole:
+            whole = MemoryScene(
+                whole.tree, self.merged()
+            )  # which block holds how many is not known otherwise
+        scene = Cropped(whole, self._crop)
+        most = min(default_pass(scene), self._room())
+        painter = Painter(
+            scene,
+            [view],
+            self.draws_with(),
+            ownership=ownership,
+            pass_gaussians=most if pass_gaussians is None else pass_gaussians,
+            device=self.device,
+        )
+        settings = PaintSettings(self.config.sh_degree, self.config.rasterize_mode == "antialiased")
+        training = TrainingConfig() if self._coordinator is None else self._coordinator.config
+        return BlockPictures(painter, view, settings, training.window_weight)
+
+    def _is_too_large(self) -> bool:
+        """Whether the device should not hold the whole scene at once."""
+        if self._coordinator is None:
+            return self._loaded_is_too_large
+        return self._coordinator.count() > min(default_pass(self.scene()), self._room())
+
+    def _room(self) -> int:
+        """Gaussians that the device could draw at once, beside what it holds."""
+        return int(FREE_SHARE * free_bytes(self.device)) // drawing_bytes(self.config.sh_degree)
+
+    def _crop(self, gaussians: Gaussians) -> Gaussians:
+        if self.crop_box is None:
+            return gaussians
+        return gaussians[self.crop_box.within(gaussians.means).reshape(-1)]
+
+    # -- loss and metrics ----------------------------------------------------------------------------
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+        """PSNR of what was drawn, a batch's mean, and the number of Gaussians in the scene.
+
+        The PSNR of each picture is left in `outputs`, for the pipeline to take.
+        """
+        pictures, photos = self._pairs(outputs, batch)
+        outputs["psnrs"] = psnrs(pictures, photos)
+        return {"psnr": torch.stack(outputs["psnrs"]).mean(), "gaussian_count": self._count()}
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """The coordinator's loss of a training batch; of a whole picture the photometric loss."""
+        del metrics_dict
+        pictures, photos = self._pairs(outputs, batch)
+        if "mask" in batch:
+            masks = _as_list(batch["mask"])
+            pictures, photos = _masked(pictures, masks), _masked(photos, masks)
+        if "batch" in outputs and self._coordinator is not None:
+            return {"main_loss": self._coordinator.loss(outputs["batch"], pictures, photos)}
+        height, width = pictures[0].shape[:2]
+        whole = {"full_pixels": height * width, "full_windows": ssim_windows(height, width)}
+        loss = photometric_loss(pictures[0], photos[0], ssim_lambda=self.config.ssim_lambda, **whole)
+        return {"main_loss": loss}
+
+    def _pairs(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
+        """Pictures and their photos, on the same background."""
+        photos = [
+            self.photo_on(image, background)
+            for image, background in zip(
+                _as_list(batch["image"]), _as_list(outputs["background"]), strict=True
+            )
+        ]
+        return _as_list(outputs["rgb"]), photos
+
+    def photo_on(self, image: Tensor, background: Tensor) -> Tensor:
+        """What a picture on this background should be: float32 in 0..1, [h, w, 3]."""
+        return self.composite_with_background(self.get_gt_img(image), background)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Any], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of a whole picture, and photo and picture side by side."""
+        photo = self.photo_on(batch["image"], outputs["background"])
+        return image_metrics(outputs["rgb"], photo), {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """A photo as float32 in 0..1 on the device; ABCD trains at full resolution from the start."""
+        return (image.float() / 255 if image.dtype == torch.uint8 else image).to(self.device)
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """None: the pipeline's callbacks drive the coordinator, which does what splatfacto's would."""
+        del training_callback_attributes
+        return []
+
+    def _count(self) -> int:
+        return len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
+
+
+def checksum(gaussians: Gaussians) -> str:
+    """blake2b of all parameters, hexadecimal."""
+    digest = hashlib.blake2b(digest_size=16)
+    for _, value in gaussians.items():
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _as_list(values: Tensor | list[Tensor]) -> list[Tensor]:
+    return values if isinstance(values, list) else [values]
+
+
+def _masked(pictures: list[Tensor], masks: list[Tensor | None]) -> list[Tensor]:
+    pairs = zip(pictures, masks, strict=True)
+    return [picture if mask is None else picture * mask.to(picture.device) for picture, mask in pairs]

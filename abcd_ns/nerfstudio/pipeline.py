@@ -1,0 +1,279 @@
+"""Joins datamanager and model to a coordinator when training begins."""
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from abcd_ns.engine.events import HeldOutScored
+from abcd_ns.engine.gaussians.initialize import thin_out
+from abcd_ns.engine.space.near_plane import near_plane
+from abcd_ns.engine.space.partition import build_grid, build_kd
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.batch import Sample
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
+from abcd_ns.engine.train.run_state import Budget, RunState
+from abcd_ns.engine.train.splitting import cut_at_rest
+from abcd_ns.engine.train.workers.share import Target
+from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.nerfstudio.datamanager import AbcdDataManager
+from abcd_ns.nerfstudio.model import AbcdModel
+from abcd_ns.nerfstudio.ram_budget import budget_bytes, share_out
+from abcd_ns.nerfstudio.room import FITTED, Demand, Room, device_budget, find_room
+from abcd_ns.nerfstudio.run.progress import ProgressReport
+from abcd_ns.nerfstudio.run.run_folder import STATE, MadeFor, new_store, take_over
+from abcd_ns.nerfstudio.run.run_folder import STORE as STORE
+from abcd_ns.nerfstudio.run.run_log import keep_log
+from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.peers.exact import ExactCoordinator
+from abcd_ns.peers.independent import IndependentCoordinator, independent_at_rest
+from abcd_ns.viewer import guard
+from abcd_ns.viewer.panel import AbcdPanel
+
+if TYPE_CHECKING:
+    from abcd_ns.nerfstudio.config import AbcdPipelineConfig
+    from abcd_ns.nerfstudio.trainer import AbcdTrainer
+
+
+class AbcdPipeline(VanillaPipeline):
+    """ABCD in nerfstudio. Constructed without side effects: evaluation tools make one, too."""
+
+    config: "AbcdPipelineConfig"
+    datamanager: AbcdDataManager
+    model: AbcdModel
+
+    def __init__(self, config: "AbcdPipelineConfig", *args: Any, **kwargs: Any) -> None:
+        config.model.mirror(config.training)
+        self._ram = share_out(budget_bytes(config.ram_budget_gb))
+        if not config.datamanager.photo_cache_gb:
+            config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / 2**30
+        # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
+        guard.install()
+        super().__init__(config, *args, **kwargs)
+        self._coordinator: Coordinator | None = None
+        self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
+
+    @property
+    def coordinator(self) -> Coordinator | None:
+        """Drives the training, once it has begun."""
+        return self._coordinator
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Everything exists by now, checkpoint included: begin, or go on, and drive the coordinator."""
+        trainer: AbcdTrainer = training_callback_attributes.trainer
+        self._coordinator = self._begin(trainer, training_callback_attributes.optimizers.optimizers)
+        self.datamanager.follow(self._coordinator)
+        self.model.follow(self._coordinator)
+        report = ProgressReport(self._coordinator)
+        self._coordinator.announce.subscribe(report)
+        log = keep_log(trainer, self._coordinator)
+        self._coordinator.announce.subscribe(log)
+        self.panel.follow(self._coordinator)
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+
+        def end_step(step: int) -> None:  # noqa: ARG001 - the coordinator counts
+            self._after_step(trainer)
+
+        def end_run(step: int) -> None:  # noqa: ARG001
+            report.close()
+            log.close()
+
+        return [
+            TrainingCallback(after, end_step),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], end_run),
+        ]
+
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """As VanillaPipeline's, but keeps what the coordinator must be told after the step."""
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        self._rendered, self._psnrs = outputs.pop("rendered"), outputs.pop("psnrs")
+        return outputs, losses, metrics
+
+    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As VanillaPipeline's; while training, it is no training time."""
+        if self._coordinator is not None:
+            self._coordinator.stopwatch.pause()
+        return super().get_eval_image_metrics_and_images(step)
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
+        if self._coordinator is not None:
+            self._coordinator.stopwatch.pause()
+        found = super().get_average_eval_image_metrics(step, output_path, get_std)
+        if self._coordinator is not None:
+            self._coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
+        return found
+
+    def _after_step(self, trainer: "AbcdTrainer") -> None:
+        if self._coordinator is None:
+            raise RuntimeError("training has not begun")
+        self._coordinator.after_step(self._rendered, self._psnrs)
+        self._rendered = None
+        if self._coordinator.finished:
+            trainer.stop_training = True
+
+    # -- set-up --------------------------------------------------------------------------------------
+
+    def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Coordinator:
+        config, folder = self.config, trainer.base_dir / STATE
+        views = self._views()
+        self.datamanager.device_photo_bytes = 0 if self._on_cpu else int(PHOTO_SHARE * self._budget)
+        self.model.draws_with().warm_up()
+        store, resumed = self._open_store(folder / STORE, trainer, views)
+        scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
+        training = replace(config.training, **self._fitted(store, resumed), processes=self._processes())
+        if resumed:
+            state = RunState.from_json(store.state)
+            cut_at_rest(scene, state, training.block_limit, training.sole_limit)
+        coordinator = coordinator_for(training)(
+            training,
+            Budget(trainer.total_steps, config.max_seconds),
+            scene,
+            views,
+            self.model.draws_with(),
+            self.model.gauss_params,
+            {name: optimizers[name] for name in self.model.gauss_params},
+            device=self.device,
+            **self._room_for_layers(),
+            target=self._target,
+        )
+        if resumed:
+            coordinator.restore()
+        return coordinator
+
+    @property
+    def _on_cpu(self) -> bool:
+        return torch.device(self.device).type == "cpu"
+
+    @cached_property
+    def _budget(self) -> int:
+        """Bytes of the device that training may take, of what is free when it begins."""
+        return device_budget(self.config.device_budget_gb, self.device)
+
+    def _room_for_layers(self) -> dict[str, int]:
+        """Bytes of the device and of RAM; on the CPU these are one."""
+        if self._on_cpu:
+            return {"layer_bytes": self._ram.layers}
+        return {"layer_bytes": int(LAYER_SHARE * self._budget), "layer_ram_bytes": self._ram.layers}
+
+    def _processes(self) -> int:
+        """As asked for; where RAM is short, one, since each reads blocks for itself."""
+        asked = self.config.training.processes
+        return asked or int(self.config.ram_budget_gb > 0)
+
+    def _target(self, sample: Sample) -> Target:
+        """What a helper trains on; the training process gets the same by way of `next_train`."""
+        shot = sample.view.index, sample.crop
+        photo = self.model.photo_on(self.datamanager.photo(*shot), sample.background)
+        return photo, self.datamanager.mask(*shot)
+
+    def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
+        """The options that were fitted to the device: as the run began, unless it goes on with a budget of
+        its own."""
+        if resumed and self.config.blocks == 0 and self.config.device_budget_gb > 0:
+            blocks = BlockTree.from_json(store.header["tree"]).num_blocks
+            return self._room(sum(map(store.counts, range(blocks))), blocks).options
+        return {name: store.header.get(name, 0) for name in FITTED}
+
+    def _room(self, points: int, blocks: int = 1) -> Room:
+        """How many blocks for a scene that goes on with so many Gaussians in so many blocks."""
+        config = self.config
+        demand = Demand(
+            self._pixels,
+            points,
+            config.training,
+            most=config.training.density.limit,
+            factor=self.datamanager.dataparser.factor,
+            blocks=blocks,
+            on_cpu=self._on_cpu,
+        )
+        return find_room(self._budget, demand)
+
+    @property
+    def _pixels(self) -> int:
+        """Of the largest image."""
+        cameras = self.datamanager.train_dataset.cameras
+        return int((cameras.width * cameras.height).max())
+
+    def _first_cut(self, points: int) -> tuple[int, dict[str, int]]:
+        """The number of blocks to begin with, and the options that are fitted to the device, by name."""
+        if self.config.blocks > 0:
+            return self.config.blocks, {name: getattr(self.config.training, name) for name in FITTED}
+        room = self._room(points)
+        CONSOLE.print(room.in_words(), highlight=False, soft_wrap=True)
+        return room.blocks, room.options
+
+    def _views(self) -> list[View]:
+        """The training views; from now on the model draws from their near plane on."""
+        views, points = views_of(self.datamanager.train_dataset.cameras), self.model.seed_points
+        known = torch.zeros(0, 3) if points is None else points[0].cpu()
+        self.model.near = self.config.near_plane or near_plane(known, views)
+        return [replace(view, near=self.model.near) for view in views]
+
+    def _open_store(
+        self, folder: Path, trainer: "AbcdTrainer", views: list[View]
+    ) -> tuple[ParameterStore, bool]:
+        """The run's own store: a copy of the one it goes on from, or a new one."""
+        training, photos = self.config.training, self.datamanager.train_dataset.image_filenames
+        made_for = MadeFor.of(photos, views, training)
+        if trainer.resumed_from is not None:
+            return take_over(trainer.resumed_from, folder, made_for), True
+        everything = self.model.initial_gaussians()
+        gaussians = thin_out(everything, training.density.limit, training.seed)
+        if len(gaussians) < len(everything):
+            CONSOLE.print(
+                f"Training begins with {len(gaussians):,} of {len(everything):,} points, the limit "
+                "on Gaussians.",
+                highlight=False,
+            )
+        del everything
+        blocks, fitted = self._first_cut(len(gaussians))
+        tree = cut_space(gaussians, blocks, self.config.partition)
+        store = new_store(folder, {"tree": tree.to_json(), **fitted, **made_for.header()})
+        if training.overlap > 0:
+            store.commit(independent_at_rest(tree, gaussians))
+            return store, False
+        warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.exact
+        largest = fitted["block_limit"] or -(-len(gaussians) // tree.num_blocks)
+        keep = scaffold_size(replace(training, **fitted), largest, self._pixels) if warms_up else None
+        store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
+        return store, False
+
+
+def coordinator_for(training: TrainingConfig) -> type[Coordinator]:
+    """Who runs a training by these options."""
+    if training.exact:
+        return ExactCoordinator
+    return IndependentCoordinator if training.overlap > 0 else Coordinator
+
+
+def cut_space(gaussians: Gaussians, blocks: int, partition: str) -> BlockTree:
+    """Cells for a scene that is about to be trained."""
+    if partition == "kd":
+        return build_kd(gaussians.means, blocks)
+    return build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
+
+
+def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:
+    """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all."""
+    low, high = (gaussians.means.quantile(q, dim=0) for q in (0.05, 0.95))
+    extent = (high - low).clamp_min(1e-9).tolist()
+    counts = [1, 1, 1]
+    while counts[0] * counts[1] * counts[2] < blocks:
+        widest = max(range(3), key=lambda axis: extent[axis] / counts[axis])
+        counts[widest] += 1
+    return counts[0], counts[1], counts[2]

@@ -1,0 +1,224 @@
+"""How many blocks a scene needs on this device, and how much of its photos a step can draw."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import psutil
+import torch
+
+from abcd_ns.data.prepare import DOWNSCALE
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, levels_of
+from abcd_ns.engine.train.schedule import views_per_step
+from abcd_ns.engine.train.splitting import FULL
+from abcd_ns.errors import UserError
+
+GB = 2**30
+EXPECTED_GROWTH = 5
+"""Gaussians at the end for each initial point, where no limit is set; for forecasts only."""
+FREE_SHARE = 0.9
+"""Of a GPU's free memory: the rest is for what the allocator cannot use."""
+RAM_SHARE = 0.25
+"""Of the machine's RAM, where the CPU is the device."""
+LEAST_BLOCK = 1_000
+"""A block with room for fewer Gaussians is not worth a visit."""
+PICTURE_SHARE = 0.75
+"""Of what layers and photos leave of the budget, for a step's pictures at most; the rest is for Gaussians."""
+LEAST_CROP = 250_000
+"""Pixels: smaller parts of a view are mostly border."""
+FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels")
+"""The options of TrainingConfig that follow from the device's memory; a run keeps them."""
+BUDGET_FLAG = "--pipeline.device-budget-gb"
+MOST_DOWNSCALE = 64
+"""No larger factor is proposed."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """What a budget allows."""
+
+    blocks: int
+    """To begin with: as few as hold the initial Gaussians. Those that outgrow their room are cut in two."""
+    limit: int
+    """Gaussians in a block at most, where there are several; 0 where there is no room for several."""
+    sole: int
+    """Gaussians at most in a block that is the whole scene."""
+    budget: int
+    """Bytes of the device that training may take."""
+    gaussians: int
+    """Expected in the whole scene at the end."""
+    batch: int
+    """Views in a step, where there are several blocks."""
+    crop_pixels: int = 0
+    """Pixels of a view in a step at most; 0 is no limit."""
+
+    @property
+    def blocks_at_the_end(self) -> int:
+        """If as many Gaussians come as are expected."""
+        if not self.limit:
+            return self.blocks
+        return max(self.blocks, _fewest(self.gaussians, self.limit, self.sole))
+
+    @property
+    def options(self) -> dict[str, int]:
+        """What of it a run keeps to: FITTED, by name."""
+        return dict(zip(FITTED, (self.limit, self.sole, self.batch, self.crop_pixels), strict=True))
+
+    def in_words(self) -> str:
+        """One line for the terminal."""
+        blocks = "1 block" if self.blocks == 1 else f"{self.blocks} blocks"
+        limit = self.sole if self.blocks == 1 else self.limit
+        grows = "a block that comes near that is cut in two."
+        if not self.limit:
+            grows = "there is no room for the layers of more, and the scene stops growing at that."
+        budget = f"{self.budget / GB:.1f} GB of the device allow {limit:,} Gaussians in a block"
+        return f"{budget}: {blocks} to begin with; {grows}{self._drawn_in_words()}"
+
+    def _drawn_in_words(self) -> str:
+        """What a step draws, where it is less than usual."""
+        views = "1 view" if self.batch == 1 else f"{self.batch} views"
+        if self.crop_pixels:
+            return f" Photos are large: a step draws {self.crop_pixels / 1e6:.2g} megapixels of {views}."
+        if self.batch >= views_per_step(0, 2):
+            return ""
+        return f" Photos are large: among several blocks a step draws {views}, not {views_per_step(0, 2)}."
+
+
+def device_budget(wanted_gb: float, device: torch.device | str) -> int:
+    """Bytes of the device that training may take: what is wanted, or with 0 what there is."""
+    if wanted_gb > 0:
+        return int(wanted_gb * GB)
+    if torch.device(device).type == "cuda":
+        return int(FREE_SHARE * torch.cuda.mem_get_info(device)[0])
+    return int(RAM_SHARE * psutil.virtual_memory().total)
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What is to be trained on a device."""
+
+    pixels: int
+    """Of the largest image."""
+    points: int
+    """Gaussians that the scene begins with."""
+    training: TrainingConfig
+    most: int | None = None
+    """Limit on Gaussians in the whole scene; None for none."""
+    factor: int = 1
+    """By which the photos were reduced."""
+    blocks: int = 1
+    """That there are already."""
+    on_cpu: bool = False
+    """Whether the CPU is the device: then layers and photos are kept under another budget."""
+
+    @property
+    def first(self) -> int:
+        """Gaussians in the beginning."""
+        return self.points if self.most is None else min(self.points, self.most)
+
+    @property
+    def gaussians(self) -> int:
+        """Gaussians in the end."""
+        return self.most or EXPECTED_GROWTH * self.points
+
+    def reduced(self, times: int) -> "Demand":
+        """The same on smaller photos."""
+        return replace(self, pixels=max(self.pixels // times**2, 1), factor=self.factor * times)
+
+
+def find_room(budget: int, demand: Demand) -> Room:
+    """The fewest blocks whose visits stay within `budget` bytes, on as many views of a step as leave room.
+
+    What does not fit is tried with fewer views in a step, unless their number is set, then with parts of a
+    view. A scene that fits in one block needs no room for layers.
+
+    Raises:
+        UserError: the budget has no room for any block worth a visit; says what would help.
+    """
+    room = _room(budget, demand)
+    if room is None:
+        raise UserError(_refusal(budget, demand))
+    return room
+
+
+def _room(budget: int, demand: Demand) -> Room | None:
+    """As `find_room`; None where nothing fits."""
+    batch, crop = _views_and_crop(budget, demand)
+    # A single block has no neighbours and draws one view a step, so it may be larger.
+    sole_batch = views_per_step(demand.training.batch, 1)
+    sole = _needs(demand, sole_batch, crop, levels=0).block_limit(budget)
+    limit, levels = 0, levels_of(2)
+    while (found := _needs(demand, batch, crop, levels).block_limit(budget)) >= LEAST_BLOCK:
+        deepest = levels_of(_fewest(demand.gaussians, found, 0))
+        if deepest <= levels:
+            limit = found
+            break
+        levels = deepest
+    fits_in_one = demand.blocks == 1 and sole >= LEAST_BLOCK and demand.first <= FULL * sole
+    if not limit and not fits_in_one:
+        return None
+    blocks = 1 if fits_in_one else _fewest(demand.first, limit, 0)
+    return Room(blocks, limit, max(sole, 0), budget, demand.gaussians, batch, crop)
+
+
+def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
+    """As many views in a step, and as much of them, as leave room for Gaussians."""
+    training, left = demand.training, _needs(demand, 1, 0, levels_of(2)).left(budget)
+    room = PICTURE_SHARE * left
+    views = list(_fewer(views_per_step(training.batch, 2, training.batch_limit)))
+    if training.batch:
+        views = views[:1]
+    for batch in views:
+        if _needs(demand, batch, training.crop_pixels, levels=0).step_bytes <= room:
+            return batch, training.crop_pixels
+    batch = views[-1]
+    of_a_pixel = DeviceNeeds(1, batch).step_bytes
+    return batch, training.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
+
+
+def _fewer(views: int) -> Iterator[int]:
+    """Half as many each time, down to one."""
+    while views:
+        yield views
+        views //= 2
+
+
+def _needs(demand: Demand, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
+    degree, keeps = demand.training.sh_degree, not demand.on_cpu
+    return DeviceNeeds(demand.pixels, batch, degree, crop_pixels, levels, keeps)
+
+
+def _fewest(gaussians: int, limit: int, sole: int) -> int:
+    """Blocks for so many Gaussians."""
+    return 1 if gaussians <= FULL * sole else max(2, fewest_blocks(gaussians, limit, FULL))
+
+
+def _refusal(budget: int, demand: Demand) -> str:
+    """Why nothing fits, and which options would help."""
+    least = _least_budget(budget, demand)
+    ways = []
+    if demand.training.batch > 1:
+        one = replace(demand, training=replace(demand.training, batch=1))
+        ways += ["one view in a step by --pipeline.training.batch 1"] * (_room(budget, one) is not None)
+    times = 2
+    while times * demand.factor <= MOST_DOWNSCALE and _room(budget, demand.reduced(times)) is None:
+        times *= 2
+    if times * demand.factor <= MOST_DOWNSCALE:
+        ways.append(f"smaller photos by {DOWNSCALE} {times * demand.factor}")
+    ways.append(f"more memory by {BUDGET_FLAG} {least:.2f}, if the device has it")
+    return (
+        f"Training on photos of {demand.pixels / 1e6:.2g} megapixels takes {least:.2f} GB of the device, and "
+        f"{budget / GB:.2f} GB may be taken: give {', or '.join(ways)}."
+    )
+
+
+def _least_budget(budget: int, demand: Demand) -> float:
+    """The least that suffices, GB to two digits."""
+    step = GB // 100
+    low, high = budget // step, 2 * (budget // step + 1)
+    while _room(high * step, demand) is None:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if _room(middle * step, demand) is not None else (middle, high)
+    return high / 100

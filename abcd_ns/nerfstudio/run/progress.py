@@ -1,0 +1,150 @@
+"""Where the training stands, in the terminal: sweep, block, steps, PSNR, Gaussians, memory, time left."""
+
+import math
+import time
+from datetime import timedelta
+
+import psutil
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from abcd_ns.engine.events import (
+    Event,
+    LayersDrawn,
+    Mended,
+    StepTaken,
+    SweepEnded,
+    VisitBegan,
+    VisitEnded,
+    VisitUndone,
+)
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.health_record import MENDED, summary
+from abcd_ns.engine.train.run_state import UNLIMITED
+
+SECONDS_BETWEEN_LINES = 10.0
+"""Where the output is no terminal (a log file, say), a line is printed this often."""
+SMOOTHING = 0.98
+"""Of the PSNR shown: the weight of what was there before."""
+
+ALARMING = ("gradients", "moments", "values")
+"""What is said at once when it is mended; the rest is counted and said at the end."""
+
+
+class ProgressReport:
+    """Listens to a coordinator. On a terminal one live line; elsewhere a line every few seconds."""
+
+    def __init__(self, coordinator: Coordinator) -> None:
+        self._coordinator = coordinator
+        self._psnr: float | None = None
+        self._sweep = 0
+        self._visit: VisitBegan | None = None
+        self._layer_seconds = self._visit_seconds = 0.0
+        self._last_line = time.monotonic()
+        self._live: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __call__(self, event: Event) -> None:
+        """Take note of an event."""
+        match event:
+            case VisitBegan():
+                self._visit, self._sweep = event, event.sweep
+                self._show("")
+            case LayersDrawn():
+                self._show(f"layers {event.done}/{event.total}")
+            case StepTaken():
+                self._take_step(event)
+            case VisitEnded():
+                self._layer_seconds += event.layer_seconds
+                self._visit_seconds += event.seconds
+            case SweepEnded():
+                self._end_sweep(event)
+            case Mended() if event.what in ALARMING:
+                self._print(f"{_block(event.block)}: {event.count:,} {MENDED[event.what]}")
+            case VisitUndone():
+                rise = event.after / event.before - 1
+                self._print(
+                    f"{_block(event.block)}: visit undone, it raised the loss of its views by {rise:.0%}"
+                )
+
+    def close(self) -> None:
+        """Take the live line away and say what became of the run."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+        state = self._coordinator.state
+        CONSOLE.print(
+            f"Trained {state.step:,} steps in {state.visit} visits, "
+            f"{_clock(self._coordinator.stopwatch.seconds)}; {self._summary()}",
+            highlight=False,
+        )
+        lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
+        for line in lines if state.health else []:  # exact joint training has no visits
+            CONSOLE.print(f"  {line}", highlight=False)
+
+    def _take_step(self, event: StepTaken) -> None:
+        if math.isfinite(event.psnr):
+            before = event.psnr if self._psnr is None else self._psnr
+            self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
+        steps = self._visit.steps if self._visit else 0
+        endless = not 0 < steps < UNLIMITED or (self._visit is not None and self._visit.block is None)
+        self._show(f"step {event.visit_step}" if endless else f"step {event.visit_step}/{steps}")
+
+    def _end_sweep(self, event: SweepEnded) -> None:
+        if self._coordinator.scene.tree.num_blocks > 1:
+            self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
+
+    def _summary(self) -> str:
+        quality = "-" if self._psnr is None else f"{self._psnr:.2f} dB on training crops"
+        share = self._layer_seconds / self._visit_seconds if self._visit_seconds else 0.0
+        return f"{quality}, {self._coordinator.count():,} Gaussians, {share:.0%} of the time for layers"
+
+    def _show(self, what: str) -> None:
+        if CONSOLE.is_terminal:
+            self._bar().update(self._task, completed=self._coordinator.progress, what=self._line(what))
+        elif time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
+            self._print(f"{self._coordinator.progress:6.1%}  {self._line(what)}")
+
+    def _print(self, line: str) -> None:
+        self._last_line = time.monotonic()
+        CONSOLE.print(line, highlight=False, soft_wrap=True)
+
+    def _line(self, what: str) -> str:
+        coordinator, visit = self._coordinator, self._visit
+        blocks = coordinator.scene.tree.num_blocks
+        if visit is not None and visit.block is None:
+            where = "warm-up of the whole scene"
+        else:
+            where = f"sweep {self._sweep} block {'-' if visit is None else visit.block + 1}/{blocks}"
+        quality = "" if self._psnr is None else f"{self._psnr:.2f} dB  "
+        left = _clock(self._seconds_left())
+        return f"{where}  {what}  {quality}{coordinator.count():,} Gaussians  {_memory()}  {left} left"
+
+    def _seconds_left(self) -> float:
+        progress = self._coordinator.progress
+        return self._coordinator.stopwatch.seconds * (1 - progress) / max(progress, 1e-6)
+
+    def _bar(self) -> Progress:
+        if self._live is None:
+            percent = TextColumn("{task.percentage:>5.1f}%")
+            columns = (BarColumn(bar_width=20), percent, TextColumn("{task.fields[what]}"))
+            self._live = Progress(*columns, console=CONSOLE, transient=True)
+            self._task = self._live.add_task("", total=1.0, what="")
+            self._live.start()
+        return self._live
+
+
+def _block(block: int | None) -> str:
+    return "warm-up" if block is None else f"block {block + 1}"
+
+
+def _memory() -> str:
+    resident = f"{psutil.Process().memory_info().rss / 2**30:.1f} GB RAM"
+    if not torch.cuda.is_available():
+        return resident
+    return f"{torch.cuda.max_memory_allocated() / 2**30:.1f} GB GPU, {resident}"
+
+
+def _clock(seconds: float) -> str:
+    return str(timedelta(seconds=int(seconds)))

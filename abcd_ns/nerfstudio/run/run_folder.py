@@ -1,0 +1,176 @@
+"""What a run keeps on disk beside nerfstudio's files, and how another run goes on from it."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from abcd_ns.engine.store import ParameterStore, StoreError
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.types import View
+from abcd_ns.errors import UserError
+
+if TYPE_CHECKING:
+    from abcd_ns.nerfstudio.config import AbcdTrainerConfig
+
+STATE = "abcd"
+"""The folder of a run, beside `nerfstudio_models`, that holds the one that follows."""
+STORE = "store"
+"""The blocks at rest."""
+MADE_FOR = "made for"
+"""The entry of a store's header that tells what it can be trained on with."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a run goes on from."""
+
+    store: Path
+    pin: str | None
+    """The pin of a checkpoint that was asked for; None is the newest generation."""
+    step: int
+    """Steps that were taken until then."""
+
+
+@dataclass(frozen=True)
+class MadeFor:
+    """What a store and whoever goes on with it must agree on."""
+
+    photos: str
+    """Digest of the training photos' names and sizes. Not of their folder: it may be moved."""
+    first_camera: tuple[float, float, float]
+    """Its position, world units, to three digits."""
+    blocks_are_trained: str
+    """In turn, jointly, or each alone: what the store holds besides blocks depends on it."""
+    sh_degree: int
+
+    @staticmethod
+    def of(photos: Sequence[Path], views: Sequence[View], training: TrainingConfig) -> "MadeFor":
+        """Of a run on these photos, taken by these cameras."""
+        digest = hashlib.blake2b(digest_size=8)
+        for photo, view in zip(photos, views, strict=True):
+            digest.update(f"{photo.name} {view.width} {view.height}\n".encode("utf-8", "surrogateescape"))
+        x, y, z = (round(value, 3) for value in views[0].center.tolist())
+        how = "jointly" if training.exact else "each alone" if training.overlap > 0 else "in turn"
+        return MadeFor(digest.hexdigest(), (x, y, z), how, training.sh_degree)
+
+    def check(self, store: ParameterStore) -> None:
+        """See that `store` was made for the same.
+
+        Raises:
+            UserError: it was not; both are shown.
+        """
+        theirs, mine = store.header.get(MADE_FOR), _plain(self)
+        if theirs is None:  # made before this was written down
+            return
+        different = [name for name in mine if not _agree(theirs.get(name), mine[name])]
+        if different:
+            pairs = (f"{name.replace('_', ' ')} {theirs.get(name)}, not {mine[name]}" for name in different)
+            raise UserError(
+                f"{store.folder} cannot be gone on with: it was made for {'; '.join(pairs)}. Give the same "
+                "data and options as before, or leave out --load-dir."
+            )
+
+    def header(self) -> dict[str, Any]:
+        """The entry of a new store's header."""
+        return {MADE_FOR: _plain(self)}
+
+
+def _plain(made_for: MadeFor) -> dict[str, Any]:
+    return {**asdict(made_for), "first_camera": list(made_for.first_camera)}
+
+
+def _agree(theirs: Any, mine: Any) -> bool:
+    if isinstance(theirs, list) and isinstance(mine, list) and len(theirs) == len(mine):
+        # Other machines and libraries may round poses otherwise in the last digits.
+        return all(abs(a - b) <= 2e-3 * max(1.0, abs(b)) for a, b in zip(theirs, mine, strict=True))
+    return theirs == mine
+
+
+def find_start(config: "AbcdTrainerConfig") -> Start | None:
+    """What --load-dir, --load-step and --load-checkpoint ask for; None begins anew.
+
+    `--load-dir` alone is the newest that the run has: its last visit's end, or its last checkpoint where that
+    is newer. It may name the run's folder or `nerfstudio_models` in it, with or without checkpoints there.
+
+    Raises:
+        UserError: there is nothing to go on from.
+    """
+    if config.load_dir is None and config.load_checkpoint is None:
+        return None
+    if config.load_dir is None:
+        return _at_checkpoint(config.load_checkpoint)
+    run = _run_of(config.load_dir)
+    if config.load_step is not None:
+        return _at_checkpoint(run / config.relative_model_dir / f"{pin_name(config.load_step)}.ckpt")
+    store = run / STATE / STORE
+    if not store.is_dir():
+        if any((run / config.relative_model_dir).glob("step-*.ckpt")):
+            raise UserError(f"{run} can be viewed but not trained further: the folder {store} is missing.")
+        raise UserError(f"There is no run of ABCD in {config.load_dir}: it has no {store}.")
+    return _at(store, None)
+
+
+def pin_name(step: int) -> str:
+    """The store's pin that belongs to a checkpoint: its file name without the ending."""
+    return f"step-{step:09d}"
+
+
+def take_over(start: Start, folder: Path, made_for: MadeFor) -> ParameterStore:
+    """Make `folder` the store of a run that goes on from `start`, and open it.
+
+    Where `folder` is the very store that the run goes on from, it is simply opened.
+
+    Raises:
+        UserError: the store cannot be read, or was made for something else; the disk refused; or another run
+            is writing to `folder`.
+    """
+    with ParameterStore.open(start.store, start.pin, read_only=True) as old:
+        made_for.check(old)
+        if folder.exists() and folder.samefile(start.store):
+            store = ParameterStore.open(folder)
+            if start.pin is not None:
+                store.restore(start.pin)
+            return store
+        old.clone_to(folder, start.pin)
+    return ParameterStore.open(folder)
+
+
+def new_store(folder: Path, header: dict[str, Any]) -> ParameterStore:
+    """An empty store for a run that begins.
+
+    Raises:
+        UserError: `folder` holds the store of another run, or the disk refused.
+    """
+    try:
+        return ParameterStore.create(folder, header)
+    except StoreError as error:
+        if not (folder / "manifest.json").exists():
+            raise
+        raise UserError(
+            f"{folder} holds a run already: go on with it by --load-dir {folder.parent.parent}, or choose "
+            "another --timestamp."
+        ) from error
+
+
+def _run_of(load_dir: Path) -> Path:
+    return load_dir if (load_dir / STATE).is_dir() else load_dir.absolute().parent
+
+
+def _at_checkpoint(path: Path) -> Start:
+    if not path.exists():
+        raise UserError(f"There is no checkpoint {path}.")
+    store = path.absolute().parent.parent / STATE / STORE
+    if not store.is_dir():
+        raise UserError(f"{path} can be viewed but not trained further: the folder {store} is missing.")
+    return _at(store, path.stem)
+
+
+def _at(folder: Path, pin: str | None) -> Start:
+    with ParameterStore.open(folder, pin, read_only=True) as store:
+        if not store.blocks:
+            raise UserError(
+                f"The run in {folder} was ended before it began: start it anew, without --load-dir."
+            )
+        return Start(folder, pin, store.state.get("step", 0))

@@ -1,0 +1,210 @@
+"""A run's log: what happened when, a JSON object a line, in `abcd/log.jsonl`; `abcd report` reads it."""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, Literal
+
+import psutil
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.nerfstudio.machine import peak_rss_bytes
+from abcd_ns.nerfstudio.run.log_lines import (
+    KIND_OF,
+    SCHEMA,
+    EndLine,
+    HeldOutLine,
+    Line,
+    SampleLine,
+    SweepEndLine,
+    TrainingLine,
+    VisitEndLine,
+    VisitLine,
+)
+from abcd_ns.nerfstudio.run.run_folder import STATE
+from abcd_ns.nerfstudio.settings import write_settings
+
+if TYPE_CHECKING:
+    from abcd_ns.nerfstudio.trainer import AbcdTrainer
+
+LOG_FILE = "log.jsonl"
+SECONDS_BETWEEN_SAMPLES = 1.0
+SAMPLES = 300
+"""Later samples are a longer time apart, this share of what has passed: a day's log is hardly longer than an
+hour's."""
+LINES_KEPT = 64
+"""Lines wait in memory for the end of a visit, but no more than so many."""
+
+
+@dataclass(frozen=True)
+class Meter:
+    """Something that is kept at hand within a budget."""
+
+    name: str
+    used: Callable[[], int]
+    """Bytes in use now."""
+    budget: int
+    """Bytes."""
+
+
+class RunLog:
+    """Listens to a coordinator and writes down what it says.
+
+    The log is a by-product: if the disk refuses it, that is said once, and the training goes on.
+
+    Args:
+        path: of the log; its folder must exist.
+        earlier: the log of the run that this one goes on from, as far as that is its past; may be the same.
+    """
+
+    def __init__(
+        self, coordinator: Coordinator, path: Path, meters: Sequence[Meter] = (), earlier: Path | None = None
+    ) -> None:
+        self._coordinator, self._meters = coordinator, tuple(meters)
+        self._path: Path | None = path
+        self._psnrs: list[float] = []
+        self._visit_psnrs: list[float] = []
+        self._lines: list[str] = []
+        if earlier is not None:
+            self._write(past_of(coordinator, earlier), "w")
+        self._sampled = coordinator.stopwatch.seconds
+        budgets = {meter.name: meter.budget for meter in self._meters}
+        limit, blocks = coordinator.config.density.limit, coordinator.scene.tree.num_blocks
+        scene = {"blocks": blocks, "gaussians": coordinator.count(), "limit": limit}
+        self._note(TrainingLine, schema=SCHEMA, **scene, budgets=budgets)
+        self._flush()
+
+    def __call__(self, event: Event) -> None:
+        """Take note of an event."""
+        match event:
+            case StepTaken():
+                self._take_step(event)
+            case VisitBegan():
+                self._visit_psnrs = []
+                self._note(VisitLine, **vars(event))
+                self._flush()
+            case VisitEnded():
+                self._end_visit(event)
+            case SweepEnded():
+                self._note(SweepEndLine, sweep=event.sweep)
+            case HeldOutScored():
+                self._note(HeldOutLine, psnr=_finite(event.psnr), ssim=_finite(event.ssim))
+                self._flush()
+
+    def close(self) -> None:
+        """Training is over: say what it took."""
+        cuda = torch.cuda.is_available()
+        self._sample()
+        self._note(
+            EndLine,
+            gaussians=self._coordinator.count(),
+            peak_rss_bytes=peak_rss_bytes(),
+            peak_device_bytes=torch.cuda.max_memory_allocated() if cuda else None,
+        )
+        self._flush()
+
+    def _take_step(self, event: StepTaken) -> None:
+        if math.isfinite(event.psnr):
+            self._psnrs.append(event.psnr)
+            self._visit_psnrs.append(event.psnr)
+        seconds = self._coordinator.stopwatch.seconds
+        if seconds - self._sampled >= max(SECONDS_BETWEEN_SAMPLES, seconds / SAMPLES):
+            self._sample()
+
+    def _end_visit(self, event: VisitEnded) -> None:
+        self._sample()
+        self._note(
+            VisitEndLine,
+            visit=event.visit,
+            sweep=event.sweep,
+            block=event.block,
+            gaussians=event.gaussians,
+            migrated=event.migrated,
+            layer_seconds=round(event.layer_seconds, 3),
+            visit_seconds=round(event.seconds, 3),
+            psnr=_mean(self._visit_psnrs[len(self._visit_psnrs) // 2 :]),
+        )
+        self._flush()
+
+    def _sample(self) -> None:
+        cuda = torch.cuda.is_available()
+        self._note(
+            SampleLine,
+            psnr=_mean(self._psnrs),
+            gaussians=self._coordinator.count(),
+            rss_bytes=psutil.Process().memory_info().rss,
+            device_bytes=torch.cuda.memory_allocated() if cuda else None,
+            held={meter.name: meter.used() for meter in self._meters},
+        )
+        self._psnrs, self._sampled = [], self._coordinator.stopwatch.seconds
+
+    def _note(self, kind: type[Line], **fields: Any) -> None:
+        coordinator = self._coordinator
+        seconds = round(coordinator.stopwatch.seconds, 3)
+        line = kind(step=coordinator.state.step, seconds=seconds, **fields)
+        self._lines.append(json.dumps({"kind": KIND_OF[kind], **asdict(line)}))
+        if len(self._lines) >= LINES_KEPT:
+            self._flush()
+
+    def _flush(self) -> None:
+        lines, self._lines = self._lines, []
+        self._write(lines, "a")
+
+    def _write(self, lines: Sequence[str], mode: Literal["w", "a"]) -> None:
+        if self._path is None:
+            return
+        try:
+            with open(self._path, mode, encoding="utf-8") as file:
+                file.writelines(f"{line}\n" for line in lines)
+        except OSError as error:
+            what = f"{self._path} cannot be written ({error.strerror}); the run's log ends here."
+            CONSOLE.print(what, style="yellow", markup=False, soft_wrap=True)
+            self._path = None
+
+
+def past_of(coordinator: Coordinator, log: Path) -> list[str]:
+    """The lines of an earlier run's log that are the past of a run that was resumed from it.
+
+    What it did after its checkpoint is cut. A line that cannot be read ends the past.
+    """
+    state, kept = coordinator.state, []
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        for text in log.read_bytes().decode("utf-8", "replace").splitlines():
+            line = json.loads(text)
+            # A visit that began after the checkpoint begins once more, at the same step.
+            again = line["kind"] == "visit" and line["visit"] >= state.visit
+            if line["step"] <= state.step and line["kind"] != "end" and not again:
+                # The clock goes on from the commit, and what was said of it came after.
+                line["seconds"] = min(line["seconds"], round(coordinator.stopwatch.seconds, 3))
+                kept.append(json.dumps(line))
+    return kept
+
+
+def keep_log(trainer: "AbcdTrainer", coordinator: Coordinator) -> RunLog:
+    """Begin the log of a run, and write its settings beside it."""
+    folder, photos = trainer.base_dir / STATE, trainer.pipeline.datamanager.train_dataset.photos
+    write_settings(trainer.config, folder)
+    scene = coordinator.scene
+    meters = (
+        Meter("photos", lambda: photos.cached_bytes, photos.budget_bytes),
+        Meter("frozen blocks", lambda: scene.cached_bytes, scene.ram_bytes),
+        Meter("layers", lambda: coordinator.layer_bytes, coordinator.layer_limit),
+    )
+    earlier = None if trainer.resumed_from is None else trainer.resumed_from.store.parent / LOG_FILE
+    return RunLog(coordinator, folder / LOG_FILE, meters, earlier)
+
+
+def _finite(value: float | None) -> float | None:
+    """None in place of what JSON cannot hold."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return round(fmean(values), 3) if values else None

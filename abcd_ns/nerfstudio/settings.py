@@ -1,0 +1,95 @@
+"""What a run was trained with, in `abcd/settings.json`: plain values that are read without trusting anyone.
+
+nerfstudio's config.yml names Python objects, which its loader makes: whoever wrote the file decides what is
+run. A report about a run from elsewhere must not do that.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.engine.trainer import TrainerConfig
+
+from abcd_ns.engine.store.atomic import write_file
+from abcd_ns.nerfstudio.machine import Machine, Versions, describe_machine, describe_versions
+
+SETTINGS_FILE = "settings.json"
+SCHEMA = 1
+"""Raised whenever a field changes its name or meaning."""
+
+Plain = bool | int | float | str | None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The whole of settings.json."""
+
+    schema: int
+    method: str
+    scene: str
+    """The name of the folder with the data."""
+    data: str
+    """The folder, as it was given."""
+    data_path: str
+    """The same as an absolute path."""
+    begun: str
+    """When training began: ISO 8601, UTC."""
+    options: dict[str, Plain]
+    """Every option by its dotted name, as on `ns-train`'s command line."""
+    versions: Versions
+    machine: Machine
+
+
+def write_settings(config: TrainerConfig, folder: Path) -> None:
+    """Write `folder`/settings.json about a training that is about to begin; the folder must exist."""
+    content = dataclasses.asdict(describe_settings(config))
+    write_file(folder / SETTINGS_FILE, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def describe_settings(config: TrainerConfig) -> Settings:
+    """What this configuration trains, here and now."""
+    data = Path(config.pipeline.datamanager.data)
+    return Settings(
+        schema=SCHEMA,
+        method=config.method_name,
+        scene=scene_name(data),
+        data=str(data),
+        data_path=str(data.resolve()),
+        begun=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        options=flat_options(config),
+        versions=describe_versions(),
+        machine=describe_machine(),
+    )
+
+
+def scene_name(data: Path) -> str:
+    """What a scene is called: the name of its folder."""
+    path = data.resolve()
+    return path.parent.name if path.suffix == ".json" else path.name
+
+
+def flat_options(config: Any) -> dict[str, Plain]:
+    """Every option of a configuration by its dotted name; private ones and classes are left out."""
+    return dict(_leaves(config, ""))
+
+
+def _leaves(value: Any, name: str) -> Iterator[tuple[str, Plain]]:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            if not str(key).startswith("_"):
+                yield from _leaves(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, (tuple, list)):
+        yield name, " ".join(map(str, value))
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield name, str(value)
+    elif value is None or isinstance(value, (bool, int, float, str)):
+        yield name, value
+    elif isinstance(value, Path):
+        yield name, str(value)

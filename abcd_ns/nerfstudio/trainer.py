@@ -1,0 +1,200 @@
+"""nerfstudio's trainer, with checkpoints that a run can truly go on from, and an end that loses nothing."""
+
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from abcd_ns.data.input_errors import exit_on_user_error, print_error
+from abcd_ns.engine.events import Event, LayersDrawn
+from abcd_ns.engine.store import StoreError, crash_points
+from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.nerfstudio.run.run_folder import Start, find_start, pin_name
+from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
+
+if TYPE_CHECKING:
+    from abcd_ns.nerfstudio.config import AbcdTrainerConfig
+
+
+class AbcdTrainer(Trainer):
+    """Saves the merged scene for nerfstudio's tools and pins the same moment in the parameter store.
+
+    Upstream, resuming drops Adam's state and trains the full count of steps again; here it goes on at the
+    very step and within the visit that was under way. Ctrl-C and SIGTERM commit before the process ends.
+    """
+
+    config: "AbcdTrainerConfig"
+    pipeline: AbcdPipeline
+    resumed_from: Start | None = None
+    """What this run goes on from."""
+
+    def __init__(self, config: "AbcdTrainerConfig", *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        self.total_steps = config.max_num_iterations
+        """Steps of the whole run, those before a resume included."""
+        self._signals = StopSignals()
+
+    def setup(self, *args: Any, **kwargs: Any) -> None:
+        """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
+        with exit_on_user_error():
+            super().setup(*args, **kwargs)
+        self.pipeline.coordinator.announce.subscribe(self._between_layers)
+
+        def begin_step(step: int) -> None:  # noqa: ARG001 - nerfstudio passes it
+            self._signals.hold()
+
+        def end_step(step: int) -> None:  # noqa: ARG001
+            self._signals.release()
+
+        location = TrainingCallbackLocation
+        self.callbacks = [
+            TrainingCallback([location.BEFORE_TRAIN_ITERATION], begin_step),
+            *self.callbacks,
+            TrainingCallback([location.AFTER_TRAIN_ITERATION], end_step),
+        ]
+
+    def train(self) -> None:
+        """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
+        try:
+            with self._signals:
+                super().train()
+        except Stopped as stopped:
+            self._end_report()
+            with exit_on_user_error():
+                self.pipeline.coordinator.save()
+            name, step = stopped.received.name, self.pipeline.coordinator.state.step
+            self._say(f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost.")
+            self._say_how_to_go_on()
+            raise SystemExit(stopped.exit_code) from None
+        except (UserError, torch.cuda.OutOfMemoryError) as error:
+            self._end_report()
+            print_error(str(error) if isinstance(error, UserError) else self._memory_is_full())
+            try:
+                self.pipeline.coordinator.scene.flush()
+            except StoreError as refused:
+                if not isinstance(error, StoreError):
+                    print_error(str(refused))
+            self._say_how_to_go_on()
+            raise SystemExit(2) from None
+        except Exception:
+            with suppress(StoreError):  # what went wrong first is what matters
+                self.pipeline.coordinator.scene.flush()
+            raise
+
+    def _memory_is_full(self) -> str:
+        limit = self.pipeline.coordinator.config.block_limit
+        room = f"blocks of {limit:,} Gaussians" if limit else f"{self.config.pipeline.blocks} blocks"
+        return (
+            f"The device's memory does not hold {room}. Nothing that a visit has finished is lost: go on "
+            "with --pipeline.blocks 0 and a smaller --pipeline.device-budget-gb, or begin anew with smaller "
+            "photos."
+        )
+
+    def _train_complete_viewer(self) -> None:
+        # All is saved; nerfstudio goes on serving its viewer until Ctrl-C, which is how such a run ends.
+        with suppress(Stopped):
+            super()._train_complete_viewer()
+
+    def _between_layers(self, event: Event) -> None:
+        # Drawing a visit's layers may take long, and between two of them there is nothing that could be lost.
+        if isinstance(event, LayersDrawn):
+            self._signals.check()
+
+    def _end_report(self) -> None:
+        for callback in self.callbacks:
+            callback.run_callback_at_location(self.step, location=TrainingCallbackLocation.AFTER_TRAIN)
+
+    def _say_how_to_go_on(self) -> None:
+        command = command_to_go_on(sys.argv, self.config.method_name, self.checkpoint_dir)
+        if command is not None:  # else whoever started this training knows better
+            self._say(f"To go on:\n  {command}")
+
+    def _say(self, text: str) -> None:
+        CONSOLE.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    # -- checkpoints ---------------------------------------------------------------------------------
+
+    def _load_checkpoint(self) -> None:
+        start = find_start(self.config)
+        if start is None:
+            CONSOLE.print("Training from scratch.")
+            return
+        self.resumed_from = start
+        self._start_step = start.step
+        self.config.max_num_iterations = max(self.total_steps - start.step, 0)
+        self.step = start.step - 1
+        which = "where it was left" if start.pin is None else start.pin
+        self._say(f"Going on after step {start.step:,} of {self.total_steps:,}: {start.store}, {which}")
+
+    def _update_viewer_state(self, step: int) -> None:
+        """As nerfstudio's, which lets a client that goes away, or sends nonsense, end the run."""
+        try:
+            super()._update_viewer_state(step)
+        except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError) as error:
+            CONSOLE.print(f"The viewer failed at step {step} ({error!r}); training goes on.", markup=False)
+
+    def save_checkpoint(self, step: int) -> None:
+        """Save the merged scene for nerfstudio's tools, and everything else in the store.
+
+        Raises:
+            UserError: the disk refused; the run can still be gone on with.
+        """
+        coordinator = self.pipeline.coordinator
+        if coordinator is None:
+            raise RuntimeError("there is nothing to save before training has begun")
+        coordinator.stopwatch.pause()
+        coordinator.save(pin=pin_name(step))
+        crash_points.reached(crash_points.CHECKPOINT_PINNED)
+        path = self.checkpoint_dir / f"{pin_name(step)}.ckpt"
+        # The Adam moments of all blocks are in the store; nerfstudio expects the keys.
+        state = {"optimizers": {}, "schedulers": {}, "scalers": self.grad_scaler.state_dict()}
+        _save_atomically({"step": step, "pipeline": self.pipeline.state_dict(), **state}, path)
+        crash_points.reached(crash_points.CHECKPOINT_IN_PLACE)
+        if self.config.save_only_latest_checkpoint:
+            self._forget_all_but(path)
+
+    def _forget_all_but(self, kept: Path) -> None:
+        store = self.pipeline.coordinator.scene.store
+        for old in self.checkpoint_dir.glob("step-*.ckpt"):
+            if old != kept:
+                old.unlink(missing_ok=True)
+        for pin in store.pins:
+            if pin != kept.stem:
+                store.unpin(pin)
+
+
+def _save_atomically(state: dict[str, Any], path: Path) -> None:
+    """Put a checkpoint in place of `path`, wholly or not at all.
+
+    Raises:
+        UserError: the disk refused.
+    """
+    # Not beside it: nerfstudio takes every file there for a checkpoint.
+    run = path.parent.parent
+    temporary = run / f".{path.name}{TEMPORARY_SUFFIX}"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for leftover in run.glob(f".step-*.ckpt{TEMPORARY_SUFFIX}"):  # of a run that was killed
+            leftover.unlink()
+        torch.save(state, temporary)
+        crash_points.reached(crash_points.CHECKPOINT_WRITTEN)
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        fsync_folder(path.parent)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, (OSError, RuntimeError)):  # torch raises the latter for a full disk
+            raise UserError(
+                f"{path} could not be written: {error}. The training itself is safe in the store; free space."
+            ) from error
+        raise

@@ -1,0 +1,32 @@
+"""nerfstudio's cameras as the engine's views."""
+
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.engine.types import View
+
+
+def view_of(cameras: Cameras, row: int = 0) -> View:
+    """Camera `row` of a list of cameras, in OpenCV convention.
+
+    Raises:
+        InputError: the camera is not a perspective one.
+    """
+    if int(cameras.camera_type[row]) != CameraType.PERSPECTIVE.value:
+        kind = CameraType(int(cameras.camera_type[row])).name.lower()
+        raise InputError(f"Camera {row} is {kind}; Gaussians are drawn by perspective cameras only.")
+    pose = cameras.camera_to_worlds[row].detach()
+    rotation = pose[:3, :3] * pose.new_tensor([1.0, -1.0, -1.0])  # OpenGL to OpenCV: flip y and z
+    viewmat = torch.eye(4, dtype=pose.dtype, device=pose.device)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ pose[:3, 3]
+    K = torch.eye(3, dtype=pose.dtype, device=pose.device)
+    K[0, 0], K[1, 1] = cameras.fx[row].item(), cameras.fy[row].item()
+    K[0, 2], K[1, 2] = cameras.cx[row].item(), cameras.cy[row].item()
+    return View(viewmat, K, int(cameras.width[row]), int(cameras.height[row]), row)
+
+
+def views_of(cameras: Cameras) -> list[View]:
+    """All cameras, each under its row as index."""
+    return [view_of(cameras, row) for row in range(cameras.shape[0])]

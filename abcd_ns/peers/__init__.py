@@ -1,0 +1,1 @@
+"""What ABCD is compared with, built from the same engine: exact gradients, and blocks that train alone."""

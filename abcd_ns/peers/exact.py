@@ -1,0 +1,283 @@
+"""Exact joint training over blocks, one block on the device at a time: the reference for gradients.
+
+NeRF-XL (Li et al., ECCV 2024) shows that volume rendering, and so its gradient, parts exactly over cells that
+tile space. In this engine's terms, for every step:
+
+1. every block's layer of the step's views is drawn, without gradients, and all are folded to the picture;
+2. the loss gives G = dL/dC, and every layer is drawn again, with gradients, between its own F and B:
+   dL/dC_A = T_F G and dL/dT_A = T_F <G, C_B + T_B b>; what a Gaussian gets from several cells is added up;
+3. every block's optimizers step.
+
+By fragments the picture is the merged one, so this is 3DGS step for step, but for the 1e-4 of light at which
+drawing stops. The device holds one block at a time and what reaches into its cell, and the step's layers; all
+blocks with moments and gradients lie in RAM. It costs one more drawing than joint training, and every block's
+way to the device and back.
+"""
+
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from abcd_ns.engine.events import StepTaken
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import attach, detach
+from abcd_ns.engine.layers.compositing import composite, fold
+from abcd_ns.engine.render import Raster, Shot
+from abcd_ns.engine.render.image_size import image_size
+from abcd_ns.engine.space.culling import Optics
+from abcd_ns.engine.space.intervals import ray_interval
+from abcd_ns.engine.space.ordering import front_to_back
+from abcd_ns.engine.space.visibility import reaches
+from abcd_ns.engine.store.scaffold import join, part
+from abcd_ns.engine.train.batch import Batch, Rendered, Sample, background, part_to_draw
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityClock, DensityControl, for_blocks
+from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer
+
+
+@dataclass
+class Gradients:
+    """What a step adds up over cells, in RAM, for all n Gaussians of the scene."""
+
+    params: dict[str, Tensor]
+    """By parameter, of its shape."""
+    means2d: Float[Tensor, "v n 2"]
+    """By view, of the projected means; density control judges by it."""
+    absolute: Float[Tensor, "v n 2"]
+    """Sums of absolute values over pixels, where asked for."""
+    radii: Tensor
+    """[v, n], px; 0 where culled."""
+
+    @staticmethod
+    def zero(gaussians: Gaussians, views: int) -> "Gradients":
+        """Nothing yet."""
+        flat = gaussians.means.new_zeros(views, len(gaussians), 2)
+        params = {name: torch.zeros_like(value) for name, value in gaussians.items()}
+        return Gradients(params, flat, flat.clone(), torch.zeros(flat.shape[:2], dtype=torch.int32))
+
+    def add(self, rows: Int64[Tensor, "m"], view: int, raster: Raster) -> None:
+        """Take over what one drawing's backward left in its info; `rows` are its Gaussians."""
+        means2d = raster.info["means2d"]
+        if means2d.grad is not None:
+            self.means2d[view].index_add_(0, rows, means2d.grad[0].to(self.means2d))
+        if hasattr(means2d, "absgrad"):
+            self.absolute[view].index_add_(0, rows, means2d.absgrad[0].to(self.absolute))
+        self.radii[view, rows] = raster.info["radii"][0].to(self.radii)
+
+
+class ExactCoordinator(Coordinator):
+    """Every step trains all blocks; options as for `Coordinator`.
+
+    `render` gives pictures whose gradient the caller's backward takes; `after_step` hands it on to blocks.
+    Between steps no Gaussians are live, so that the caller's optimizers have nothing to step.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._optics = Optics(list(self.views.values()), self._rasterizer.window_side)
+        self._batch: Batch | None = None
+        self._degree = 0
+        self._layers_of: list[dict[int, Layer]] = []
+        self._pictures: list[Tensor] = []
+        self._take()
+
+    @property
+    def batch(self) -> int:
+        """Views in a step."""
+        return views_per_step(self.config.batch, 1)
+
+    def _density_control(self) -> DensityControl:
+        # Every block sees every step.
+        return DensityControl(for_blocks(self.config.density, 1))
+
+    def next_batch(self) -> Batch:
+        """Set the learning rate and say what to train on next: whole views, or random parts."""
+        self.stopwatch.start()
+        self._pace.set(self.batch, exponential_decay(self.progress, 1.0, self.config.means_lr_decay))
+        step, rows = self.state.step, tuple(sorted(self.views))
+        samples = []
+        for place in range(self.batch):
+            view = self.views[endless_order(rows, step * self.batch + place, self.config.seed)]
+            behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
+            crop = part_to_draw(self.config, view.full, step, place)
+            share = crop.pixels / view.full.pixels
+            samples.append(Sample(view, crop, None, None, None, behind, share))
+        return Batch(step, tuple(samples))
+
+    def render(self, batch: Batch) -> Rendered:
+        """Pass 1: all blocks' layers, folded; differentiable in the pictures alone."""
+        self._batch, self._layers_of = batch, [{} for _ in batch.samples]
+        self._degree = self.sh_degree
+        with torch.no_grad():
+            for block, _, gaussians in self._cells():
+                for place in range(len(batch.samples)):
+                    self._layers_of[place][block] = self._draw(block, gaussians, place).layer
+        wholes = [fold(self._in_order(place)) for place in range(len(batch.samples))]
+        self._pictures = [
+            composite(whole, sample.background).requires_grad_()
+            for whole, sample in zip(wholes, batch.samples, strict=True)
+        ]
+        clamped = tuple(picture.clamp(0, 1) for picture in self._pictures)
+        return Rendered(clamped, tuple(whole.transmittance for whole in wholes), ())
+
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+        """Pass 2, and a step of every block's optimizers."""
+        gradients, taken = self.gradients(), len(rendered.pictures)
+        self.state.step += 1
+        owner = self._owner_of_all()
+        updated, rows = [], []
+        for block in owner.unique().tolist():
+            rows.append((owner == block).nonzero()[:, 0])
+            updated.append(self._step(block, self._all[rows[-1]], gradients, rows[-1], taken))
+        joined, order = join(updated), torch.cat(rows)
+        kept = all(len(state) == len(row) for state, row in zip(updated, rows, strict=True))
+        self._all = joined[order.argsort()] if kept else joined
+        self._lay_over()
+        self._pictures, self._layers_of = [], []
+        _, psnr = self.health.end_step(psnrs)
+        self.announce(StepTaken(self.state.step, 0, self.state.step, psnr))
+        if self.finished:
+            self.save()
+        elif self.scene.is_due(self.config.commit_seconds):
+            self._rest_amid_visit(self.config.commit_seconds)
+
+    def gradients(self) -> Gradients:
+        """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given.
+
+        Raises:
+            RuntimeError: `render` was not called before, or its pictures have no gradient.
+        """
+        if self._batch is None or not self._pictures or self._pictures[0].grad is None:
+            raise RuntimeError(
+                "there is no gradient to hand on: call render, and backward of the loss, first"
+            )
+        gradients = Gradients.zero(self._all.gaussians, len(self._pictures))
+        for block, rows, gaussians in self._cells():
+            leaves = Gaussians(**{name: v.detach().requires_grad_() for name, v in gaussians.items()})
+            for place in range(len(self._pictures)):
+                raster = self._draw(block, leaves, place)
+                raster.info["means2d"].retain_grad()
+                self._backward(block, place, raster)
+                gradients.add(rows, place, raster)
+            for name, leaf in leaves.items():
+                if leaf.grad is not None:
+                    gradients.params[name].index_add_(0, rows, leaf.grad.to("cpu"))
+        return gradients
+
+    def count(self) -> int:
+        """Gaussians in the whole scene."""
+        return len(self._all)
+
+    def _rest_amid_visit(self, within: float) -> None:
+        """Put every block to rest; there are no visits."""
+        held, nobody = part(self._all, self._owner_of_all()), self._all.nobody
+        blocks = range(self.scene.tree.num_blocks)
+        self._rest(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
+
+    def restore(self) -> None:
+        """Go on from what the store holds: where `save` was called, the order of the Gaussians aside."""
+        super().restore()
+        self._take()
+
+    # -- blocks --------------------------------------------------------------------------------------
+
+    def _take(self) -> None:
+        blocks = range(self.scene.tree.num_blocks)
+        self._all = join([self.scene.state(block) for block in blocks])
+        self._lay_over()
+
+    def _lay_over(self) -> None:
+        everything = self._all.gaussians
+        self.scene.lay_over(None, lambda: everything)
+
+    def _owner_of_all(self) -> Int64[Tensor, "n"]:
+        return self.scene.tree.assign(self._all.gaussians.means)
+
+    def _cells(self) -> Iterator[tuple[int, Int64[Tensor, "m"], Gaussians]]:
+        """(block, rows, Gaussians on the device) of every layer that holds any."""
+        everything, tree = self._all.gaussians, self.scene.tree
+        owner, slack = self._owner_of_all(), self._optics.slack(everything.means)
+        for block in range(tree.num_blocks):
+            inside = owner == block
+            if self.config.ownership == "fragments":
+                inside = inside | reaches(everything, tree.cell(block), slack, self._optics.slant)
+            rows = inside.nonzero()[:, 0]
+            if len(rows):
+                yield block, rows, everything[rows].to(self.device)
+
+    def _draw(self, block: int, gaussians: Gaussians, place: int) -> Raster:
+        sample = self._batch.samples[place]
+        window = None
+        if self.config.ownership == "fragments":
+            grid = self._rasterizer.window_grid(sample.crop)
+            window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
+        shot = Shot(sample.view, sample.crop, None, window)
+        options = {"antialiased": self.config.antialiased, "absgrad": self.density.absgrad}
+        return self._rasterizer.draw(gaussians, [shot], sh_degree=self._degree, **options)[0]
+
+    def _in_order(self, place: int) -> list[Layer]:
+        """The view's layers, front to back."""
+        order = front_to_back(self.scene.tree, self._batch.samples[place].view.center.double().cpu())
+        layers = self._layers_of[place]
+        return [layers[block] for block in order if block in layers]
+
+    def _backward(self, block: int, place: int, raster: Raster) -> None:
+        layers, own = self._in_order(place), self._layers_of[place][block]
+        at = next(k for k, layer in enumerate(layers) if layer is own)
+        front, back = fold(layers[:at], like=own), fold(layers[at + 1 :], like=own)
+        gradient = self._pictures[place].grad
+        behind = composite(back, self._batch.samples[place].background)
+        by_color = front.transmittance[..., None] * gradient
+        outputs = (raster.color, raster.transmittance)
+        torch.autograd.backward(outputs, (by_color, (by_color * behind).sum(dim=-1)))
+
+    def _step(
+        self, block: int, state: BlockState, gradients: Gradients, rows: Int64[Tensor, "m"], taken: int
+    ) -> BlockState:
+        attach(state.to(self.device), self.params, self.optimizers, batch=taken)
+        for name in PARAM_NAMES:
+            self.params[name].grad = gradients.params[name][rows].to(self.device)
+        if self.config.density.strategy == "mcmc":
+            self.density.regularisation(self.params, self.count()).backward()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+        clocks = replace(
+            state.clocks, steps=state.clocks.steps + taken, adam_views=state.clocks.adam_views + taken
+        )
+        growth = self.density.after_step(
+            self.params,
+            self.optimizers,
+            {name: value.to(self.device) for name, value in state.growth.items()},
+            (self._info(gradients, rows),),
+            self._clock_of(block, len(state), clocks.steps, taken),
+        )
+        stepped = detach(self.params, self.optimizers, growth, clocks)
+        attach(stepped[:0].to(self.device), self.params, self.optimizers)
+        return stepped
+
+    def _info(self, gradients: Gradients, rows: Int64[Tensor, "m"]) -> dict[str, Any]:
+        """As a rasterizer gives it, of one block's Gaussians and all views of the step."""
+        means2d = torch.zeros_like(gradients.means2d[:, rows]).to(self.device)
+        means2d.grad = gradients.means2d[:, rows].to(self.device)
+        means2d.absgrad = gradients.absolute[:, rows].to(self.device)
+        radii = gradients.radii[:, rows].to(self.device)
+        size = image_size([sample.view for sample in self._batch.samples], self.device)
+        return {"means2d": means2d, "radii": radii, "gaussian_ids": None, "n_cameras": len(radii), **size}
+
+    def _clock_of(self, block: int, gaussians: int, steps: int, taken: int) -> DensityClock:
+        limit, everything = self.config.density.limit, max(self.count(), 1)
+        drawn = random.Random(f"density {self.config.seed} {self.state.step} {block}")
+        return DensityClock(
+            progress=self.progress,
+            steps=steps,
+            taken=taken,
+            views=len(self.views),
+            room=None if limit is None else max(limit - everything, 0) * gaussians // everything,
+            seed=drawn.getrandbits(62),
+        )

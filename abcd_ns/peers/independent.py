@@ -1,0 +1,272 @@
+"""Partition, train, merge: every block is trained once, by itself, on its cell and a margin around it.
+
+What published systems do that train large scenes by parts, in this engine's terms:
+
+- A block begins with the Gaussians of its cell enlarged by `overlap` (as in VastGaussian, Lin et al., CVPR
+  2024, and Mega-NeRF, Turki et al., CVPR 2022). It knows nothing of its neighbours' training.
+- It is trained on the pixels whose surface lies in the enlarged cell, as Mega-NeRF prunes its data. The
+  surface is that of the initial points; where there are none, the ray's far end stands for it. Each pixel is
+  thus some block's, and no block is asked for what it cannot explain.
+- Where the surface lies behind the cell, or the ray misses it, the block must stay clear: the target is the
+  background, another one in every step. Without that, blocks fill with floaters before others' surfaces;
+  VastGaussian's airspace-aware choice of cameras and BlockGaussian's auxiliary points are against the same.
+- At the end it keeps the Gaussians whose means lie in its cell; all blocks together are the scene.
+
+A block has one visit, as long as its share of the budget by the views that say something about it, and every
+schedule runs over that visit. The store also holds each block as it began, under numbers of its own.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
+from abcd_ns.engine.render import Rasterizer
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.space.intervals import ray_interval
+from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.store.scaffold import blocks_at_rest, join
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.special_blocks import initial_of
+from abcd_ns.engine.train.batch import Batch, Rendered
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityClock
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
+from abcd_ns.engine.train.schedule import exponential_decay, plan_sweep, sh_degree_at
+from abcd_ns.engine.types import Crop, Gaussians, View
+
+SURFACE_OPACITY = 0.9
+"""Of the initial points where they stand for surfaces."""
+SURFACE_SCALE = 0.5
+"""Their size as such, as a share of what they begin with: outliers, which begin large, hide too much."""
+BEYOND = 1e30
+"""Camera z of a pixel that shows no point: further than any finite cell."""
+
+
+def independent_at_rest(
+    tree: BlockTree, gaussians: Gaussians
+) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
+    """The first content of a store: every block, and once more every block as it began."""
+    blocks = blocks_at_rest(tree, gaussians)
+    return {**blocks, **{initial_of(block): content for block, content in blocks.items()}}
+
+
+def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
+    """The cell, moved outward at each face by `overlap` of its extent on that axis.
+
+    Args:
+        means: of the cell's Gaussians; where the cell is infinite, its extent is theirs, a twentieth at
+            either end left out.
+    """
+    extent = cell.upper - cell.lower
+    if len(means):
+        middle = means.double().cpu().quantile(torch.tensor([0.05, 0.95]).double(), dim=0)
+        extent = torch.where(extent.isinf(), middle[1] - middle[0], extent)
+    margin = overlap * torch.where(extent.isinf(), 0.0, extent)
+    return Box(cell.lower - margin, cell.upper + margin)
+
+
+@dataclass(frozen=True)
+class Region:
+    """What the pixels of one view are to a block, by where their surface lies; of a crop or the whole view.
+
+    Neither of both: the cell lies behind the surface, and nobody can tell what is there.
+    """
+
+    own: Bool[Tensor, "h w"]
+    """In the enlarged cell: the photo is the block's to explain."""
+    clear: Bool[Tensor, "h w"]
+    """Behind the cell, or the ray misses it: the block must let all light through."""
+
+    def to(self, device: torch.device) -> "Region":
+        """On a device."""
+        return Region(self.own.to(device), self.clear.to(device))
+
+    def __getitem__(self, crop: Crop) -> "Region":
+        """Some of its pixels, counted from its own upper left corner."""
+        return Region(self.own[crop.slices], self.clear[crop.slices])
+
+
+class Surfaces:
+    """How far the initial points are at every pixel of every view; 4 bytes of RAM for each.
+
+    All initial Gaussians are drawn at once to find out.
+    """
+
+    def __init__(self, scene: StoredScene, views: list[View], rasterizer: Rasterizer, device: torch.device):
+        self._views = {view.index: view for view in views}
+        gaussians = Gaussians.cat([initial_gaussians(scene, b) for b in range(scene.tree.num_blocks)])
+        opaque = math.log(SURFACE_OPACITY / (1 - SURFACE_OPACITY))
+        scales = gaussians.scales + math.log(SURFACE_SCALE)
+        opacities = torch.full_like(gaussians.opacities, opaque)
+        points = replace(gaussians, opacities=opacities, scales=scales).to(device)
+        self._depths = {index: self._depth(points, view, rasterizer) for index, view in self._views.items()}
+
+    def region(self, view: int, cell: Box) -> Region:
+        """What every pixel of `view` is to a block with this cell."""
+        camera = self._views[view]
+        depth = self._depths[view].to(camera.viewmat)
+        span = ray_interval(cell, camera, TileGrid(camera.full, 1))
+        near, far = (plane.view_as(depth) for plane in (span.near, span.far))
+        own = (near <= depth) & (depth < far)
+        hidden = (depth < near) & near.isfinite()
+        return Region(own, ~own & ~hidden)
+
+    @staticmethod
+    @torch.no_grad()
+    def _depth(points: Gaussians, view: View, rasterizer: Rasterizer) -> Float[Tensor, "h w"]:
+        raster = rasterizer(points, view, sh_degree=0)
+        alpha = 1 - raster.transmittance
+        shown = raster.depth / alpha.clamp_min(1e-10)
+        return torch.where(alpha > 0.5, shown, BEYOND).float().cpu()
+
+
+class IndependentCoordinator(Coordinator):
+    """Trains each block in one visit, alone; options as for `Coordinator`, with `training.overlap` > 0."""
+
+    def __init__(self, config: TrainingConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(replace(config, migrate=False), *args, **kwargs)
+        self._surfaces: Surfaces | None = None
+        self._regions: dict[int, Region] = {}
+        self._crops: dict[int, Crop] = {}
+        self._part = 1.0
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree of spherical harmonics in use: by the share of the visit that is done."""
+        return sh_degree_at(self.share, self.config.sh_ramp, self.config.sh_degree)
+
+    @property
+    def share(self) -> float:
+        """Share of the visit that is done, 0..1; every schedule runs over it."""
+        active = self.state.active
+        if active is None:
+            return 0.0
+        return min(max((self.progress - active.since) / (active.until - active.since), 0.0), 1.0)
+
+    def next_batch(self) -> Batch:
+        """As Coordinator's, with the visit's own learning rate and degree."""
+        batch = super().next_batch()
+        self._active.sh_degree = self.sh_degree
+        decay = exponential_decay(self.share, 1.0, self.config.means_lr_decay)
+        self._pace.set(self.batch, means_decay=decay)
+        return batch
+
+    def loss(self, batch: Batch, pictures: Any, photos: Any) -> Float[Tensor, ""]:
+        """As Coordinator's, of the pixels that say something about the block."""
+        shown, wanted = [], []
+        for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
+            index = sample.view.index
+            region = self._regions[index][sample.crop.within(self._crops[index])]
+            counts = (region.own | region.clear)[..., None].to(picture)
+            clear = region.clear[..., None].to(photo.device)
+            target = torch.where(clear, sample.background.to(photo), photo)
+            shown.append(picture * counts)
+            wanted.append(target * counts)
+        return super().loss(batch, shown, wanted)
+
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+        """As Coordinator's; the visit ends when its share of the budget is used up."""
+        super().after_step(rendered, psnrs)
+        if self.state.active is not None and self.progress >= self._active.until:
+            self._end_visit()
+
+    def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:  # noqa: ARG002
+        return ()  # nobody knows how many steps there will be
+
+    def _density_clock(self, taken: int) -> DensityClock:
+        """On the visit's share, with room for the block's part of the scene's limit."""
+        clock, limit = super()._density_clock(taken), self.config.density.limit
+        if limit is not None:
+            limit = int(limit * self._part) - len(self.params["means"])
+        return replace(clock, progress=self.share, room=limit)
+
+    # -- visits --------------------------------------------------------------------------------------
+
+    @property
+    def _blocks(self) -> range:
+        return range(self.scene.tree.num_blocks)
+
+    def _begin_visit(self) -> None:
+        began, since = self.stopwatch.seconds, self.progress
+        if not self.state.views:
+            self._plan()
+        plans = self.state.queue
+        share = plans[0].steps / sum(plan.steps for plan in plans)
+        block = plans.pop(0).block
+        self._look(block)
+        crops = self._crops
+        self.state.active = ActiveVisit(
+            number=self.state.visit,
+            geometry=VisitGeometry(block, crops),
+            sh_degree=0,
+            steps=UNLIMITED,
+            views=tuple(sorted(crops)),
+            began=began,
+            since=since,
+            until=since + (1 - since) * share if plans else 1.0,
+        )
+        self.state.visit += 1
+        self._rest(self.scene.tree, {block: self._joined(block)}, self.config.commit_seconds)
+        self._attach(self.state.active)
+
+    def _plan(self) -> None:
+        """One visit to every block that owns a pixel, weighed by the views that say something about it."""
+        for block in self._blocks:
+            self._look(block)
+            owns = any(bool(region.own.any()) for region in self._regions.values())
+            self.state.views[block] = len(self._regions) if owns else 0
+        self.state.queue = list(plan_sweep(0, self.state.views, 1, None, self.config.seed))
+        if not self.state.queue:
+            raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
+
+    def _attach(self, active: ActiveVisit) -> None:
+        block = active.geometry.block
+        self._look(block)
+        super()._attach(active)
+        begun = sum(self.scene.rows(initial_of(b)) for b in self._blocks)
+        self._part = len(self._joined(block)) / begun
+        # What looks at the scene meanwhile sees the block as it will be merged.
+        cell = self.scene.tree.cell(block)
+
+        def inside() -> Gaussians:
+            live = live_gaussians(self.params)
+            return live[cell.contains(live.means)]
+
+        self.scene.lay_over(block, inside)
+
+    def _look(self, block: int) -> None:
+        """Find out what pixels are to the block, and let go of the last block's."""
+        if self._surfaces is None:
+            views = list(self.views.values())
+            self._surfaces = Surfaces(self.scene, views, self._rasterizer, self.device)
+        box, self._regions, self._crops = self._box(block), {}, {}
+        begun = self._joined(block).gaussians.to(self.device)
+        crops = survey(begun, block, self.views.values(), self._rasterizer).crops
+        for view, crop in crops.items():
+            region = self._surfaces.region(view, box)[crop].to(self.device)
+            if bool((region.own | region.clear).any()):
+                self._regions[view], self._crops[view] = region, crop
+
+    def _box(self, block: int) -> Box:
+        means = initial_gaussians(self.scene, block).means
+        return enlarged(self.scene.tree.cell(block), means, self.config.overlap)
+
+    def _joined(self, block: int) -> BlockState:
+        """The block as it begins, with what of the others lies in its enlarged cell."""
+        box, others = self._box(block), [b for b in self._blocks if b != block]
+        own, *around = [initial_gaussians(self.scene, b) for b in [block, *others]]
+        return join([BlockState.fresh(g) for g in [own, *(g[box.contains(g.means)] for g in around)]])
+
+
+def initial_gaussians(scene: StoredScene, block: int) -> Gaussians:
+    """A block's Gaussians as they began."""
+    return scene.stored(initial_of(block))

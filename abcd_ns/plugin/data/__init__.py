@@ -1,1 +1,0 @@
-"""Reading scenes: models, photos and the frame they are put in."""

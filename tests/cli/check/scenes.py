@@ -1,0 +1,58 @@
+"""A scene with nothing to complain about, and surveys of what it could have been."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from abcd_ns.cli.check.command import findings_of
+from abcd_ns.cli.check.looks import Look
+from abcd_ns.cli.check.survey import Survey
+from abcd_ns.cli.check.visibility import visibility
+from abcd_ns.cli.findings import Finding
+from tests.data.dataparser_scenes import write_model, write_photos
+
+POINTS = 600
+
+
+def wide(width: int, height: int) -> tuple[str, list[float]]:
+    """A lens that sees all points from everywhere."""
+    return "PINHOLE", [width * 0.3, width * 0.3, width / 2, height / 2]
+
+
+def write_sound(folder: Path) -> Path:
+    """Nothing about it is doubtful; it is noted that photos have two sizes."""
+    write_model(folder / "sparse/0", points=POINTS, params=wide)
+    write_photos(folder / "images")
+    return folder
+
+
+def names(findings: Iterable[Finding]) -> list[str]:
+    return [finding.name for finding in findings]
+
+
+def the(name: str, found: Survey) -> Finding:
+    """The one finding of that name."""
+    (finding,) = (finding for finding in findings_of(found) if finding.name == name)
+    return finding
+
+
+def changed(found: Survey, pose: Callable | None = None, points: np.ndarray | None = None) -> Survey:
+    """The survey of a scene with other poses, `pose(row, 3 x 4)`, or other points."""
+    prepared, scene = found.prepared, found.prepared.scene
+    if pose is not None:
+        moved = [
+            replace(frame, camera_to_world=pose(row, frame.camera_to_world.copy()))
+            for row, frame in enumerate(scene.frames)
+        ]
+        prepared = replace(prepared, scene=replace(scene, frames=moved))
+    if points is not None:
+        prepared = replace(prepared, points_in_model=points)
+    # A new object, as centres are kept with the old one.
+    return replace(found, prepared=prepared, seen=visibility(prepared))
+
+
+def with_looks(found: Survey, *looks: Look) -> Survey:
+    """The survey with other looks at the first photos."""
+    return replace(found, looks=(*looks, *found.looks[len(looks) :]))

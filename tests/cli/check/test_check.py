@@ -1,0 +1,197 @@
+"""`abcd check`: refuses what training refuses, in its words, and explains what is doubtful."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from abcd_ns.cli.check.command import check, examine
+from abcd_ns.cli.check.visibility import visibility
+from abcd_ns.cli.findings import Finding, by_level
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.errors import UserError
+from tests.cli.check.scenes import POINTS, names
+from tests.data.dataparser_scenes import (
+    NAMES,
+    REAL,
+    SIZES,
+    parser,
+    project_pycolmap,
+    write_model,
+    write_photos,
+)
+
+
+def test_a_sound_scene_is_summed_up(sound, tmp_path, capsys):
+    before = sorted(sound.rglob("*"))
+    assert check(data=sound, json=tmp_path / "report.json") == 0
+    assert sorted(sound.rglob("*")) == before
+
+    printed = capsys.readouterr().out
+    report = json.loads((tmp_path / "report.json").read_text())
+    summary = report["summary"]
+    assert names_in(report) == ["mixed-sizes"]
+    assert summary["photos"] == len(NAMES)
+    assert summary["sizes"] == {f"{w} x {h}": 5 for w, h in SIZES}
+    assert (summary["train"], summary["held_out"], summary["points"]) == (8, 2, POINTS)
+    assert summary["photo_bytes"] == sum(5 * 3 * w * h for w, h in SIZES)
+    assert f"is fine: ns-train abcd --data {sound}\n" in printed
+    for part in ("10, 5 of", "600", "8 to train on, 2 held out", "mixed-sizes"):
+        assert part in printed
+
+
+def names_in(report: dict) -> list[str]:
+    return [finding["name"] for finding in report["findings"]]
+
+
+def test_near_plane_is_that_of_training(sound, found):
+    """Half the depth of the nearest point in a picture that is trained on."""
+    depths = []
+    for row in found.train:
+        pose = found.prepared.scene.frames[row].camera_to_world
+        local = (found.points - pose[:, 3]) @ pose[:, :3]
+        depths.extend(-local[inside(local, found.prepared.lenses[row]), 2])
+    summary = examine(sound).summary
+    assert summary.near_plane_model == pytest.approx(min(depths) / 2, rel=0.05)
+    assert summary.near_plane == pytest.approx(
+        summary.near_plane_model * found.prepared.similarity.scale, rel=1e-6
+    )
+
+
+def inside(local: np.ndarray, lens) -> np.ndarray:
+    """Which points, in OpenGL camera coordinates, lie in the picture."""
+    u = lens.fx * local[:, 0] / -local[:, 2] + lens.cx
+    v = lens.fy * local[:, 1] / local[:, 2] + lens.cy
+    return (local[:, 2] < 0) & (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)
+
+
+def test_points_in_view_are_those_that_pycolmap_projects_into_it(tmp_path):
+    model = write_model(tmp_path / "sparse/0", points=300)
+    write_photos(tmp_path / "images")
+    seen = visibility(parser(tmp_path).prepared())
+    for row, name in enumerate(sorted(NAMES)):
+        width, height = SIZES[NAMES.index(name) % 2]
+        uv = project_pycolmap(model, name)
+        expected = ((uv >= 0) & (uv < [width, height])).all(axis=1).sum()
+        assert seen.in_view[row] == expected
+
+
+def test_a_choice_of_many_points_stands_for_all(found, monkeypatch):
+    whole = found.seen
+    monkeypatch.setattr("abcd_ns.cli.check.visibility.MOST_POINTS", 200)
+    part = visibility(found.prepared)
+    assert part.in_view == pytest.approx(whole.in_view, abs=0.1 * POINTS)
+    assert part.in_view.sum() != whole.in_view.sum()
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda scene: shutil.rmtree(scene),
+        lambda scene: shutil.rmtree(scene / "images"),
+        lambda scene: [(scene / "images" / name).write_bytes(b"") for name in NAMES[:3]],
+        lambda scene: (scene / "sparse/0/cameras.bin").write_bytes(b"\xff" * 9),
+        lambda scene: (scene / "test_list.txt").write_text("gone.png"),
+    ],
+    ids=["no scene", "no photos", "empty photos", "damaged model", "split list"],
+)
+def test_what_training_refuses_is_refused_in_the_same_lines(scene, tmp_path, capsys, spoil):
+    spoil(scene)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError) as refused:
+        parser(scene).check()
+
+    assert check(data=scene) == 2
+
+    printed = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    for line in refused.value.lines:
+        assert f"input: {line}" in printed
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_damage_in_the_middle_of_a_photo_is_an_error(scene, capsys):
+    """Training would stop when it comes to it: the file ends as it should."""
+    path = scene / "images" / NAMES[0]
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = bytes(40)
+    path.write_bytes(data)
+    parser(scene).check()
+
+    assert check(data=scene) == 2
+    assert f"damaged-photo: {path} cannot be decoded" in capsys.readouterr().out
+
+
+def test_a_refusal_is_written_too(scene, tmp_path):
+    (scene / "images" / NAMES[0]).write_bytes(b"")
+    assert check(data=scene, json=tmp_path / "report.json") == 2
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["summary"] is None
+    assert [finding["level"] for finding in report["findings"]] == ["error"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"downscale": 0}, "--downscale is 0"),
+        ({"json": Path("nowhere/report.json")}, "the folder nowhere does not exist"),
+        ({"json": Path("/")}, "is a folder"),
+    ],
+)
+def test_impossible_options_are_refused_before_any_work(options, message):
+    with pytest.raises(UserError, match=message):
+        check(data=Path("nowhere"), **options)
+
+
+def test_long_lists_of_errors_are_cut_in_the_terminal_only(tmp_path, capsys):
+    many = [f"{i:02d}.png" for i in range(30)]
+    write_model(tmp_path / "sparse/0", names=many)
+    write_photos(tmp_path / "images", names=many)
+    for name in many:
+        (tmp_path / "images" / name).unlink()
+    assert check(data=tmp_path) == 2
+    printed = capsys.readouterr().out
+    assert printed.count("cannot be read") == 20
+    assert "and 10 more (30 in all)" in printed
+    assert len(examine(tmp_path).findings) == 30
+
+
+def test_names_that_no_terminal_takes_are_escaped(scene, capsys):
+    """A byte that is no UTF-8, and a newline."""
+    written, path = b"right/0000.png", scene / "sparse/0/images.bin"
+    odd = b"right/\xff\n00.png"
+    path.write_bytes(path.read_bytes().replace(written, odd))
+    (scene / "images" / os.fsdecode(written)).unlink()
+    Image.new("RGB", SIZES[0]).save(scene / "images" / os.fsdecode(odd))
+    assert check(data=scene) == 0
+    assert "over: right/\\udcff\\n00.png." in capsys.readouterr().out
+
+
+def test_findings_are_sorted_by_how_serious_they_are():
+    levels = ("note", "error", "warning", "note", "error")
+    mixed = [Finding(level, str(i), "") for i, level in enumerate(levels)]
+    assert names(by_level(mixed)) == ["1", "4", "2", "0", "3"]
+
+
+def test_the_readers_notes_are_warnings(tmp_path):
+    write_model(tmp_path / "sparse/0", points=0)
+    write_photos(tmp_path / "images")
+    for i in range(11):
+        Image.new("RGB", (9, 9), (i, 90, 90)).save(tmp_path / f"images/extra{i}.png")
+    said = [finding.what for finding in examine(tmp_path).findings if finding.name == "input"]
+    assert any("has no points" in line for line in said)
+    assert any("Fewer than half have one" in line for line in said)
+
+
+# Real scenes
+
+
+@pytest.mark.parametrize("name", ["fox", "castle-P30"])
+def test_real_scenes_are_fine(name):
+    if not (REAL / name).is_dir():
+        pytest.skip(f"{REAL / name} is not there; set ABCD_DATA to a folder that holds it")
+    report = examine(REAL / name)
+    assert not [finding for finding in report.findings if finding.level != "note"]

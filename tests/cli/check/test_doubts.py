@@ -1,0 +1,188 @@
+"""What `abcd check` finds doubtful: each thing is found where it is, and not where it is not."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from abcd_ns.cli.check.command import examine, findings_of
+from abcd_ns.cli.check.looks import Look
+from abcd_ns.cli.check.survey import Survey, survey
+from tests.cli.check.scenes import POINTS, changed, names, the, wide, with_looks
+from tests.data.dataparser_scenes import NAMES, SIZES, write_model, write_photos, write_transforms
+
+# Photos
+
+
+def test_few_photos_and_a_split_that_leaves_one(tmp_path):
+    write_model(tmp_path / "sparse/0", points=POINTS, names=NAMES[:2], params=wide)
+    write_photos(tmp_path / "images", names=NAMES[:2])
+    said = names(examine(tmp_path).findings)
+    assert "few-photos" in said
+    assert "few-training-views" in said
+
+
+def test_copies_of_a_photo_are_named_and_leaks_counted(scene):
+    ordered = sorted(NAMES)
+    assert NAMES.index(ordered[0]) % 2 == NAMES.index(ordered[2]) % 2, "photos of one size"
+    shutil.copy(scene / "images" / ordered[0], scene / "images" / ordered[2])
+    what = the("duplicate-photos", survey(scene, 1)).what
+    assert f"{ordered[0]} = {ordered[2]}" in what
+    assert "1 of them is both trained on and held out" in what
+
+
+def test_photos_that_only_look_alike_are_no_copies(scene):
+    for name in NAMES[:3:2]:
+        Image.new("RGB", SIZES[0], (90, 90, 90)).save(scene / "images" / name)
+    Image.new("RGB", SIZES[0], (90, 90, 91)).save(scene / "images" / NAMES[4])
+    (group,) = survey(scene, 1).copies
+    assert sorted(sorted(NAMES)[row] for row in group) == sorted(NAMES[:3:2])
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_brightness_is_the_mean_luma(scene, kind):
+    noise = np.random.default_rng(0).integers(0, 256, (SIZES[0][1], SIZES[0][0], 3), dtype=np.uint8) // 2
+    path = scene / "images" / NAMES[0]
+    Image.fromarray(noise).save(path, format=kind)
+    found = survey(scene, 1)
+    expected = (noise @ [0.299, 0.587, 0.114]).mean() / 255
+    assert found.looks[sorted(NAMES).index(NAMES[0])].brightness == pytest.approx(expected, abs=0.01)
+
+
+def test_exposure_that_varies_is_told_from_blank_photos(found):
+    evenly = [Look(0.3 + 0.02 * i) for i in range(len(NAMES))]
+    assert not {"exposure", "blank-photos"} & set(names(findings_of(with_looks(found, *evenly))))
+    uneven = [Look(0.1 + 0.08 * i) for i in range(len(NAMES))]
+    assert "factor of" in the("exposure", with_looks(found, *uneven)).what
+    blank = [Look(0.0), Look(0.999), *evenly[2:]]
+    assert "2 photos are black or white" in the("blank-photos", with_looks(found, *blank)).what
+    assert "exposure" not in names(findings_of(with_looks(found, *blank)))
+
+
+def test_orientation_and_alpha_are_noted(scene):
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.new("RGBA", SIZES[0], (9, 90, 90, 120)).save(scene / "images" / NAMES[0], exif=exif)
+    found = survey(scene, 1)
+    assert NAMES[0] in the("exif-orientation", found).what
+    assert the("alpha", found).what.startswith("1 photo has")
+
+
+def test_masks_are_noted(scene):
+    meta = write_transforms(scene)
+    for frame in meta["frames"]:
+        frame["mask_path"] = f"masks/{frame['file_path']}"
+        (scene / frame["mask_path"]).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (frame["w"], frame["h"]), 255).save(scene / frame["mask_path"])
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    assert "10 photos have a mask" in the("masks", survey(scene, 1)).what
+
+
+def test_photos_beyond_their_share_of_ram(found, monkeypatch):
+    monkeypatch.setattr("abcd_ns.cli.check.about_photos.default_budget", lambda: 1000)
+    assert "photo-cache-gb" in the("photos-beyond-ram", found).fix
+
+
+def test_large_photos_come_with_what_helps(found):
+    source = replace(found.sources[0], stored=(6000, 4000), reduced=(6000, 4000))
+    large = replace(found, prepared=replace(found.prepared, sources=[source, *found.sources[1:]]))
+    assert "leave out --pipeline.datamanager.dataparser.downscale-factor" in the("large-photos", large).fix
+
+
+# Cameras
+
+
+def test_distortion_says_what_becomes_of_the_photos(tmp_path):
+    write_model(
+        tmp_path / "sparse/0",
+        points=POINTS,
+        params=lambda w, h: ("OPENCV", [w, w, w / 2, h / 2, -0.1, 0.01, 0, 0]),
+    )
+    write_photos(tmp_path / "images")
+    found = survey(tmp_path, 1)
+    before, after = SIZES[0], next(s.size for s in found.sources if s.stored == SIZES[0])
+    assert before != after
+    what = the("distortion", found).what
+    assert f"5 photos, {before[0]} x {before[1]} to {after[0]} x {after[1]}" in what
+
+
+def test_a_camera_far_from_the_others_is_named(found):
+    def away(row: int, pose: np.ndarray) -> np.ndarray:
+        pose[:, 3] += 1000 * (row == 4)
+        return pose
+
+    assert found.names[4] in the("far-cameras", changed(found, away)).what
+
+
+def test_cameras_that_only_turned(found):
+    middle = found.centers.mean(axis=0)
+
+    def turned(_: int, pose: np.ndarray) -> np.ndarray:
+        pose[:, 3] = middle + 1e-3 * (pose[:, 3] - middle)
+        return pose
+
+    assert "no depth can be told" in the("one-place", changed(found, turned)).what
+
+
+def test_focal_lengths_of_other_worlds(found):
+    lens = found.prepared.lenses[2]
+    lenses = [*found.prepared.lenses]
+    lenses[2] = replace(lens, fx=5 * lens.fx, fy=5 * lens.fy)
+    odd = replace(found, prepared=replace(found.prepared, lenses=lenses))
+    assert found.names[2] in the("unlike-focal-lengths", odd).what
+
+
+def test_views_without_points_are_named(found):
+    def averted(row: int, pose: np.ndarray) -> np.ndarray:
+        if row == 3:
+            pose[:, [0, 2]] *= -1
+        return pose
+
+    what = the("views-without-points", changed(found, averted)).what
+    assert what.startswith("1 view shows no point")
+    assert found.names[3] in what
+
+
+def behind(found: Survey, count: int) -> np.ndarray:
+    """Points behind all cameras, far off."""
+    backwards = found.prepared.scene.frames[5].camera_to_world[:, 2]
+    return found.centers.mean(axis=0) + 1000 * backwards + found.points[:count]
+
+
+def test_points_of_another_model_are_seen_by_no_view(found):
+    said = names(findings_of(changed(found, points=behind(found, POINTS))))
+    assert "no-view-sees-points" in said
+    assert "views-without-points" not in said
+    assert "unseen-points" not in said
+
+
+def test_views_with_few_points_come_with_their_number(found):
+    sparse = changed(found, points=found.points[:8])
+    assert "views-with-few-points" in names(findings_of(sparse))
+    assert "8" in the("few-points", sparse).what
+
+
+# Points
+
+
+def test_points_far_off_are_counted(found):
+    points = found.points.copy()
+    points[:2] = [[1e6, 0, 0], [0, 1e6, 0]]
+    assert the("far-points", changed(found, points=points)).what.startswith("2 points lie")
+
+
+def test_points_in_no_picture_are_counted(found):
+    points = np.concatenate([found.points, behind(found, 150)])
+    what = the("unseen-points", changed(found, points=points)).what
+    assert what.startswith("20% of the points")
+    assert "20% behind every camera" in what
+
+
+def test_geo_referenced_scenes_are_noted(tmp_path):
+    write_model(tmp_path / "sparse/0", points=POINTS, offset=5e6, params=wide)
+    write_photos(tmp_path / "images")
+    report = examine(tmp_path)
+    assert names(report.findings) == ["mixed-sizes", "far-origin"]

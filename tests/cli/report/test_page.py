@@ -1,0 +1,248 @@
+"""The report's page, from made-up runs: what it says, that it is safe, and that it needs nothing else."""
+
+import base64
+import dataclasses
+import hashlib
+import re
+import shlex
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+from abcd_ns.cli.report import held_out as held_out_module
+from abcd_ns.cli.report.blocks import describe_blocks
+from abcd_ns.cli.report.charts import smoothed
+from abcd_ns.cli.report.held_out import HeldOut, data_uri, pick
+from abcd_ns.cli.report.options import changed_options, training_command
+from abcd_ns.cli.report.page import render_page, sparkline
+from abcd_ns.cli.report.plan import make_plan, push_apart
+from abcd_ns.cli.report.svg import DARK
+from abcd_ns.lab.runs.evaluate import Drawn, HeldOutView
+from tests.cli.report.runs import made_up_held_out, made_up_run, made_up_score, made_up_settings
+
+HOSTILE = "</title></style><script>alert(1)</script>\"'><img src=http://evil/x onerror=alert(2)>{{ 7*7 }}"
+
+
+class Page(HTMLParser):
+    """Elements, and the text in each kind of them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.texts: dict[str, list[str]] = {}
+        self._open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.elements.append((tag, dict(attrs)))
+        self.texts.setdefault(tag, []).append("")
+        self._open.append(tag)
+
+    def handle_startendtag(self, tag, attrs) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag) -> None:
+        if tag in self._open:
+            while self._open.pop() != tag:
+                pass
+
+    def handle_data(self, data) -> None:
+        for tag in set(self._open):
+            self.texts[tag][-1] += data
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def page_of(tmp_path, held_out: HeldOut | None = None, notes=(), **settings) -> tuple[str, Page]:
+    run = made_up_run(tmp_path, **settings)
+    plan = make_plan(run.checkpoint.tree, run.checkpoint.means)
+    text = render_page(run, held_out, plan, list(notes))
+    return text, Page(text)
+
+
+def test_the_headline_says_what_was_measured(tmp_path):
+    text, page = page_of(tmp_path, made_up_held_out())
+    assert page.texts["h1"] == ["made-up"]
+    said = [re.sub(r"\s+", " ", found).strip() for found in page.texts["dd"]]
+    for value in ("24.00dB", "composited 23.50", "0.800", "45.0dB", "330", "40", "16.0 s", "19% for layers"):
+        assert value in said
+    assert "not ended: still running, or broken off" in text
+    assert "2026-01-02 03:04 UTC" in text
+
+
+def test_without_pictures_the_last_evaluation_of_the_log_stands_in(tmp_path):
+    text, page = page_of(tmp_path, None, ["the photos are gone"])
+    assert "24.50dB" in [found.strip() for found in page.texts["dd"]]
+    assert "the photos are gone" in text
+    assert page.all("img") == []
+
+
+def test_names_are_text_wherever_they_come_from(tmp_path):
+    options = {**made_up_settings().options, "pipeline.training.background": HOSTILE, HOSTILE: HOSTILE}
+    hostile = {"scene": HOSTILE, "method": HOSTILE, "data": HOSTILE, "options": options}
+    text, page = page_of(tmp_path, made_up_held_out(HOSTILE), [HOSTILE], **hostile)
+    assert page.texts["h1"] == [HOSTILE]
+    assert page.texts["title"][0].startswith(HOSTILE)
+    assert len(page.all("script")) == 1
+    assert not any(name.startswith("on") for _, attributes in page.elements for name in attributes)
+    assert "<script>alert" not in text
+    assert all(image["src"].startswith("data:") for image in page.all("img"))
+
+
+def test_nothing_is_fetched_from_anywhere(tmp_path):
+    text, page = page_of(tmp_path, made_up_held_out())
+    for tag, attributes in page.elements:
+        for name in ("src", "href", "xlink:href", "data", "action", "srcset", "poster"):
+            assert re.match(r"data:|#", attributes.get(name) or "#"), (tag, name)
+    outside = re.sub(r"data:[^\"')]*", "", text)
+    assert "url(" not in re.sub(r"url\(#", "", outside)
+    for word in ("@import", "http://", "https://", "fetch(", "XMLHttpRequest", "WebSocket"):
+        assert word not in outside
+
+
+def test_only_the_pages_own_script_may_run(tmp_path):
+    _, page = page_of(tmp_path, made_up_held_out())
+    (policy,) = (meta["content"] for meta in page.all("meta") if "http-equiv" in meta)
+    digest = base64.b64encode(hashlib.sha256(page.texts["script"][0].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in policy
+    assert "default-src 'none'" in policy
+
+
+def test_ids_are_unique_and_references_lead_somewhere(tmp_path):
+    text, page = page_of(tmp_path, made_up_held_out())
+    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    wanted = re.findall(r"url\(#([^)]+)\)", text) + re.findall(r'href="#([^"]+)"', text)
+    wanted += [attributes["aria-labelledby"] for attributes in page.all("section")]
+    assert wanted
+    assert set(wanted) <= set(ids)
+
+
+def test_charts_are_all_there_and_follow_the_theme(tmp_path):
+    text, page = page_of(tmp_path, made_up_held_out())
+    labels = [svg["aria-label"] for svg in page.all("svg") if svg.get("class") != "spark"]
+    for title in ("Quality", "Visits", "Gaussians", "Quality by block", "Memory", "Budgets", "From above"):
+        assert any(label.startswith(f"Chart: {title}.") for label in labels)
+    for light, dark in DARK.items():
+        assert f"--c-{light[1:]}: {dark};" in text
+    drawn = "".join(re.findall(r"<svg.*?</svg>", text, re.DOTALL))
+    assert re.findall(r"(?:stroke|fill): #000000", drawn) == []
+    assert "var(--c-0072b2, #0072b2)" in drawn
+
+
+def test_a_visit_says_what_it_was_where_the_pointer_is(tmp_path):
+    _, page = page_of(tmp_path)
+    assert "block 2, sweep 1: 4.0 s from 8.0 s on, 25% of it for layers, 22.00 dB" in page.texts["title"]
+    assert "warm-up of the whole scene, 4.0 s" in page.texts["title"]
+
+
+def test_pictures_can_be_compared_by_keyboard_and_are_described(tmp_path):
+    _, page = page_of(tmp_path, made_up_held_out())
+    (slider,) = page.all("input")
+    assert slider["type"] == "range"
+    assert "0000.png" in slider["aria-label"]
+    assert all(image["alt"] for image in page.all("img"))
+
+
+def test_blocks_have_a_row_each(tmp_path):
+    _, page = page_of(tmp_path)
+    rows = [re.sub(r"\s+", " ", found) for found in page.texts["tr"]]
+    assert sum("trained" in row and "200" in row for row in rows) == 3
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
+def test_shown_views_reach_from_the_best_to_the_worst(count):
+    scores = [made_up_score(row, psnr) for row, psnr in enumerate([21.0, 25.0, 23.0, 20.0, 24.0])]
+    found = pick(scores, count)
+    if count == 1:
+        assert found == {2: "median"}
+    else:
+        rows = list(found)
+        assert (rows[0], rows[-1]) == (1, 3)
+        assert (found[1], found[3]) == ("best", "worst")
+        ranks = [scores[row].psnr_merged for row in rows]
+        assert ranks == sorted(ranks, reverse=True)
+    assert len(found) == min(count, 5)
+    assert pick(scores, 0) == {}
+    assert pick([], 3) == {}
+
+
+def test_pictures_of_a_page_are_reduced_to_a_few_megapixels(monkeypatch):
+    monkeypatch.setattr(held_out_module, "PAGE_PIXELS", 3 * 2 * 100)
+    noise = torch.rand(40, 60, 3, generator=torch.Generator().manual_seed(0))
+    drawn = Drawn(HeldOutView(0, "a.png", None, noise), noise, noise)
+    shown = held_out_module._show(drawn, made_up_score(0, 20.0), "best", 2)
+    assert shown.width * shown.height <= 110
+    assert shown.width / shown.height == pytest.approx(1.5, rel=0.15)
+
+
+@pytest.mark.parametrize("lossless", [True, False])
+def test_pictures_stand_in_the_page_itself(lossless):
+    picture = np.full((8, 8, 3), 200, np.uint8)
+    kind, _, content = data_uri(picture, lossless).partition(";base64,")
+    assert kind == f"data:image/{'png' if lossless else 'jpeg'}"
+    assert base64.b64decode(content)[:2] == (b"\x89P" if lossless else b"\xff\xd8")
+
+
+def test_changed_settings_and_the_command_that_sets_them():
+    options = made_up_settings().options
+    changed = {"pipeline.blocks": 4, "pipeline.max_seconds": 60.0, "timestamp": "now", "output_dir": "x"}
+    settings = made_up_settings(options={**options, **changed}, data="my data; rm -rf")
+    found = {option.name: (option.value, option.default) for option in changed_options(settings)}
+    assert found == {"pipeline.blocks": ("4", "0"), "pipeline.max_seconds": ("60.0", "None")}
+    assert shlex.split(training_command(settings).replace("\\\n", "")) == [
+        "ns-train", "abcd", "--data", "my data; rm -rf",
+        "--pipeline.blocks", "4", "--pipeline.max-seconds", "60.0",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("method", ["abcd", "abcd-paper", "abcd-monolithic", "abcd-exact"])
+def test_a_method_as_it_is_has_no_changed_settings(method):
+    assert changed_options(made_up_settings(method)) == []
+
+
+def test_an_unknown_method_is_told_without_defaults():
+    settings = made_up_settings("my-own")
+    assert changed_options(settings) == []
+    assert training_command(settings) == "ns-train my-own --data made-up"
+
+
+def test_states_of_blocks_say_why_one_was_not_trained(tmp_path):
+    run = made_up_run(tmp_path)
+    story = dataclasses.replace(run.story, visits=run.story.visits[:2])
+    assert [block.state for block in describe_blocks(dataclasses.replace(run, story=story))] == [
+        "trained", "in the warm-up only", "in the warm-up only",
+    ]  # fmt: skip
+    jointly = dataclasses.replace(run, story=dataclasses.replace(story, visits=()))
+    assert {block.state for block in describe_blocks(jointly)} == {"trained in every step"}
+    without = dataclasses.replace(run, checkpoint=None)
+    assert [(block.number, block.gaussians) for block in describe_blocks(without)] == [
+        (1, None), (2, None), (3, None),
+    ]  # fmt: skip
+
+
+def test_numbers_on_the_plan_do_not_cover_each_other():
+    places = push_apart([np.zeros(2)] * 5 + [np.ones(2)], 0.1)
+    distances = np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(6, 1)]
+    assert distances.min() > 0.09
+    assert np.linalg.norm(places[5] - 1) < 0.01
+
+
+def test_smoothing_keeps_the_ends_and_a_straight_line():
+    points = [(float(k), 2.0 * k) for k in range(100)]
+    assert smoothed(points) == [(x, pytest.approx(y)) for x, y in points]
+    assert smoothed([(0.0, 5.0)]) == [(0.0, 5.0)]
+
+
+def test_a_sparkline_rises_where_values_do():
+    (points,) = re.findall(r'points="([^"]+)"', sparkline([20.0, 24.0]))
+    (_, first), (_, last) = (map(float, point.split(",")) for point in points.split())
+    assert last < first
+    assert sparkline([]) == ""
+    assert "nan" not in sparkline([20.0])
+    (noise,) = re.findall(r'points="([^"]+)"', sparkline([20.0, 20.01]))
+    heights = [float(point.split(",")[1]) for point in noise.split()]
+    assert abs(heights[0] - heights[1]) < 1

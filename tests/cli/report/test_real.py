@@ -1,0 +1,191 @@
+"""`abcd report` on runs that were really trained, whole and damaged ones."""
+
+import json
+import os
+import pickle
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from abcd_ns import methods
+from abcd_ns.cli import main as cli
+from abcd_ns.cli.report.command import report
+from abcd_ns.cli.report.run_folder import load_pipeline, open_run
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.evaluate import mean_psnr
+from abcd_ns.nerfstudio.run.run_log import LOG_FILE
+from abcd_ns.nerfstudio.settings import SETTINGS_FILE
+from tests.nerfstudio.test_training import configure, run
+from tests.reference.colmap_scene import HELD_OUT, write_scene
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """The folder of a run, with its data beside it."""
+    place = tmp_path_factory.mktemp("place")
+    trainer = run(configure(write_scene(place / "wall"), place / "out"))
+    return Path(trainer.base_dir)
+
+
+@pytest.fixture
+def copied(trained, tmp_path) -> Path:
+    """The run again, to be damaged."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+class Canary:
+    """Unpickled, or made by an unsafe yaml loader, it leaves a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_a_run_becomes_one_page(trained, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    assert report(trained, out=out, pictures=2) == 0
+    page = out.read_text()
+    assert page.count('type="range"') == 2
+    assert len(re.findall(r'src="data:image/png', page)) == 6
+    assert len(re.findall(r"<tr><th scope=\"row\">\d", page)) == 3
+    assert "--max-num-iterations 36" in page
+    assert f"Of {HELD_OUT} views" in page
+    assert str(out) in capsys.readouterr().out
+    assert out.stat().st_size < 1 << 20
+
+
+def test_the_model_that_is_drawn_is_the_one_that_was_trained(trained):
+    opened = open_run(trained)
+    pipeline = load_pipeline(opened, opened.checkpoint)
+    saved = torch.load(opened.checkpoint.path, weights_only=True)["pipeline"]
+    assert torch.equal(pipeline.model.merged().means, saved["_model.gauss_params.means"])
+    assert pipeline.config.blocks == 3
+    options = opened.settings.options
+    assert options["pipeline.training.layers"] is True
+    assert options["pipeline.max_seconds"] is None
+    assert (options["pipeline.blocks"], type(options["pipeline.blocks"])) == (3, int)
+    assert mean_psnr(pipeline) > 14
+    assert opened.checkpoint.step == opened.story.step == 36
+
+
+def test_the_page_lies_in_the_runs_folder_unless_told_otherwise(copied):
+    assert cli.main(["report", str(copied / "config.yml"), "--pictures", "0"]) == 0
+    first = (copied / "report.html").read_text()
+    assert "<input" not in first
+    assert cli.main(["report", str(copied), "--pictures", "1"]) == 0
+    assert "<input" in (copied / "report.html").read_text()
+
+
+def test_no_object_is_made_of_what_a_folder_says(copied, tmp_path):
+    bait = f"!!python/object/apply:os.mkdir ['{tmp_path / 'yaml'}']"
+    (copied / "config.yml").write_text(bait)
+    report(copied, pictures=0)
+    checkpoint = next((copied / "nerfstudio_models").iterdir())
+    content = {"step": 35, "pipeline": Canary(tmp_path / "pickle")}
+    torch.save(content, checkpoint)
+    with pytest.raises(UserError, match=r"step-000000035\.ckpt cannot be read"):
+        report(copied)
+    checkpoint.write_bytes(pickle.dumps(content))
+    with pytest.raises(UserError, match=r"step-000000035\.ckpt cannot be read"):
+        report(copied)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+def test_where_the_photos_are_gone_the_page_says_so_and_has_the_rest(copied, capsys):
+    settings = json.loads((copied / "abcd" / SETTINGS_FILE).read_text())
+    (copied / "abcd" / SETTINGS_FILE).write_text(json.dumps({**settings, "data_path": "/absent/wall"}))
+    assert report(copied) == 0
+    page = (copied / "report.html").read_text()
+    assert "Held-out views could not be drawn" in page
+    assert "Chart: From above" in page
+    assert "/absent/wall" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_run_that_is_still_going_on_has_a_page(copied):
+    shutil.rmtree(copied / "nerfstudio_models")
+    log = copied / "abcd" / LOG_FILE
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(lines[: len(lines) // 2]) + '{"kind": "sam')
+    assert report(copied) == 0
+    page = (copied / "report.html").read_text()
+    assert "There is no checkpoint yet" in page
+    assert "not ended" in page
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: (folder / "abcd" / SETTINGS_FILE).unlink(), "is no run with a log"),
+        (lambda folder: (folder / "abcd" / LOG_FILE).unlink(), r"log\.jsonl does not exist"),
+        (lambda folder: (folder / "abcd" / SETTINGS_FILE).write_text("{"), r"settings\.json is not JSON"),
+        (
+            lambda folder: (folder / "abcd" / LOG_FILE).write_text('{"kind": "magic"}\n'),
+            r"log\.jsonl, line 1 is of the unknown kind 'magic'",
+        ),
+        (
+            lambda folder: next((folder / "nerfstudio_models").iterdir()).write_bytes(b""),
+            r"\.ckpt cannot be read",
+        ),
+        (
+            lambda folder: (folder / "abcd" / "store" / "manifest.json").write_text("{}"),
+            r"manifest\.json is not the manifest",
+        ),
+    ],
+)
+def test_what_is_damaged_is_named_and_nothing_is_written(copied, spoil, message):
+    spoil(copied)
+    with pytest.raises(UserError, match=message):
+        report(copied)
+    assert not (copied / "report.html").exists()
+
+
+def test_options_that_this_version_has_not_are_named(copied):
+    path = copied / "abcd" / SETTINGS_FILE
+    settings = json.loads(path.read_text())
+    for name, value, message in (
+        ("pipeline.training.magic", 1, "there is no option 'training.magic'"),
+        ("pipeline.training.batch", "many", "training.batch is 'many'; it must be a whole number"),
+    ):
+        path.write_text(json.dumps({**settings, "options": {**settings["options"], name: value}}))
+        opened = open_run(copied)
+        with pytest.raises(UserError, match=message):
+            load_pipeline(opened, opened.checkpoint)
+
+
+def test_a_folder_above_the_run_gets_a_hint(trained):
+    with pytest.raises(UserError, match=f"did you mean {trained}"):
+        report(trained.parent)
+    with pytest.raises(UserError, match="there is no such folder"):
+        report(trained / "nothing")
+
+
+def test_files_of_something_else_are_left_alone(trained, tmp_path):
+    mine = tmp_path / "thesis.html"
+    mine.write_text("<p>mine</p>")
+    with pytest.raises(UserError, match="is no page of this command"):
+        report(trained, out=mine)
+    assert mine.read_text() == "<p>mine</p>"
+    with pytest.raises(UserError, match="is a folder"):
+        report(trained, out=tmp_path)
+    with pytest.raises(UserError, match="does not exist"):
+        report(trained, out=tmp_path / "absent" / "page.html")
+    with pytest.raises(UserError, match="--pictures is -1"):
+        report(trained, pictures=-1)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [methods.abcd_monolithic, methods.abcd_exact, methods.abcd_partition],
+    ids=lambda m: m.config.method_name,
+)
+def test_every_way_to_train_has_a_page(tmp_path, method):
+    trainer = run(configure(write_scene(tmp_path / "wall"), tmp_path / "out", method, steps=8))
+    assert report(Path(trainer.base_dir), pictures=1) == 0
+    page = (Path(trainer.base_dir) / "report.html").read_text()
+    assert ("ordering gap" in page) == (method is not methods.abcd_monolithic)
+    assert ("trained in every step" in page) == (method is methods.abcd_exact)

@@ -1,0 +1,76 @@
+"""Reading a run's log: what comes back, and what is refused by name."""
+
+import json
+
+import pytest
+
+from abcd_ns.cli.report.story import Story, read_story
+from abcd_ns.lab.runs.records import RecordError
+from tests.cli.report.runs import TRAINING, line, log_lines, write_log
+
+
+@pytest.fixture
+def story(tmp_path) -> Story:
+    return read_story(write_log(tmp_path / "log.jsonl", log_lines()))
+
+
+def test_visits_are_joined_from_their_beginning_and_end(story):
+    assert [visit.block for visit in story.visits] == [None, 0, 1, 2]
+    assert [(visit.began, visit.ended) for visit in story.visits] == [(0, 4), (4, 8), (8, 12), (12, 16)]
+    assert all(visit.done for visit in story.visits)
+    assert story.layer_seconds == 3.0
+    assert [visit.psnr for visit in story.of_block(1)] == [22.0]
+    assert (story.step, story.seconds, story.blocks, story.gaussians) == (40, 16.0, 3, 330)
+    assert story.end is None
+    assert [story.seconds_at(step) for step in (0, 5, 25, 99)] == [0.0, 2.0, 10.0, 16.0]
+
+
+def test_a_visit_without_an_end_lasts_until_the_log_ends(tmp_path):
+    lines = [*log_lines(), line("visit", 40, 16.0, visit=4, block=1), line("sample", 45, 19.0)]
+    visit = read_story(write_log(tmp_path / "log.jsonl", lines)).visits[-1]
+    assert (visit.began, visit.ended, visit.done) == (16.0, 19.0, False)
+
+
+def test_a_visit_whose_beginning_is_lost_began_as_long_ago_as_it_says(tmp_path):
+    end = line("visit end", 60, 30.0, visit=7, visit_seconds=4.5)
+    story = read_story(write_log(tmp_path / "log.jsonl", [line("training", 50, 27.0, **TRAINING), end]))
+    assert [(visit.number, visit.began, visit.views) for visit in story.visits] == [(7, 25.5, None)]
+
+
+def test_a_log_cut_anywhere_is_read_up_to_its_last_whole_line(tmp_path):
+    path = write_log(tmp_path / "log.jsonl", log_lines()[:6])
+    whole = path.read_bytes()
+    first = whole.index(b"\n") + 1
+    for length in range(first, len(whole)):
+        path.write_bytes(whole[:length])
+        lines = whole[:length].count(b"\n")
+        assert read_story(path).step == json.loads(whole.split(b"\n")[lines - 1])["step"]
+    path.write_bytes(whole[: first - 1])
+    with pytest.raises(RecordError, match="does not say when training began"):
+        read_story(path)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("no json", "line 3 is damaged"),
+        ("[1, 2]", "line 3 is of the unknown kind None"),
+        ('{"kind": ["visit"]}', "line 3 is of the unknown kind"),
+        (line("sample", 1, 1.0).replace("sample", "simple"), "line 3 is of the unknown kind 'simple'"),
+        (line("sample", 1, 1.0).replace("rss_bytes", "rss"), "line 3 has an unknown field 'rss'"),
+        (line("held out", 1, 1.0).replace("20.0", "NaN"), "line 3 is damaged .NaN"),
+        (line("held out", 1, 1.0).replace("20.0", '"much"'), "line 3: psnr must be a number"),
+        (line("training", 1, 1.0, **{**TRAINING, "schema": 99}), "line 3 has schema 99"),
+    ],
+)
+def test_a_line_that_is_none_is_named(tmp_path, bad, message):
+    lines = log_lines()
+    path = write_log(tmp_path / "log.jsonl", [*lines[:2], bad, *lines[2:]])
+    with pytest.raises(RecordError, match=message) as refused:
+        read_story(path)
+    assert str(path) in str(refused.value)
+
+
+def test_a_missing_log_is_named(tmp_path):
+    with pytest.raises(RecordError, match=r"absent\.jsonl does not exist"):
+        read_story(tmp_path / "absent.jsonl")

@@ -1,0 +1,186 @@
+"""`abcd demo`: the right commands in the right order, and what is said when one of them fails.
+
+Here nerfstudio's commands are scripts that leave what the real ones do.
+"""
+
+import json
+import os
+import stat
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from abcd_ns.cli import demo as demo_module
+from abcd_ns.cli.demo import count_vertices, demo
+from abcd_ns.errors import UserError
+
+STAND_IN = """#!{python}
+import json, os, pathlib, sys
+from PIL import Image
+name, words = pathlib.Path(sys.argv[0]).name, sys.argv[1:]
+here = pathlib.Path(sys.argv[0]).parent
+with open(here / "calls.jsonl", "a") as file:
+    file.write(json.dumps([name, *words]) + "\\n")
+print("output of", name)
+if name in os.environ.get("BROKEN", "").split():
+    sys.exit(3)
+
+def given(flag):
+    return pathlib.Path(words[words.index(flag) + 1])
+
+if name == "ns-train":
+    run = given("--output-dir") / given("--experiment-name") / words[0] / given("--timestamp")
+    run.mkdir(parents=True)
+    (run / "config.yml").write_text("")
+elif name == "ns-eval":
+    assert given("--load-config").is_file()
+    folder = given("--render-output-path")
+    folder.mkdir(parents=True, exist_ok=True)
+    for row in range(5):
+        pair = Image.new("RGB", (64, 24), (200, 100, 50))
+        pair.paste((100, 100, 50), (32, 0, 64, 24))
+        pair.save(folder / f"eval_img_{{row:04d}}.png")
+    given("--output-path").write_text(json.dumps({{"results": {{"psnr": 21.5, "ssim": 0.75}}}}))
+elif name == "ns-export":
+    header = b"ply\\nformat binary_little_endian 1.0\\nelement vertex 1234\\nproperty float x\\nend_header\\n"
+    (given("--output-dir") / given("--output-filename")).write_bytes(header)
+elif name == "abcd-report":
+    assert (pathlib.Path(words[0]) / "config.yml").is_file()
+    given("--out").write_text("a page")
+"""
+
+
+class StandIns:
+    """nerfstudio's commands beside a Python of their own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir()
+        for name in ("ns-train", "ns-eval", "ns-export", "abcd-report"):
+            path = folder / name
+            path.write_text(STAND_IN.format(python=sys.executable))
+            path.chmod(path.stat().st_mode | stat.S_IXUSR)
+
+    def calls(self) -> list[list[str]]:
+        path = self.folder / "calls.jsonl"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+@pytest.fixture
+def commands(tmp_path, monkeypatch) -> StandIns:
+    stand_ins = StandIns(tmp_path / "bin")
+    monkeypatch.setattr(demo_module, "_tool", lambda name: str(stand_ins.folder / name))
+    real = demo_module._abcd
+    stand_in = {"report": [str(stand_ins.folder / "abcd-report")]}
+    monkeypatch.setattr(demo_module, "_abcd", lambda command: stand_in.get(command) or real(command))
+    small = {"courts": 1, "views_per_court": 2, "width": 32, "height": 24, "points_per_court": 50}
+    monkeypatch.setattr(demo_module, "SCENE", small)
+    monkeypatch.setenv("COLUMNS", "200")
+    return stand_ins
+
+
+def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capfd):
+    out = tmp_path / "demo"
+
+    assert demo(out=out, seconds=5.0, blocks=3) == 0
+
+    assert (out / "scene" / "sparse" / "0").is_dir()
+    assert [name for name, *_ in commands.calls()] == ["ns-train", "ns-eval", "ns-export", "abcd-report"]
+    assert (out / "report.html").read_text() == "a page"
+    train = commands.calls()[0]
+    assert train[1:4] == ["abcd", "--data", str((out / "scene").resolve())]
+    for flag, value in (
+        ("--pipeline.blocks", "3"),
+        ("--pipeline.max-seconds", "5"),
+        ("--vis", "tensorboard"),
+        ("--viewer.quit-on-train-completion", "True"),
+    ):
+        assert train[train.index(flag) + 1] == value
+    assert commands.calls()[2][1] == "gaussian-splat"
+    printed = capfd.readouterr().out
+    assert f"$ abcd synth {out / 'scene'} --courts 1" in printed
+    files = (str(out / "splat.ply"), str(out / "report.html"))
+    for part in ("21.50 dB", "0.750", "1,234", "GiB", *files, "ns-viewer --load-config"):
+        assert part in printed
+    assert "output of ns-train" in printed
+    assert "output of ns-eval" not in printed
+    assert "output of ns-eval" in (out / "logs" / "ns-eval.log").read_text()
+
+
+@pytest.mark.usefixtures("commands")
+def test_pictures_are_photo_picture_and_error_of_views_far_apart(tmp_path, capfd):
+    demo(out=tmp_path / "demo", seconds=1.0)
+    paths = sorted((tmp_path / "demo" / "pictures").iterdir())
+    assert [path.name for path in paths] == ["view-0000.png", "view-0002.png", "view-0004.png"]
+    printed = capfd.readouterr().out
+    for path in paths:
+        assert str(path) in printed
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
+        for colour in ((200, 100, 50), (100, 100, 50)):
+            assert (pixels == colour).all(axis=1).sum() > 10_000
+
+
+@pytest.mark.parametrize(
+    ("broken", "where"),
+    [
+        ("ns-train", "its output above"),
+        ("ns-eval", "ns-eval.log"),
+        ("ns-export", "ns-export.log"),
+        ("abcd-report", "report.log"),
+    ],
+)
+def test_a_failing_command_ends_the_demo_in_one_line(commands, tmp_path, monkeypatch, capfd, broken, where):
+    monkeypatch.setenv("BROKEN", broken)
+
+    assert demo(out=tmp_path / "demo", seconds=1.0) == 1
+
+    last = capfd.readouterr().out.strip().splitlines()[-1]
+    assert last.startswith(f"error: {broken.removeprefix('abcd-')} failed with exit code 3; see ")
+    assert where in last
+    assert commands.calls()[-1][0] == broken
+
+
+@pytest.mark.usefixtures("commands")
+def test_a_second_demo_trains_anew_on_the_same_scene(tmp_path, monkeypatch):
+    stamps = iter(("first", "second"))
+    monkeypatch.setattr(demo_module.time, "strftime", lambda _: next(stamps))
+    out = tmp_path / "demo"
+    assert demo(out=out, seconds=1.0) == demo(out=out, seconds=1.0) == 0
+    assert sorted(path.name for path in (out / "training" / "demo" / "abcd").iterdir()) == ["first", "second"]
+
+
+def test_a_folder_of_something_else_is_left_alone(commands, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("")
+    with pytest.raises(UserError, match="is not empty and is not of this command"):
+        demo(out=tmp_path / "mine")
+    assert os.listdir(tmp_path / "mine") == ["thesis.tex"]
+    with pytest.raises(UserError, match="is a file"):
+        demo(out=tmp_path / "mine" / "thesis.tex")
+    assert commands.calls() == []
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"seconds": 0.0}, "--seconds is 0"), ({"blocks": 0}, "--blocks is 0")]
+)
+def test_options_out_of_range_are_refused(tmp_path, options, message):
+    with pytest.raises(UserError, match=message):
+        demo(out=tmp_path / "demo", **options)
+    assert not (tmp_path / "demo").exists()
+
+
+def test_a_missing_nerfstudio_is_said_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    with pytest.raises(UserError, match="ns-train is missing; install nerfstudio"):
+        demo_module._tool("ns-train")
+
+
+@pytest.mark.parametrize("content", [b"ply\nend_header\n", b"", b"no ply\n"])
+def test_a_ply_without_vertices_is_noticed(tmp_path, content):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(ValueError, match="no header"):
+        count_vertices(tmp_path / "a.ply")

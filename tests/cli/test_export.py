@@ -1,0 +1,176 @@
+"""`abcd export`: what an independent reader finds in the files is the scene."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from abcd_ns.cli.export.command import TRANSFORMS, export
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.errors import UserError
+from tests.reference.scenes import random_gaussians
+
+BLOCKS = 5
+ROTATION = torch.linalg.qr(torch.tensor([[1.0, 2, 3], [-1, 1, 0.5], [0, 2, -1]], dtype=torch.float64))[0]
+ROTATION = ROTATION * torch.linalg.det(ROTATION).sign()
+FRAME = Frame(ROTATION, torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64), 0.04)
+
+
+@pytest.fixture
+def scene():
+    found = random_gaussians(300, sh_degree=3)
+    found.opacities[7] = -12.0  # no rasterizer draws it
+    return found
+
+
+@pytest.fixture
+def run(scene, tmp_path):
+    """A run's folder, as far as exporting goes."""
+    folder, tree = tmp_path / "run", build_kd(scene.means, BLOCKS)
+    folder.mkdir()
+    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
+        store.commit(blocks_at_rest(tree, scene), state=RunState().to_json())
+    matrix = torch.cat((FRAME.rotation, FRAME.translation[:, None]), dim=1)
+    (folder / TRANSFORMS).write_text(json.dumps({"transform": matrix.tolist(), "scale": FRAME.scale}))
+    return folder
+
+
+def read(path) -> np.ndarray:
+    return PlyData.read(str(path))["vertex"].data
+
+
+def positions(vertices) -> np.ndarray:
+    return np.stack([vertices[axis] for axis in "xyz"], axis=1)
+
+
+def by_position(vertices) -> np.ndarray:
+    return vertices[np.lexsort([vertices[axis] for axis in "xyz"])]
+
+
+def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, tmp_path):
+    assert export(run, out=tmp_path / "before.ply") == 0
+    with ParameterStore.open(run / "abcd/store") as store:
+        state = BlockState.from_tensors(*store.load(0))
+        store.commit({0: state[3:].to_tensors(), INBOX: state[:3].to_tensors()})
+    assert export(run, out=tmp_path / "after.ply") == 0
+    before, after = by_position(read(tmp_path / "before.ply")), by_position(read(tmp_path / "after.ply"))
+    assert np.array_equal(before, after)
+
+
+def test_in_the_runs_own_frame_every_value_is_what_is_stored(run, scene, tmp_path):
+    assert export(run, out=tmp_path / "scene.ply", frame="nerfstudio") == 0
+    found = by_position(read(tmp_path / "scene.ply"))
+    kept = scene[torch.arange(len(scene)) != 7]
+    kept = kept[torch.from_numpy(np.lexsort(kept.means.T.numpy()))]
+    assert np.array_equal(positions(found), kept.means.numpy())
+    assert np.array_equal(found["opacity"], kept.opacities[:, 0].numpy())
+    assert np.array_equal(found["scale_2"], kept.scales[:, 2].numpy())
+    assert np.array_equal(found["f_dc_1"], kept.features_dc[:, 1].numpy())
+    # Fifteen of red, fifteen of green, fifteen of blue.
+    assert np.array_equal(found["f_rest_17"], kept.features_rest[:, 2, 1].numpy())
+    quats = torch.nn.functional.normalize(kept.quats, dim=1)
+    assert np.allclose(found["rot_0"], quats[:, 0], atol=1e-6)
+
+
+def test_the_datas_frame_is_where_the_photos_were_posed(run, scene, tmp_path, capsys):
+    export(run, out=tmp_path / "scene.ply")
+    found = read(tmp_path / "scene.ply")
+    back = FRAME.points(torch.from_numpy(positions(found)))
+    distances = torch.cdist(back, scene.means.double()).min(dim=1).values
+    assert len(found) == len(scene) - 1
+    assert float(distances.max()) < 1e-5
+    own = read_own(run, tmp_path)
+    assert np.allclose(np.sort(found["scale_0"]), np.sort(own["scale_0"]) - math.log(FRAME.scale), atol=1e-5)
+    assert "299 Gaussians" in capsys.readouterr().out
+
+
+def read_own(run, tmp_path) -> np.ndarray:
+    export(run, out=tmp_path / "own.ply", frame="nerfstudio")
+    return read(tmp_path / "own.ply")
+
+
+def test_the_blocks_files_together_are_the_scene(run, tmp_path):
+    whole = by_position(read_own(run, tmp_path))
+    export(run, out=tmp_path / "parts", by_block=True, frame="nerfstudio")
+    parts = sorted((tmp_path / "parts").iterdir())
+    assert [path.name for path in parts] == [f"block-{n:04d}.ply" for n in range(BLOCKS)]
+    assert np.array_equal(by_position(np.concatenate([read(path) for path in parts])), whole)
+
+
+@pytest.mark.parametrize("frame", ["data", "nerfstudio"])
+def test_a_box_holds_what_lies_in_it(run, tmp_path, frame):
+    export(run, out=tmp_path / "whole.ply", frame=frame)
+    everything = positions(read(tmp_path / "whole.ply"))
+    low, high = np.quantile(everything, [0.2, 0.7], axis=0)
+    export(run, out=tmp_path / "box.ply", box=(*low, *high), frame=frame)
+    inside = ((everything >= low) & (everything < high)).all(axis=1)
+    found = positions(read(tmp_path / "box.ply"))
+    assert 0 < len(found) < len(everything)
+    assert np.array_equal(found, everything[inside])
+
+
+def test_what_is_exported_can_be_seen(run, tmp_path):
+    found = read_own(run, tmp_path)
+    assert (1 / (1 + np.exp(-found["opacity"].astype(np.float64))) >= MIN_ALPHA - 1e-9).all()
+
+
+def test_far_from_the_origin_lost_digits_are_told(run, tmp_path, capsys):
+    path = run / TRANSFORMS
+    far = json.loads(path.read_text())
+    for row, offset in zip(far["transform"], (5e5, 4e6, 100.0), strict=True):
+        row[3] -= offset
+    path.write_text(json.dumps(far))
+    export(run, out=tmp_path / "far.ply")
+    said = capsys.readouterr().out
+    assert "rounds positions to 0." in said
+    assert "--frame nerfstudio" in said
+
+
+def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path):
+    box = (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)
+    for words, options in {
+        "no Gaussian to export in this box": {"box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)},
+        "Y0 < Y1": {"box": box},
+    }.items():
+        with pytest.raises(UserError, match=words):
+            export(run, out=tmp_path / "new.ply", **options)
+    with pytest.raises(UserError, match="exists already"):
+        export(run, out=run)
+    with pytest.raises(UserError, match="no run of ABCD"):
+        export(tmp_path, out=tmp_path / "new.ply", frame="nerfstudio")
+    (run / TRANSFORMS).write_text("{}")
+    with pytest.raises(UserError, match="cannot be read"):
+        export(run, out=tmp_path / "new.ply")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+def test_a_run_in_its_warm_up_has_nothing_to_show_yet(run, tmp_path):
+    store_path = run / "abcd/store"
+    with ParameterStore.open(store_path) as store:
+        store.commit({}, state={})
+    with pytest.raises(UserError, match="warm-up"):
+        export(run, out=tmp_path / "new.ply")
+
+
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_shard_that_is_damaged_or_gone_is_one_line(run, tmp_path, gone):
+    shard = sorted((run / "abcd/store").glob("*.safetensors"))[1]
+    if gone:
+        shard.unlink()
+    else:
+        content = bytearray(shard.read_bytes())
+        content[-9] ^= 1
+        shard.write_bytes(content)
+    with pytest.raises(UserError, match="If the run is training, wait"):
+        export(run, out=tmp_path / "new.ply")
+    assert not (tmp_path / "new.ply").exists()

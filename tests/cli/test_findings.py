@@ -1,0 +1,70 @@
+"""Findings: how they look in a terminal, and that the document explains each of them."""
+
+import ast
+import io
+import re
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from abcd_ns.cli.findings import Finding, print_findings
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENT = (ROOT / "docs/troubleshooting.md").read_text()
+MAKERS = [*(ROOT / "abcd_ns/cli/check").glob("*.py"), *(ROOT / "abcd_ns/cli/doctor").glob("*.py")]
+LONG = "A sentence of many words that says what was found and why it matters. " * 3
+
+
+def printed(*findings: Finding, width: int = 80) -> list[str]:
+    stream = io.StringIO()
+    print_findings(findings, Console(file=stream, width=width))
+    return stream.getvalue().splitlines()
+
+
+def test_groups_are_titled_and_the_most_serious_comes_first():
+    lines = printed(
+        Finding("note", "n", "Nice."), Finding("error", "e", "Bad."), Finding("note", "m", "Too.")
+    )
+    assert lines == ["", "error", "  e: Bad.", "", "notes (2)", "  n: Nice.", "  m: Too."]
+
+
+def test_text_is_wrapped_and_errors_are_not():
+    warning = printed(Finding("warning", "w", LONG, LONG))
+    assert max(map(len, warning)) <= 80
+    assert sum(line.startswith("    -> ") for line in warning) == 1
+    assert all(line.startswith("    ") for line in warning[3:])
+    assert len(printed(Finding("error", "e", LONG.strip()))) == 3
+
+
+def test_names_of_files_are_no_markup():
+    name = "[red]a.png[/red] :smile:"
+    assert printed(Finding("note", "n", name))[-1] == f"  n: {name}"
+
+
+def names_in_code() -> set[str]:
+    """The second argument of every Finding(...) that check and doctor make."""
+    calls = (
+        node
+        for path in MAKERS
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding"
+    )
+    return {call.args[1].value for call in calls}
+
+
+def names_in_document() -> set[str]:
+    headings = re.findall(r"^#### (.+)$", DOCUMENT, re.MULTILINE)
+    return {name for heading in headings for name in heading.split(", ")}
+
+
+def test_the_document_explains_every_finding_and_no_other():
+    assert len(names_in_code()) > 30
+    assert names_in_document() == names_in_code()
+
+
+@pytest.mark.parametrize("link", re.findall(r"\]\(#([\w-]+)\)", DOCUMENT))
+def test_links_within_the_document_lead_somewhere(link):
+    headings = re.findall(r"^#+ (.+)$", DOCUMENT, re.MULTILINE)
+    anchors = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    assert link in anchors

@@ -1,0 +1,119 @@
+"""`abcd plan`: its figures add up, and what would not fit is said."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from rich.console import Console
+
+from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast, warnings_of
+from abcd_ns.cli.plan.forecast import Share, device_shares, disk_shares, views_of_blocks
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.train.memory import DeviceNeeds
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.room import GB, Room
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+FITS = (Share("something", 1),)
+
+
+def capture(count: int = 400) -> Capture:
+    points = random_gaussians(count).means
+    return Capture(points, torch.full((count, 3), 128, dtype=torch.uint8), ring_of_views(6))
+
+
+def test_views_of_blocks_counts_as_a_loop_over_points_does():
+    points, views = random_gaussians(60).means * 3, ring_of_views(5)
+    tree = build_kd(points, 6)
+    expected = [0] * 6
+    for view in views:
+        seen = set()
+        for point, block in zip(points, tree.assign(points).tolist(), strict=True):
+            x, y, z = (view.viewmat[:3, :3] @ point + view.viewmat[:3, 3]).tolist()
+            u, v = (float(view.K[k, k]) * at / z + float(view.K[k, 2]) for k, at in ((0, x), (1, y)))
+            if z > view.near and 0 <= u < view.width and 0 <= v < view.height:
+                seen.add(block)
+        for block in seen:
+            expected[block] += 1
+    assert views_of_blocks(tree, points, views) == tuple(expected)
+    assert 0 < sum(expected) < 30
+
+
+def test_a_forecast_adds_up():
+    found = forecast(capture(), Wanted(blocks=4, max_gaussians=1000, steps=100), Console(quiet=True))
+    assert (found.room.blocks, sum(found.points_of_block), len(found.views_of_block)) == (4, 400, 4)
+    assert found.batch == 4
+    assert found.seconds_per_step > 0
+    low, high = found.hours
+    assert low < high == pytest.approx(low * 1000 / 400)
+    needs = DeviceNeeds(48 * 36, 4, levels=3)  # where the CPU is the device, nothing else is kept there
+    assert sum(share.nbytes for share in found.device) == needs.bytes_for(250)
+    assert not found.warnings
+
+
+def test_a_device_budget_decides_how_many_blocks():
+    few, many = (
+        forecast(capture(), Wanted(max_gaussians=3_000_000, device_budget_gb=gb), Console(quiet=True))
+        for gb in (40, 3)
+    )
+    assert few.room.blocks_at_the_end == few.room.blocks == many.room.blocks == 1
+    assert many.room.blocks_at_the_end > 2
+    assert sum(share.nbytes for share in many.device) <= 3 * GB
+
+
+def test_large_photos_are_planned_for_as_they_are_trained_on():
+    small = capture()
+    large = [dataclasses.replace(view, width=2600, height=100) for view in small.views[:3]]
+    found = forecast(
+        dataclasses.replace(small, views=large), Wanted(device_budget_gb=0.15), Console(quiet=True)
+    )
+    assert 0 < found.room.crop_pixels < 260_000
+    assert sum(share.nbytes for share in found.device) <= 0.15 * GB
+    assert not found.warnings
+
+
+def test_a_device_keeps_layers_and_photos_besides():
+    limit = DeviceNeeds(100, 4).block_limit(GB)
+    room = Room(blocks=2, limit=limit, sole=10**9, budget=GB, gaussians=10**9, batch=4)
+    shares = device_shares(room, DeviceNeeds(100, 4))
+    assert [share.nbytes for share in shares[2:]] == [GB // 8, GB // 8]
+    assert GB - DeviceNeeds(100, 4).gaussian_bytes < sum(share.nbytes for share in shares) <= GB
+    alone = device_shares(dataclasses.replace(room, blocks=1), DeviceNeeds(100, 1, levels=0))
+    assert [share.nbytes for share in alone[2:]] == [0, GB // 8]
+
+
+def test_disk_holds_two_generations_and_a_checkpoint():
+    room = Room(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000, batch=4)
+    needs = DeviceNeeds(100, 1)
+    assert sum(share.nbytes for share in disk_shares(room, needs)) == 1000 * 236 * (2 * 3 + 1)
+    assert device_shares(room, needs)[0].nbytes == 1000 * needs.gaussian_bytes
+
+
+@pytest.mark.parametrize("where", ["device", "ram", "disk"])
+def test_what_does_not_fit_is_said_with_what_to_do(where):
+    shares = {"device": FITS, "ram": FITS, "disk": FITS, where: (Share("too much", 2**60),)}
+    (line,) = warnings_of(Room(2, 100, 100, GB, 100, 4), (5, 5), **shares)
+    assert {"device": "on the device", "ram": "of RAM", "disk": "of disk"}[where] in line
+    assert ": " in line
+
+
+def test_blocks_that_hardly_any_view_sees_are_counted():
+    (line,) = warnings_of(Room(3, 100, 100, GB, 100, 4), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
+    assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
+
+
+def test_the_screen_names_all_that_takes_room(capsys):
+    found = forecast(capture(), Wanted(blocks=4), Console(quiet=True))
+    print_forecast(found, Console(width=120))
+    shown = capsys.readouterr().out
+    for share in (*found.device, *found.ram, *found.disk):
+        assert share.what in shown
+    assert "views that see it" in shown
+    assert math.isfinite(found.hours[1])
+
+
+@pytest.mark.parametrize("option", [{"blocks": -1}, {"downscale": 0}, {"steps": 0}, {"max_gaussians": -5}])
+def test_options_out_of_range_are_refused(tmp_path, option):
+    with pytest.raises(UserError, match=next(iter(option)).replace("_", "-")):
+        plan(tmp_path, **option)

@@ -1,0 +1,125 @@
+"""`abcd poses`: photos alone become a data set, and what cannot is said."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from abcd_ns.cli.poses import command, mapping
+from abcd_ns.cli.poses.command import poses
+from abcd_ns.errors import UserError
+from tests.data.dataparser_scenes import parser
+
+WIDTH, HEIGHT, FOCAL = 400, 300, 290.0
+
+
+def corner_of_a_room(place: np.ndarray, textures: np.ndarray) -> Image.Image:
+    """A photo of three walls, papered with noise, from `place` towards where they meet, nearly."""
+    forward = np.array([0.3, 0.3, 0.3]) - place
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    rays = np.stack([x / FOCAL, y / FOCAL, np.ones_like(x)], axis=-1) @ axes
+    with np.errstate(divide="ignore"):
+        distance = np.where(rays < 0, -place / rays, np.inf)  # to the walls x = 0, y = 0 and z = 0
+    wall = distance.argmin(axis=-1)
+    hit = place + rays * distance.min(axis=-1)[..., None]
+    u, v = (np.take_along_axis(hit, ((wall + k) % 3)[..., None], axis=-1)[..., 0] for k in (1, 2))
+    grid = [np.clip(c * 100, 0, textures.shape[1] - 1.001) for c in (u, v)]
+    shades = np.stack([map_coordinates(texture, grid, order=1) for texture in textures])
+    grey = np.take_along_axis(shades, wall[None], axis=0)[0]
+    return Image.fromarray(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def places() -> dict[str, np.ndarray]:
+    """Where the photos are taken from, by name."""
+    angles = np.linspace(0.35, 1.25, 12)
+    return {
+        f"{n:02d}.png": np.array([3 * np.cos(a), 3 * np.sin(a), 1.2 + 0.1 * (n % 3)])
+        for n, a in enumerate(angles)
+    }
+
+
+@pytest.fixture(scope="module")
+def found(places, tmp_path_factory) -> Path:
+    """Photos, through `abcd poses`."""
+    data = tmp_path_factory.mktemp("found") / "scene"
+    (data / "images").mkdir(parents=True)
+    noise = np.random.default_rng(0).normal(size=(3, 400, 400))
+    smooth = sum(gaussian_filter(noise, (0, s, s)) * s for s in (1.5, 4, 10))
+    textures = np.clip(128 + 150 * smooth, 0, 255)
+    for name, place in places.items():
+        corner_of_a_room(place, textures).save(data / "images" / name)
+    assert poses(data) == 0
+    return data
+
+
+def test_cameras_are_where_they_were(places, found):
+    model = pycolmap.Reconstruction(str(found / "sparse" / "0"))
+    images = [model.image(i) for i in model.reg_image_ids()]
+    assert len(images) == len(places)
+    seen = np.array([image.projection_center() for image in images])
+    true = np.array([places[image.name] for image in images])
+    similarity = pycolmap.estimate_sim3d(seen, true)
+    moved = np.array([similarity * center for center in seen])
+    assert np.linalg.norm(moved - true, axis=1).max() < 0.03
+
+
+def test_the_focal_length_is_found_though_no_photo_tells_it(found):
+    (camera,) = pycolmap.Reconstruction(str(found / "sparse/0")).cameras.values()
+    assert camera.mean_focal_length() == pytest.approx(FOCAL, rel=0.03)
+
+
+def test_the_result_can_be_trained_on_and_nothing_else_is_left(found):
+    outputs = parser(found).get_dataparser_outputs("train")
+    assert len(outputs.image_filenames) == 10
+    assert len(outputs.metadata["points3D_xyz"]) > 100
+    assert sorted(path.name for path in found.iterdir()) == ["images", "sparse"]
+
+
+def test_an_earlier_model_is_not_overwritten(found):
+    with pytest.raises(UserError, match="exists already"):
+        poses(found)
+
+
+def write_blank(data: Path, count: int) -> None:
+    (data / "images").mkdir()
+    for number in range(count):
+        Image.new("RGB", (64, 48), (number, 90, 120)).save(data / "images" / f"{number}.png")
+
+
+def test_photos_that_show_nothing_are_refused_and_nothing_is_left(tmp_path):
+    write_blank(tmp_path, 4)
+    with pytest.raises(UserError, match="No two photos"):
+        poses(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "find_poses", None)
+    with pytest.raises(UserError, match="put the photos there"):
+        poses(tmp_path)
+    write_blank(tmp_path, 2)
+    with pytest.raises(UserError, match="has 2 photos"):
+        poses(tmp_path)
+    (tmp_path / "images" / "2.png").write_bytes(b"no picture")
+    with pytest.raises(UserError, match=r"2\.png"):
+        poses(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    write_blank(tmp_path, 3)
+    with pytest.raises(UserError, match="--lens EYE is no camera model"):
+        poses(tmp_path, lens="EYE")
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_a_process_that_dies_is_an_error_and_not_a_wait(tmp_path):
+    task = mapping.Task(tmp_path / "nowhere", ("a.png",), tmp_path, "OPENCV", True, "any")
+    with pytest.raises(mapping.MappingFailed):
+        mapping.find_poses(task, lambda _: None)

@@ -1,0 +1,82 @@
+"""`abcd train`: what is in the file is what `ns-train` is told."""
+
+import os
+from pathlib import Path
+
+import pytest
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
+from abcd_ns.cli import main as cli
+from abcd_ns.cli import train
+from abcd_ns.errors import UserError
+
+FOLDER = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = [path for path in sorted(FOLDER.glob("*.toml")) if "\nmethod = " in path.read_text()]
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """The command lines that would have taken the process's place."""
+    found = []
+    monkeypatch.setattr(os, "execv", lambda _, words: found.append(words[1:]))
+    return found
+
+
+def test_tables_become_dotted_names_and_later_words_count(tmp_path, told):
+    path = tmp_path / "mine.toml"
+    path.write_text('method = "abcd"\nvis = "tensorboard"\n[pipeline.training]\nheal = false\nwarmup = 0.5\n')
+    cli.main(["train", str(path), "--data", "garden"])
+    options = [
+        "--vis",
+        "tensorboard",
+        "--pipeline.training.heal",
+        "False",
+        "--pipeline.training.warmup",
+        "0.5",
+    ]
+    assert told == [["abcd", *options, "--data", "garden"]]
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_ns_train_takes_every_file_in_configs(path):
+    words = train.command_line(path)
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=[*words, "--pipeline.max-seconds", "77"])
+    assert config.method_name == words[0] == "abcd"
+    assert config.pipeline.max_seconds == 77
+    assert f"abcd train configs/{path.name} --data" in path.read_text()
+
+
+def test_the_examples_are_there():
+    assert [path.stem for path in CONFIGS] == ["cpu", "garden", "small-gpu"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("blocks = 3", "names no method"),
+        ("method = 3", "names no method"),
+        ("method = ", "cannot be read as TOML"),
+        ('method = "abcd"\n[pipeline]\nblocks = [1, 2]', "blocks is a list"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, told, text, message):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=message) as caught:
+        train.train([str(path)])
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not told
+
+
+def test_an_absent_file_is_refused(tmp_path, told):
+    assert cli.main(["train", str(tmp_path / "absent.toml")]) == 2
+    assert not told
+
+
+@pytest.mark.parametrize("words", [[], ["--help"]])
+def test_help_shows_how_to_use_it(words, told, capsys):
+    assert cli.main(["train", *words]) == 0
+    assert "abcd train configs/small-gpu.toml" in capsys.readouterr().out
+    assert not told

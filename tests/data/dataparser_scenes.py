@@ -1,0 +1,110 @@
+"""Small scenes as users have them, written through pycolmap, and how a parser is asked about them."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from abcd_ns.data.colmap_model import Z_UP, read_colmap
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.nerfstudio.dataparser import AbcdDataParser, AbcdDataParserConfig
+
+REAL = Path(os.environ.get("ABCD_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
+"""Where the real scenes are, if they are."""
+SIZES = ((61, 41), (47, 33))
+"""Of the two cameras; odd, so that halving rounds down."""
+NAMES = [f"{'left' if i % 2 else 'right'}/{i // 2:04d}.png" for i in range(10)]
+
+
+def write_model(
+    folder: Path,
+    *,
+    text: bool = False,
+    offset: float = 0.0,
+    points: int = 20,
+    params: Callable[[int, int], tuple[str, list[float]]] | None = None,
+    names: list[str] = NAMES,
+) -> pycolmap.Reconstruction:
+    """Cameras on an arc that look at points around `offset`, through pycolmap; two camera sizes in turn."""
+    rng = np.random.default_rng(0)
+    params = params or (lambda w, h: ("PINHOLE", [w * 0.9, w * 0.95, w / 2 + 1, h / 2 - 2]))
+    model = pycolmap.Reconstruction()
+    for number, (width, height) in enumerate(SIZES, start=1):
+        kind, values = params(width, height)
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model=kind, width=width, height=height, params=values)
+        )
+    for i, name in enumerate(names):
+        angle = 0.9 * i / len(names) - 0.4
+        rotation = pycolmap.Rotation3d(np.array([0.02 * i, angle, 0.01]))
+        center = np.array([4 * np.sin(angle), 0.1 * i, -4 * np.cos(angle)]) + offset
+        pose = pycolmap.Rigid3d(rotation.inverse(), -(rotation.inverse() * center))
+        image = pycolmap.Image(name=name, camera_id=1 + i % 2, image_id=len(names) - i)
+        model.add_image_with_trivial_frame(image, pose)
+    for xyz in rng.uniform(-1, 1, (points, 3)):
+        model.add_point3D(xyz + offset, pycolmap.Track(), rng.integers(0, 256, 3).astype(np.uint8))
+    folder.mkdir(parents=True)
+    (model.write_text if text else model.write_binary)(str(folder))
+    return model
+
+
+def write_photos(folder: Path, names: list[str] = NAMES, divide: float = 1, rounded: Callable = int) -> None:
+    """Noise photos of the cameras' sizes, divided and rounded."""
+    rng = np.random.default_rng(1)
+    for i, name in enumerate(names):
+        width, height = (rounded(side / divide) for side in SIZES[i % 2])
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(folder / name)
+
+
+def parser(data: Path, **options) -> AbcdDataParser:
+    return AbcdDataParserConfig(data=data, **options).setup()
+
+
+def project(outputs, index: int) -> np.ndarray:
+    """Pixels float64 [n, 2] of the outputs' own points in one of its cameras, written out."""
+    camera = outputs.cameras[index]
+    pose = camera.camera_to_worlds.double().numpy() * [1, -1, -1, 1]
+    local = (outputs.metadata["points3D_xyz"].double().numpy() - pose[:, 3]) @ pose[:, :3]
+    fx, fy, cx, cy = (getattr(camera, name).item() for name in ("fx", "fy", "cx", "cy"))
+    return local[:, :2] / local[:, 2:] * [fx, fy] + [cx, cy]
+
+
+def project_pycolmap(model: pycolmap.Reconstruction, name: str) -> np.ndarray:
+    image = model.find_image_with_name(name)
+    return np.stack([image.project_point(point.xyz) for _, point in sorted(model.points3D.items())])
+
+
+def refusal(data: Path, **options) -> str:
+    """The message that a scene is refused with."""
+    with pytest.raises(InputError) as caught:
+        parser(data, **options).get_dataparser_outputs()
+    return str(caught.value)
+
+
+def write_transforms(scene: Path, **extra) -> dict:
+    """The COLMAP scene of the fixture as nerfstudio would write it, in place of the model."""
+    model = read_colmap(scene, scene / "sparse/0")
+    shutil.rmtree(scene / "sparse")
+    frames = []
+    for frame in reversed(model.frames):
+        intrinsics = {"fl_x": frame.lens.fx, "fl_y": frame.lens.fy, "cx": frame.lens.cx, "cy": frame.lens.cy}
+        pose = np.concatenate([frame.camera_to_world, [[0, 0, 0, 1]]]).tolist()
+        size = {"w": frame.lens.width, "h": frame.lens.height}
+        frames.append({"file_path": f"images/{frame.name}", "transform_matrix": pose, **intrinsics, **size})
+    rows = "\n".join(
+        " ".join(map(str, [*p, *c])) for p, c in zip(model.points_xyz, model.points_rgb, strict=True)
+    )
+    types = [f"property double {axis}\n" for axis in "xyz"]
+    types += [f"property uint8 {color}\n" for color in ("red", "green", "blue")]
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(model.points_xyz)}\n{''.join(types)}end_header\n"
+    (scene / "points.ply").write_text(head + rows + "\n")
+    meta = {"ply_file_path": "points.ply", "applied_transform": Z_UP.tolist(), "frames": frames, **extra}
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    return meta

@@ -1,0 +1,83 @@
+"""Photos are reduced to 1600 px where nothing else is said."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from abcd_ns.cli.check.command import examine
+from abcd_ns.data.prepare import automatic_factor
+from abcd_ns.data.scene import Frame, Lens, Scene
+from tests.data.dataparser_scenes import SIZES, parser, write_model, write_photos
+
+
+@pytest.fixture
+def long_scene(tmp_path, monkeypatch) -> Path:
+    """Photos of 3300 x 40 px and, every other one, of 900 x 48."""
+    monkeypatch.setattr("tests.data.dataparser_scenes.SIZES", ((3300, 40), (900, 48)))
+    write_model(tmp_path / "sparse/0")
+    write_photos(tmp_path / "images")
+    return tmp_path
+
+
+def widths(data: Path, **options) -> set[int]:
+    cameras = parser(data, **options).get_dataparser_outputs().cameras
+    return set(cameras.width.flatten().tolist())
+
+
+def test_photos_are_reduced_to_1600_px_by_the_largest_of_them(long_scene, capsys):
+    assert widths(long_scene) == {3300 // 4, 900 // 4}
+    said = capsys.readouterr().out
+    assert said.count("reduced 4 times, to 825 px at most") == 1
+    assert "--pipeline.datamanager.dataparser.downscale-factor 1 keeps" in said
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1, {3300, 900}), (2, {1650, 450}), (3, {1100, 300})])
+def test_a_factor_that_is_given_is_taken_and_nothing_is_said(long_scene, capsys, factor, expected):
+    assert widths(long_scene, downscale_factor=factor) == expected
+    assert capsys.readouterr().out == ""
+
+
+def test_small_photos_are_left_alone(scene, capsys):
+    assert widths(scene) == {width for width, _ in SIZES}
+    assert parser(scene).factor == 1
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("longest", "factor"), [(1600, 1), (1601, 2), (3200, 2), (3201, 4), (6401, 8)])
+@pytest.mark.parametrize("upright", [False, True])
+def test_the_factor_is_nerfstudios(longest, factor, upright):
+    def frame(width, height):
+        size = (height, width) if upright else (width, height)
+        return Frame("", np.eye(4)[:3], Lens(*size, 1.0, 1.0, 0.0, 0.0))
+
+    nothing = np.empty((0, 3))
+    scene = Scene(Path(), Path(), Path(), [frame(100, 90), frame(longest, 20)], nothing, nothing)
+    assert automatic_factor(scene) == factor
+
+
+def test_it_is_no_warning(long_scene):
+    report = examine(long_scene)
+    (said,) = [finding for finding in report.findings if "reduced 4 times" in finding.what]
+    assert said.level == "note"
+    assert not any("reduced 4 times" in finding.what for finding in examine(long_scene, downscale=4).findings)
+
+
+def test_a_reduced_folder_is_read_by_default_where_it_is(long_scene):
+    write_photos(long_scene / "images_4", divide=4)
+    outputs = parser(long_scene).get_dataparser_outputs()
+    assert all(path.is_relative_to(long_scene / "images_4") for path in outputs.image_filenames)
+
+
+def test_a_scene_with_large_photos_is_viewed_as_it_was_trained(long_scene, capsys):
+    trained = parser(long_scene).get_dataparser_outputs().cameras
+    shutil.rmtree(long_scene / "images")
+    capsys.readouterr()
+    viewing = parser(long_scene)
+    viewing.downscale_factor = 1  # as FullImageDatamanager does for test_mode="inference"
+    viewed = viewing.get_dataparser_outputs().cameras
+    assert torch.equal(viewed.width, trained.width)
+    assert torch.equal(viewed.fx, trained.fx)
+    assert "reduced" not in capsys.readouterr().out

@@ -1,0 +1,362 @@
+"""Scenes as users have them: cameras, points and photos are read right."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.ply import read_points
+from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
+from tests.data.dataparser_scenes import (
+    NAMES,
+    REAL,
+    SIZES,
+    parser,
+    project,
+    project_pycolmap,
+    refusal,
+    write_model,
+    write_photos,
+    write_transforms,
+)
+
+
+@pytest.mark.parametrize("offset", [0.0, 5e6])
+@pytest.mark.parametrize("factor", [1, 2])
+@pytest.mark.parametrize("text", [False, True])
+def test_points_project_where_pycolmap_projects_them(tmp_path, text, factor, offset):
+    model = write_model(tmp_path / "sparse/0", text=text, offset=offset)
+    write_photos(tmp_path / "images")
+    outputs = parser(tmp_path, downscale_factor=factor, eval_mode="all").get_dataparser_outputs()
+    assert [path.relative_to(tmp_path / "images").as_posix() for path in outputs.image_filenames] == sorted(
+        NAMES
+    )
+    for row, name in enumerate(sorted(NAMES)):
+        width, height = SIZES[NAMES.index(name) % 2]
+        size = np.array([width // factor, height // factor])
+        expected = project_pycolmap(model, name) * size / [width, height]
+        assert np.abs(project(outputs, row) - expected).max() < 1e-2
+        assert (outputs.cameras.width[row].item(), outputs.cameras.height[row].item()) == tuple(size)
+    assert outputs.metadata["points3D_rgb"].dtype == torch.uint8
+    colors = [point.color for _, point in sorted(model.points3D.items())]
+    assert np.array_equal(outputs.metadata["points3D_rgb"].numpy(), np.stack(colors))
+
+
+@pytest.mark.parametrize("center", ["poses", "focus"])
+@pytest.mark.parametrize("orientation", ["up", "pca", "vertical", "none"])
+def test_geo_referenced_scene_is_the_same_scene(tmp_path, orientation, center):
+    outputs = []
+    for name, offset in (("near", 0.0), ("far", 5e6)):
+        write_model(tmp_path / name / "sparse/0", offset=offset)
+        write_photos(tmp_path / name / "images")
+        options = {"orientation_method": orientation, "center_method": center}
+        outputs.append(parser(tmp_path / name, **options).get_dataparser_outputs())
+    near, far = outputs
+    assert torch.allclose(near.cameras.camera_to_worlds, far.cameras.camera_to_worlds, atol=1e-6)
+    assert torch.allclose(near.metadata["points3D_xyz"], far.metadata["points3D_xyz"], atol=1e-6)
+    assert near.dataparser_scale == pytest.approx(far.dataparser_scale, rel=1e-6)
+
+
+def test_poses_go_back_to_original_coordinates(tmp_path):
+    model = write_model(tmp_path / "sparse/0", offset=5e6)
+    write_photos(tmp_path / "images")
+    outputs = parser(tmp_path, eval_mode="all").get_dataparser_outputs()
+    back = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds)
+    for row, name in enumerate(sorted(NAMES)):
+        world = model.find_image_with_name(name).cam_from_world().inverse()
+        assert np.abs(back[row, :, 3].numpy() - world.translation).max() < 1e-5
+        assert np.abs(back[row, :, :3].numpy() - world.rotation.matrix()).max() < 1e-6
+    outputs.save_dataparser_transform(tmp_path / "out.json")
+    saved = json.loads((tmp_path / "out.json").read_text())
+    xyz = np.stack([point.xyz for _, point in sorted(model.points3D.items())])
+    moved = saved["scale"] * (np.array(saved["transform"]) @ np.c_[xyz, np.ones(len(xyz))].T).T
+    assert np.abs(moved - outputs.metadata["points3D_xyz"].numpy()).max() < 1e-6
+
+
+def test_default_frame_is_nerfstudios(scene):
+    """Against nerfstudio's own COLMAP parser, which works in float32."""
+    from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+
+    theirs = ColmapDataParserConfig(
+        data=scene, colmap_path=Path("sparse/0"), downscale_factor=1, eval_mode="all"
+    )
+    theirs = theirs.setup().get_dataparser_outputs()
+    ours = parser(scene, eval_mode="all").get_dataparser_outputs()
+    order = [theirs.image_filenames.index(path) for path in ours.image_filenames]
+    assert torch.allclose(ours.cameras.camera_to_worlds, theirs.cameras.camera_to_worlds[order], atol=1e-5)
+    assert torch.allclose(ours.dataparser_transform.float(), theirs.dataparser_transform, atol=1e-5)
+    assert ours.dataparser_scale == pytest.approx(theirs.dataparser_scale, rel=1e-5)
+
+
+def test_held_out_views_are_every_eighth_by_name(scene):
+    train, test = (parser(scene).get_dataparser_outputs(split).image_filenames for split in ("train", "test"))
+    ordered = [scene / "images" / name for name in sorted(NAMES)]
+    assert test == ordered[::8]
+    assert sorted(train + test) == ordered
+
+
+@given(count=st.integers(2, 60), interval=st.integers(2, 12))
+@settings(derandomize=True, max_examples=40, deadline=None)
+def test_splits_partition_the_views(count, interval):
+    config = AbcdDataParserConfig(eval_interval=interval)
+    train, test, val = (split_rows(count, split, config) for split in ("train", "test", "val"))
+    assert test == val == list(range(0, count, interval))
+    assert sorted(train + test) == list(range(count))
+    everything = AbcdDataParserConfig(eval_mode="all")
+    assert (
+        split_rows(count, "train", everything) == split_rows(count, "test", everything) == list(range(count))
+    )
+
+
+@pytest.mark.parametrize("folder", ["sparse/0", "colmap/sparse/0", "sparse"])
+def test_model_is_found_without_a_flag(tmp_path, folder):
+    write_model(tmp_path / folder)
+    write_photos(tmp_path / "images")
+    assert len(parser(tmp_path).get_dataparser_outputs().image_filenames) == 8
+
+
+def test_dataset_gives_photos_of_the_cameras_sizes_and_writes_nothing(scene):
+    before = sorted(scene.rglob("*"))
+    outputs = parser(scene, downscale_factor=2).get_dataparser_outputs()
+    dataset = AbcdDataset(outputs)
+    for i in range(len(dataset)):
+        data = dataset.get_data(i, image_type="uint8")
+        camera = dataset.cameras[i]
+        assert data["image"].shape == (camera.height.item(), camera.width.item(), 3)
+        assert torch.equal(dataset[i]["image"], data["image"].float() / 255)
+    assert sorted(scene.rglob("*")) == before
+    with pytest.raises(InputError, match="downscale-factor"):
+        AbcdDataset(outputs, scale_factor=0.5)
+
+
+def test_photo_of_a_pinhole_is_bit_equal(scene):
+    outputs = parser(scene).get_dataparser_outputs()
+    for i, path in enumerate(outputs.image_filenames):
+        assert np.array_equal(AbcdDataset(outputs).get_numpy_image(i), np.array(Image.open(path)))
+
+
+@pytest.mark.parametrize(("kind", "extra"), [("SIMPLE_RADIAL", [0.0]), ("OPENCV", [0.0, 0.0, 0.0, 0.0])])
+def test_zero_distortion_is_a_pinhole(tmp_path, scene, kind, extra):
+    def params(w, h):
+        focal = [w * 0.9] if kind == "SIMPLE_RADIAL" else [w * 0.9, w * 0.9]
+        return kind, [*focal, w / 2, h / 2, *extra]
+
+    write_model(tmp_path / "zero/sparse/0", params=params)
+    shutil.copytree(scene / "images", tmp_path / "zero/images")
+    outputs = parser(tmp_path / "zero").get_dataparser_outputs()
+    assert all(source.undistortion is None for source in outputs.metadata["photos"])
+
+
+def test_distorted_cameras_become_pinholes(tmp_path):
+    write_model(
+        tmp_path / "sparse/0", params=lambda w, h: ("OPENCV", [w, w, w / 2, h / 2, 0.1, 0.01, 1e-3, 2e-3])
+    )
+    write_photos(tmp_path / "images")
+    outputs = parser(tmp_path).get_dataparser_outputs()
+    assert outputs.cameras.distortion_params is None
+    for i, source in enumerate(outputs.metadata["photos"]):
+        assert source.size == (outputs.cameras.width[i].item(), outputs.cameras.height[i].item())
+        assert AbcdDataset(outputs).get_numpy_image(i).shape == (*source.size[::-1], 3)
+
+
+def test_reduced_folder_is_used_where_it_fits(scene):
+    write_photos(scene / "images_2", divide=2, rounded=lambda x: int(x + 0.5))
+    outputs = parser(scene, downscale_factor=2).get_dataparser_outputs()
+    assert all(path.is_relative_to(scene / "images_2") for path in outputs.image_filenames)
+    first = outputs.metadata["photos"][0]
+    full = SIZES[NAMES.index(first.path.relative_to(scene / "images_2").as_posix()) % 2]
+    assert first.size == ((full[0] + 1) // 2, (full[1] + 1) // 2)
+    ratio = outputs.cameras.fx[0].item() / (full[0] * 0.9)
+    assert ratio == pytest.approx(first.size[0] / full[0], rel=1e-6)
+
+
+def test_reduced_folder_that_does_not_fit_is_left_alone(scene, capsys):
+    write_photos(scene / "images_2", divide=3)
+    outputs = parser(scene, downscale_factor=2).get_dataparser_outputs()
+    assert all(path.is_relative_to(scene / "images") for path in outputs.image_filenames)
+    assert "does not fit" in capsys.readouterr().out
+
+
+def test_reduced_copies_serve_where_there_are_no_full_photos(scene):
+    shutil.rmtree(scene / "images")
+    write_photos(scene / "images_2", divide=2)
+    assert parser(scene, downscale_factor=1).get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 2
+    assert parser(scene, downscale_factor=4).get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 4
+
+
+def test_scene_is_viewed_without_photos(scene):
+    shutil.rmtree(scene / "images")
+    viewing = parser(scene, downscale_factor=2)
+    viewing.downscale_factor = 1  # as FullImageDatamanager does for test_mode="inference"
+    assert viewing.get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 2
+
+
+def test_scene_without_points_starts_at_random(tmp_path, capsys):
+    write_model(tmp_path / "sparse/0", points=0)
+    write_photos(tmp_path / "images")
+    assert "points3D_xyz" not in parser(tmp_path).get_dataparser_outputs().metadata
+    assert "no points" in capsys.readouterr().out
+
+
+def test_photos_without_pose_are_mentioned(scene, capsys):
+    Image.new("RGB", (9, 9)).save(scene / "images/extra.png")
+    parser(scene).get_dataparser_outputs()
+    assert "1 photos in" in capsys.readouterr().out
+
+
+def test_odd_file_names(tmp_path):
+    names = ["a b/ü 1.png", "a b/[red]x.png", "ß/ü 1.png"]
+    write_model(tmp_path / "sparse/0", names=names)
+    write_photos(tmp_path / "images", names=names)
+    outputs = parser(tmp_path, eval_mode="all").get_dataparser_outputs()
+    assert outputs.image_filenames == sorted(tmp_path / "images" / name for name in names)
+
+
+def test_nerfstudios_datamanager_takes_it(tmp_path):
+    """Distorted cameras: nerfstudio must find nothing left to undistort."""
+    from nerfstudio.data.datamanagers.full_images_datamanager import (
+        FullImageDatamanager,
+        FullImageDatamanagerConfig,
+    )
+
+    write_model(tmp_path / "sparse/0", params=lambda w, h: ("SIMPLE_RADIAL", [w, w / 2, h / 2, -0.1]))
+    write_photos(tmp_path / "images")
+    config = FullImageDatamanagerConfig(
+        dataparser=AbcdDataParserConfig(), data=tmp_path, cache_images_type="uint8"
+    )
+    manager = FullImageDatamanager[AbcdDataset](config)
+    parsed = parser(tmp_path).get_dataparser_outputs("test")
+    for (camera, data), wanted in zip(manager.fixed_indices_eval_dataloader, parsed.cameras, strict=True):
+        assert data["image"].shape == (camera.height.item(), camera.width.item(), 3)
+        assert torch.equal(camera.fx.ravel(), wanted.fx.ravel())
+    camera, data = manager.next_train(0)
+    expected = manager.train_dataset.photos.image(camera.metadata["cam_idx"])
+    assert torch.equal(data["image"], expected)
+
+
+def test_check_reads_once_and_names_faults(scene):
+    checked = parser(scene)
+    checked.check()
+    shutil.rmtree(scene / "sparse")
+    assert len(checked.get_dataparser_outputs().image_filenames) == 8
+    with pytest.raises(InputError, match="holds no model"):
+        parser(scene).check()
+
+
+# transforms.json
+
+
+@pytest.mark.parametrize("direct", [False, True])
+def test_transforms_json_is_the_same_scene(scene, direct):
+    colmap = parser(scene, downscale_factor=2).get_dataparser_outputs()
+    write_transforms(scene)
+    data = scene / "transforms.json" if direct else scene
+    nerf = parser(data, downscale_factor=2).get_dataparser_outputs()
+    assert nerf.image_filenames == colmap.image_filenames
+    assert torch.equal(nerf.metadata["points3D_rgb"], colmap.metadata["points3D_rgb"])
+    assert torch.allclose(nerf.metadata["points3D_xyz"], colmap.metadata["points3D_xyz"], atol=1e-6)
+    assert torch.allclose(nerf.dataparser_transform, colmap.dataparser_transform)
+    for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height"):
+        assert torch.allclose(getattr(nerf.cameras, name), getattr(colmap.cameras, name), atol=1e-6), name
+
+
+def test_applied_scale_is_undone_on_the_way_back(scene):
+    plain = write_transforms(scene)
+    centers = parser(scene).get_dataparser_outputs()
+    (scene / "transforms.json").write_text(json.dumps({**plain, "applied_scale": 0.25}))
+    scaled = parser(scene).get_dataparser_outputs()
+    assert torch.equal(scaled.cameras.camera_to_worlds, centers.cameras.camera_to_worlds)
+    back, quarter = (
+        o.transform_poses_to_original_space(o.cameras.camera_to_worlds) for o in (scaled, centers)
+    )
+    assert torch.allclose(back[..., 3], quarter[..., 3] / 0.25, atol=1e-5)
+
+
+def test_angle_of_view_and_size_from_the_photo(scene):
+    meta = write_transforms(scene)
+    frames = [
+        {"file_path": f["file_path"], "transform_matrix": f["transform_matrix"]} for f in meta["frames"]
+    ]
+    (scene / "transforms.json").write_text(json.dumps({"camera_angle_x": np.pi / 2, "frames": frames}))
+    outputs = parser(scene, eval_mode="all").get_dataparser_outputs()
+    assert torch.allclose(outputs.cameras.fx * 2, outputs.cameras.width.float())
+    assert torch.equal(outputs.cameras.fx, outputs.cameras.fy)
+    assert torch.equal(outputs.cameras.cx * 2, outputs.cameras.width.float())
+
+
+def test_masks_of_all_frames_reach_the_dataset(scene):
+    meta = write_transforms(scene)
+    for frame in meta["frames"]:
+        mask = np.full((frame["h"], frame["w"]), 255, np.uint8)
+        mask[:, : frame["w"] // 2] = 0
+        frame["mask_path"] = frame["file_path"].replace("images", "masks")
+        (scene / frame["mask_path"]).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(scene / frame["mask_path"])
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    data = AbcdDataset(parser(scene).get_dataparser_outputs())[0]
+    width = data["image"].shape[1]
+    assert data["mask"].shape == (*data["image"].shape[:2], 1)
+    assert data["mask"].dtype == torch.bool
+    assert not data["mask"][:, : width // 2].any()
+    assert data["mask"][:, width // 2 :].all()
+    del meta["frames"][0]["mask_path"]
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    assert "9 of 10 frames have a mask_path" in refusal(scene)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_ply(tmp_path, order):
+    xyz, rgb = np.arange(12.0).reshape(4, 3), np.arange(12, dtype=np.uint8).reshape(4, 3)
+    row = [(name, order + "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    table = np.array([(*p, *c) for p, c in zip(xyz, rgb, strict=True)], dtype=row)
+    kind = "little" if order == "<" else "big"
+    types = "".join(f"property {'uchar' if t == 'u1' else 'float'} {name}\n" for name, t in row)
+    head = f"ply\nformat binary_{kind}_endian 1.0\nelement vertex 4\n{types}end_header\n".encode()
+    path = tmp_path / "points.ply"
+    path.write_bytes(head + table.tobytes())
+    assert np.array_equal(read_points(path)[0], xyz)
+    assert np.array_equal(read_points(path)[1], rgb)
+    for broken in (
+        head + table.tobytes()[:-1],
+        head + table.tobytes() + b"!",
+        b"",
+        head.replace(b"4\n", b"-4\n"),
+        head.replace(b"4\n", b"1152921504606846976\n") + table.tobytes(),
+        head.replace(b"4\n", b"9" * 5000 + b"\n") + table.tobytes(),
+    ):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match=r"points\.ply"):
+            read_points(path)
+
+
+# Real scenes
+
+
+@pytest.mark.parametrize("name", ["castle-P30", "fox"])
+@pytest.mark.parametrize("factor", [1, 2])
+def test_real_scene_projects_as_pycolmap_does(name, factor):
+    if not (REAL / name).is_dir():
+        pytest.skip(f"{REAL / name} is not there; set ABCD_DATA to a folder that holds it")
+    model = pycolmap.Reconstruction(str(REAL / name / "sparse/0"))
+    outputs = parser(REAL / name, downscale_factor=factor, eval_mode="all").get_dataparser_outputs()
+    dataset = AbcdDataset(outputs)
+    for row in (0, 7):
+        image = model.find_image_with_name(outputs.image_filenames[row].name)
+        camera = model.camera(image.camera_id)
+        xyz = np.stack([point.xyz for _, point in sorted(model.points3D.items())])
+        local = image.cam_from_world() * xyz
+        front = local[:, 2] > 1e-3 * np.abs(local).max()
+        size = np.array([camera.width // factor, camera.height // factor])
+        expected = camera.img_from_cam(local[front]) * size / [camera.width, camera.height]
+        near = np.abs(expected).max(axis=1) < 4 * max(camera.width, camera.height)
+        assert np.abs(project(outputs, row)[front][near] - expected[near]).max() < 1e-2
+        assert dataset.get_numpy_image(row).shape == (*size[::-1], 3)

@@ -1,0 +1,325 @@
+"""Pixels: exact where nothing is to be done, an area mean where reduced, the lens's rays if undistorted."""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.photos import Photos, PhotoSource, area_reduce, default_budget
+from abcd_ns.data.scene import Lens
+from abcd_ns.data.undistort import distort, undistortion
+from abcd_ns.engine.types import Crop
+
+WIDTH, HEIGHT = 40, 24
+
+
+def noise(seed: int, channels: int = 3, size: tuple[int, int] = (WIDTH, HEIGHT)) -> np.ndarray:
+    """uint8 [height, width, channels]."""
+    return np.random.default_rng(seed).integers(0, 256, (size[1], size[0], channels), dtype=np.uint8)
+
+
+def saved(path: Path, image: np.ndarray) -> Path:
+    Image.fromarray(image.squeeze()).save(path)
+    return path
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> list[PhotoSource]:
+    """Six photos at full size."""
+    size = (WIDTH, HEIGHT)
+    return [PhotoSource(saved(tmp_path / f"{i}.png", noise(i)), size, size) for i in range(6)]
+
+
+def naive_area_mean(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Each pixel's rectangle in the source, weighted pixel by pixel in float64."""
+
+    def shares(old: int, new: int) -> np.ndarray:
+        table = np.zeros((new, old))
+        for i in range(new):
+            for j in range(old):
+                overlap = min((i + 1) * old / new, j + 1) - max(i * old / new, j)
+                table[i, j] = max(overlap, 0) * new / old
+        return table
+
+    down, right = shares(image.shape[0], height), shares(image.shape[1], width)
+    return np.einsum("yh,xw,hwc->yxc", down, right, image.astype(np.float64))
+
+
+@given(
+    old=st.tuples(st.integers(1, 23), st.integers(1, 23)),
+    share=st.tuples(st.floats(0.05, 1), st.floats(0.05, 1)),
+    channels=st.sampled_from([1, 3, 4]),
+    seed=st.integers(0, 1000),
+)
+@settings(derandomize=True, max_examples=80, deadline=None)
+def test_reducing_is_the_exact_area_mean(old, share, channels, seed):
+    size = tuple(max(1, int(side * s)) for side, s in zip(old, share, strict=True))
+    image = noise(seed, channels, old)
+    reduced = area_reduce(image, size)
+    assert reduced.shape == (size[1], size[0], channels)
+    # Half a level is rounding; the rest is float32 in the sums.
+    assert np.abs(reduced - naive_area_mean(image, *size)).max() <= 0.51
+
+
+def test_photo_that_needs_nothing_is_bit_equal(sources):
+    photos = Photos(sources)
+    for i in range(len(sources)):
+        assert np.array_equal(photos.image(i).numpy(), noise(i))
+        assert photos.size(i) == (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_channels(tmp_path, channels):
+    image = noise(0, channels)
+    size = (WIDTH, HEIGHT)
+    photo = Photos([PhotoSource(saved(tmp_path / "photo.png", image), size, size)]).image(0).numpy()
+    grey = np.repeat(image[..., :1], 3, axis=2)
+    expected = {1: grey, 2: np.concatenate([grey, image[..., -1:]], axis=2)}.get(channels, image)
+    assert np.array_equal(photo, expected)
+
+
+def test_palette_becomes_its_colors(tmp_path):
+    picture = Image.fromarray(noise(0)).quantize(16)
+    picture.save(tmp_path / "p.png")
+    photos = Photos([PhotoSource(tmp_path / "p.png", picture.size, picture.size)])
+    assert np.array_equal(photos.image(0).numpy(), np.array(picture.convert("RGB")))
+
+
+def test_exif_orientation_is_not_applied(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(noise(0)).save(tmp_path / "p.png", exif=exif)
+    photos = Photos([PhotoSource(tmp_path / "p.png", (WIDTH, HEIGHT), (WIDTH, HEIGHT))])
+    assert np.array_equal(photos.image(0).numpy(), noise(0))
+
+
+@given(x=st.integers(0, WIDTH - 1), y=st.integers(0, HEIGHT - 1), data=st.data())
+@settings(derandomize=True, max_examples=20, deadline=None)
+def test_crop_is_a_view_of_the_photo(tmp_path_factory, x, y, data):
+    crop = Crop(x, y, data.draw(st.integers(1, WIDTH - x)), data.draw(st.integers(1, HEIGHT - y)))
+    path = saved(tmp_path_factory.mktemp("crop") / "p.png", noise(0))
+    photos = Photos([PhotoSource(path, (WIDTH, HEIGHT), (WIDTH, HEIGHT))])
+    pixels = photos.crop(0, crop)
+    expected = noise(0)[y : y + crop.height, x : x + crop.width]
+    assert pixels.dtype == torch.uint8
+    assert np.array_equal(pixels.numpy(), expected)
+    assert pixels.untyped_storage().data_ptr() == photos.image(0).untyped_storage().data_ptr()
+
+
+@pytest.mark.parametrize("crop", [Crop(-1, 0, 4, 4), Crop(0, 0, WIDTH + 1, 4), Crop(0, HEIGHT - 3, 4, 4)])
+def test_crop_over_the_border_is_an_error(sources, crop):
+    with pytest.raises(ValueError, match="border"):
+        Photos(sources).crop(0, crop)
+
+
+# Memory
+
+
+@pytest.mark.parametrize("budget", [0, WIDTH * HEIGHT * 3, 2 * WIDTH * HEIGHT * 3 + 1, None])
+def test_budget_bounds_memory_and_changes_no_pixel(sources, budget):
+    photos = Photos(sources, budget)
+    for i in np.random.default_rng(0).integers(0, len(sources), 40).tolist():
+        assert np.array_equal(photos.image(i).numpy(), noise(i))
+        assert photos.cached_bytes <= (default_budget() if budget is None else budget)
+    assert (photos.cached_bytes > 0) == (budget != 0)
+
+
+def test_least_recently_used_photo_goes_first(sources, monkeypatch):
+    reads = _count_reads(monkeypatch)
+    photos = Photos(sources, 2 * WIDTH * HEIGHT * 3)
+    for i in (0, 1, 0, 2, 0, 1):
+        photos.image(i)
+    assert reads == [0, 1, 2, 1]
+
+
+def test_threads_read_a_photo_once_and_agree(sources, monkeypatch):
+    reads = _count_reads(monkeypatch)
+    photos, start = Photos(sources), Barrier(4)
+
+    def work(seed: int) -> bool:
+        start.wait()
+        order = np.random.default_rng(seed).permutation(len(sources)).tolist() * 3
+        return all(np.array_equal(photos.image(i).numpy(), noise(i)) for i in order)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(work, range(4)))
+    assert sorted(reads) == list(range(len(sources)))
+
+
+def _count_reads(monkeypatch, seconds: float = 0) -> list[int]:
+    """The numbers of the photos that are opened from now on; each opening takes `seconds` more."""
+    reads: list[int] = []
+    opened: Callable = Image.open
+
+    def counting(path: Path, *args, **kwargs):
+        reads.append(int(path.stem))
+        time.sleep(seconds)
+        return opened(path, *args, **kwargs)
+
+    monkeypatch.setattr(Image, "open", counting)
+    return reads
+
+
+def test_threads_that_want_the_same_photo_wait_for_one_read(sources, monkeypatch):
+    reads = _count_reads(monkeypatch, seconds=0.2)
+    photos, start = Photos(sources), Barrier(4)
+
+    def work(_: int) -> int:
+        start.wait()
+        return photos.image(0).untyped_storage().data_ptr()
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(work, range(4)))) == 1
+    assert reads == [0]
+
+
+def test_photo_that_changed_since_the_check_is_named(sources):
+    photos = Photos(sources, 0)
+    sources[0].path.unlink()
+    saved(sources[1].path, noise(0, size=(WIDTH + 1, HEIGHT)))
+    sources[2].path.write_bytes(sources[2].path.read_bytes()[:200])
+    for i in range(3):
+        for _ in range(2):  # a failed read must not block the next one
+            with pytest.raises(InputError, match=rf"{i}\.png"):
+                photos.image(i)
+
+
+# Masks
+
+
+def masked(tmp_path: Path, mask: np.ndarray, reduced: tuple[int, int]) -> Photos:
+    photo = saved(tmp_path / "photo.png", noise(0))
+    return Photos(
+        [PhotoSource(photo, (WIDTH, HEIGHT), reduced, mask_path=saved(tmp_path / "mask.png", mask))]
+    )
+
+
+def test_reduced_mask_keeps_pixels_that_count_as_a_whole(tmp_path):
+    mask = np.where(np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.9, 255, 0).astype(np.uint8)
+    reduced = masked(tmp_path, mask, (WIDTH // 2, HEIGHT // 2)).mask(0)
+    expected = mask.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).min(axis=(1, 3)) > 0
+    assert reduced.dtype == torch.bool
+    assert np.array_equal(reduced.numpy()[..., 0], expected)
+    assert expected.any()
+    assert not expected.all()
+
+
+def test_mask_may_have_the_reduced_size(tmp_path):
+    mask = np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8)
+    mask[3, 5] = 0
+    assert np.array_equal(masked(tmp_path, mask, (WIDTH // 2, HEIGHT // 2)).mask(0).numpy()[..., 0], mask > 0)
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (np.zeros((HEIGHT, WIDTH), np.uint8), "hides the whole"),
+        (np.ones((WIDTH, HEIGHT), np.uint8), "unlike its photo"),
+    ],
+)
+def test_useless_mask_is_named(tmp_path, mask, message):
+    with pytest.raises(InputError, match=message):
+        masked(tmp_path, mask, (WIDTH, HEIGHT)).mask(0)
+
+
+def test_photo_without_mask_has_none(sources):
+    assert Photos(sources).mask(0) is None
+
+
+# Distortion
+
+LENSES = {
+    "SIMPLE_RADIAL": (-0.15,),
+    "RADIAL": (0.12, -0.03),
+    "OPENCV": (-0.2, 0.03, 2e-3, -1e-3),
+    "FULL_OPENCV": (0.1, 0.02, 1e-3, 1e-3, 0.01, 0.05, 0.01, 0.002),
+    "OPENCV_FISHEYE": (0.03, -0.01, 0.002, -0.001),
+    "RADIAL_FISHEYE": (0.02, -0.01),
+}
+
+
+def lens_pair(kind: str, width: int, height: int) -> tuple[Lens, pycolmap.Camera]:
+    """One lens as ours and as COLMAP's."""
+    focals = [0.8 * width] if "RADIAL" in kind else [0.8 * width, 0.85 * width]
+    center = [width / 2 + 1.25, height / 2 - 0.75]
+    fisheye = kind.endswith("FISHEYE")
+    values = LENSES[kind] + (0.0,) * ((4 if fisheye else 8) - len(LENSES[kind]))
+    camera = pycolmap.Camera(model=kind, width=width, height=height, params=[*focals, *center, *LENSES[kind]])
+    return Lens(width, height, focals[0], focals[-1], *center, values, fisheye), camera
+
+
+def pixel_rays(lens: Lens) -> np.ndarray:
+    """(x, y) of the rays (x, y, 1) through all pixel centres, float64 [height * width, 2]."""
+    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
+    return np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy], axis=-1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_undistorted_pixels_come_from_where_colmap_sees_them(tmp_path, kind):
+    """The photo's red and green say the column and row, so each result pixel says where it came from."""
+    width, height = 240, 180
+    lens, camera = lens_pair(kind, width, height)
+    flat = undistortion(lens)
+    rows, columns = np.mgrid[:height, :width].astype(np.uint8)
+    photo = saved(tmp_path / "p.png", np.stack([columns, rows, 0 * rows], axis=-1))
+    image = Photos([PhotoSource(photo, lens.size, lens.size, flat)]).image(0).numpy()
+    assert image.shape == (flat.pinhole.height, flat.pinhole.width, 3)
+    rays = pixel_rays(flat.pinhole)
+    expected = camera.img_from_cam(np.c_[rays, np.ones(len(rays))])
+    assert np.abs(distort(lens, rays) - expected).max() < 1e-6
+    # The photo ends at its outermost pixel centres; OpenCV's cropping is good to a pixel.
+    expected = (expected - 0.5).clip(0, [width - 1, height - 1])
+    error = image[..., :2].reshape(-1, 2) - expected
+    inner = ((expected > 2) & (expected < [width - 3, height - 3])).all(axis=1)
+    # Rounding to 8 bits is 1/2, OpenCV's steps of 1/32 px are 1/64; half a pixel mistaken gives 0.53 and up.
+    assert np.abs(error[inner]).max() < 0.52
+    assert inner.mean() > 0.9
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_no_pixel_of_the_result_is_unseen(tmp_path, kind):
+    lens, _ = lens_pair(kind, 240, 180)
+    flat = undistortion(lens)
+    white = saved(tmp_path / "p.png", np.full((180, 240, 3), 255, np.uint8))
+    image = Photos([PhotoSource(white, lens.size, lens.size, flat)]).image(0)
+    assert (image == 255).float().mean() > 0.98
+    assert flat.pinhole.width > 0.9 * lens.width
+    assert not flat.pinhole.distorted
+
+
+def test_mask_is_undistorted_with_its_photo(tmp_path):
+    lens, _ = lens_pair("OPENCV", 240, 180)
+    flat = undistortion(lens)
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :120] = 0
+    photo = saved(tmp_path / "p.png", np.repeat(mask[..., None], 3, axis=2))
+    source = PhotoSource(photo, lens.size, lens.size, flat, saved(tmp_path / "m.png", mask))
+    photos = Photos([source])
+    assert photos.mask(0).shape == (*photos.image(0).shape[:2], 1)
+    # What is used was white all through; half-way pixels are not used.
+    assert (photos.image(0)[photos.mask(0)[..., 0]] == 255).all()
+    assert 0.4 < photos.mask(0).float().mean() < 0.6
+
+
+@pytest.mark.parametrize("coefficients", [(-3.0,), (-1.2, 0.1), (1e6,), (0.0, 0.0, 5.0, 5.0)])
+def test_absurd_distortion_is_refused(coefficients):
+    padded = coefficients + (0.0,) * (8 - len(coefficients))
+    with pytest.raises(InputError, match="leaves no picture"):
+        undistortion(Lens(200, 150, 160, 160, 100, 75, padded))
+
+
+def test_lens_scales_with_its_photo():
+    lens = Lens(101, 67, 80, 81, 50, 33).resized(50, 33)
+    assert lens.size == (50, 33)
+    assert (lens.fx, lens.cx) == pytest.approx((80 * 50 / 101, 50 * 50 / 101))
+    assert (lens.fy, lens.cy) == pytest.approx((81 * 33 / 67, 33 * 33 / 67))

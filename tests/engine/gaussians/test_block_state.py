@@ -1,0 +1,115 @@
+"""Blocks at rest, and swapping them into live parameters and Adam."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, make_adam
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from tests.reference.scenes import random_gaussians
+
+
+def some_state(count: int, seed: int = 0) -> BlockState:
+    generator = torch.Generator().manual_seed(seed)
+    return BlockState(
+        random_gaussians(count, seed),
+        random_gaussians(count, seed + 1),
+        Gaussians(**{n: v**2 for n, v in random_gaussians(count, seed + 2).items()}),
+        {"grad2d": torch.rand(count, generator=generator), "count": torch.rand(count, generator=generator)},
+        Clocks(steps=7, adam_views=5, visits=2),
+    )
+
+
+def assert_same(a: BlockState, b: BlockState) -> None:
+    ours, theirs = a.to_tensors(), b.to_tensors()
+    assert ours[0].keys() == theirs[0].keys()
+    assert ours[1] == theirs[1]
+    for name, value in ours[0].items():
+        assert torch.equal(value, theirs[0][name]), name
+
+
+def live(state: BlockState):
+    params = {n: torch.nn.Parameter(v) for n, v in Gaussians.empty(1).items()}
+    optimizers = make_adam(params)
+    attach(state, params, optimizers)
+    return params, optimizers
+
+
+def take_steps(params, optimizers, count: int) -> None:
+    for _ in range(count):
+        loss = sum((p**2).sum() for p in params.values())
+        for optimizer in optimizers.values():
+            optimizer.zero_grad()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+
+
+@pytest.mark.parametrize("count", [0, 1, 9])
+def test_tensors_and_back(count):
+    state = some_state(count)
+    assert_same(BlockState.from_tensors(*state.to_tensors()), state)
+
+
+def test_rows_that_part_and_join_again_lose_nothing():
+    state = some_state(10)
+    mask = torch.arange(10) % 3 == 0
+    assert_same(
+        state[mask].joined_by(state[~mask]), state[torch.cat([torch.where(mask)[0], torch.where(~mask)[0]])]
+    )
+
+
+def test_a_statistic_that_one_side_lacks_starts_at_zero():
+    joined = BlockState.fresh(random_gaussians(2)).joined_by(some_state(3))
+    assert joined.growth["grad2d"][:2].tolist() == [0, 0]
+    assert torch.equal(joined.growth["grad2d"][2:], some_state(3).growth["grad2d"])
+
+
+def test_tensors_of_unequal_length_are_refused():
+    with pytest.raises(ValueError, match="equally many rows"):
+        BlockState(random_gaussians(3), random_gaussians(2), random_gaussians(3))
+
+
+def test_attach_then_detach_is_the_identity():
+    state = some_state(6)
+    params, optimizers = live(state)
+    assert_same(detach(params, optimizers, state.growth, state.clocks), state)
+
+
+def test_a_block_that_rested_trains_as_if_it_had_not():
+    state = some_state(6)
+    stayed = live(state)
+    take_steps(*stayed, 5)
+    moved = live(state)
+    take_steps(*moved, 2)
+    clocks = replace(state.clocks, adam_views=state.clocks.adam_views + 2)
+    rest = detach(*moved, state.growth, clocks)
+    attach(some_state(4, seed=9), *moved)
+    take_steps(*moved, 3)
+    attach(rest, *moved)
+    take_steps(*moved, 3)
+    assert_same(
+        detach(*moved, state.growth, state.clocks),
+        detach(*stayed, state.growth, state.clocks),
+    )
+
+
+def test_the_block_before_frees_its_memory_whoever_still_refers_to_it():
+    params, optimizers = live(some_state(6))
+    kept = copy.copy(params)
+    take_steps(params, optimizers, 1)
+    attach(some_state(3, seed=5), params, optimizers)
+    assert all(kept[name].numel() == 0 and kept[name].grad is None for name in PARAM_NAMES)
+    assert all(len(optimizers[name].state) == 1 for name in PARAM_NAMES)
+
+
+def test_detached_tensors_do_not_follow_later_steps():
+    state = some_state(6)
+    params, optimizers = live(state)
+    rest = detach(params, optimizers, state.growth, state.clocks)
+    take_steps(params, optimizers, 1)
+    assert_same(rest, state)
+    assert not torch.equal(live_gaussians(params).means, rest.gaussians.means)

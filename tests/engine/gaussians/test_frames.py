@@ -1,0 +1,78 @@
+"""Another frame of coordinates: nothing looks different."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from abcd_ns.engine.gaussians.frames import Frame, multiplied, quaternion, sh_rotation
+from abcd_ns.engine.render import TorchRasterizer
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+numbers = st.integers(0, 2**31)
+
+
+def random_rotation(seed: int) -> Rotation:
+    return Rotation.random(random_state=np.random.RandomState(seed))
+
+
+def random_frame(seed: int) -> Frame:
+    generator = np.random.RandomState(seed)
+    turn = torch.from_numpy(random_rotation(seed).as_matrix())
+    return Frame(turn, torch.from_numpy(generator.normal(size=3)), math.exp(generator.normal()))
+
+
+@given(numbers)
+def test_a_moved_scene_looks_the_same_to_a_camera_that_moves_along(seed):
+    frame = random_frame(seed)
+    # The blur of 0.3 pixels does not depend on units, nor does anything else that is drawn.
+    gaussians = random_gaussians(40, seed, sh_degree=3, dtype=torch.float64)
+    (view,) = ring_of_views(1, dtype=torch.float64)
+    moved = view.viewmat.clone()
+    moved[:3, :3] = view.viewmat[:3, :3] @ frame.rotation.T
+    moved[:3, 3] = frame.scale * (view.viewmat[:3, 3] - moved[:3, :3] @ frame.translation)
+    draw = TorchRasterizer("never")
+    before = draw(gaussians, view, sh_degree=3)
+    after = draw(frame.gaussians(gaussians), replace(view, viewmat=moved), sh_degree=3)
+    assert float(before.color.max()) > 0.05
+    assert torch.allclose(after.color, before.color, atol=1e-9)
+    assert torch.allclose(after.transmittance, before.transmittance, atol=1e-9)
+
+
+@given(numbers)
+def test_there_and_back(seed):
+    frame = random_frame(seed)
+    gaussians = random_gaussians(20, seed, sh_degree=2, dtype=torch.float64)
+    back = frame.inverse.gaussians(frame.gaussians(gaussians))
+    for name, value in gaussians.items():
+        found = getattr(back, name)
+        if name == "quats":  # q and -q are one rotation
+            value = value / value.norm(dim=1, keepdim=True)
+            found = found * (found * value).sum(dim=1, keepdim=True).sign()
+        assert torch.allclose(found, value, atol=1e-10), name
+
+
+@given(numbers, numbers)
+def test_quaternions_are_those_of_scipy(first, second):
+    a, b = random_rotation(first), random_rotation(second)
+    found = multiplied(
+        quaternion(torch.from_numpy(a.as_matrix())), torch.from_numpy(b.as_quat()[None, [3, 0, 1, 2]])
+    )
+    expected = torch.from_numpy((a * b).as_quat()[[3, 0, 1, 2]])
+    assert abs(float(found[0] @ expected)) > 1 - 1e-12
+
+
+@given(numbers)
+def test_harmonics_turn_by_an_orthogonal_matrix_that_mixes_no_degrees(seed):
+    turn = sh_rotation(torch.from_numpy(random_rotation(seed).as_matrix()))
+    assert torch.allclose(turn @ turn.T, torch.eye(15, dtype=torch.float64), atol=1e-10)
+    ends = (0, 3, 8, 15)
+    for low, high in itertools.pairwise(ends):
+        outside = torch.ones(15, dtype=torch.bool)
+        outside[low:high] = False
+        assert not turn[low:high, outside].any()

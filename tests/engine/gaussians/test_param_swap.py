@@ -1,0 +1,93 @@
+"""Learning rates of steps of several views."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.param_swap import Pace, adam_step, attach, detach, nothing_live
+from abcd_ns.engine.types import PARAM_NAMES
+from tests.reference.scenes import random_gaussians
+
+
+def travelled(power: float, views: int, steps: int) -> dict[str, float]:
+    """How far each parameter comes where all views ask for the same."""
+    params, adam = nothing_live(sh_degree=1)
+    attach(BlockState.fresh(random_gaussians(1)), params, adam)
+    pace, before = Pace(adam, power), {name: params[name].detach().clone() for name in PARAM_NAMES}
+    for _ in range(steps):
+        pace.set(views, means_decay=1.0)
+        for name in PARAM_NAMES:
+            params[name].grad = torch.ones_like(params[name])
+            adam[name].step()
+    return {name: float((params[name].detach() - before[name]).abs().max()) for name in PARAM_NAMES}
+
+
+@given(views=st.integers(1, 16))
+def test_views_that_agree_come_as_far_together_as_one_by_one(views):
+    together, one_by_one = travelled(1.0, views, steps=1), travelled(1.0, 1, steps=views)
+    assert together == pytest.approx(one_by_one, rel=1e-2)
+
+
+@given(views=st.integers(1, 16), power=st.sampled_from([0.5, 0.75, 1.0]))
+def test_a_step_grows_with_the_power_of_its_views(views, power):
+    single = travelled(power, 1, steps=1)
+    expected = {name: far * math.pow(views, power) for name, far in single.items()}
+    assert travelled(power, views, steps=1) == pytest.approx(expected, rel=1e-2)
+
+
+def corrected_moments(adam, parameter) -> tuple[float, float]:
+    """Adam's estimates of the gradient and its square, bias-corrected as torch's Adam does."""
+    state, (first, second) = adam.state[parameter], adam.param_groups[0]["betas"]
+    step = float(state["step"])
+    return (
+        float(state["exp_avg"].mean()) / (1 - first**step),
+        float(state["exp_avg_sq"].mean()) / (1 - second**step),
+    )
+
+
+def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:
+    """Adam's estimates after each of some steps, for a gradient that is always 1.
+
+    Args:
+        batches: (views in a step, steps); the block is taken out and put back in between.
+    """
+    params, adam = nothing_live(sh_degree=0)
+    pace, rest = Pace(adam, 0.5), BlockState.fresh(random_gaussians(2))
+    for batch, steps in batches:
+        attach(rest, params, adam, batch=batch)
+        clocks = rest.clocks
+        for _ in range(steps):
+            pace.set(batch, means_decay=1.0)
+            params["scales"].grad = torch.ones_like(params["scales"])
+            adam["scales"].step()
+            clocks = replace(clocks, adam_views=clocks.adam_views + batch)
+            yield corrected_moments(adam["scales"], params["scales"])
+        rest = detach(params, adam, {}, clocks)
+
+
+@pytest.mark.parametrize("batches", [[(1, 3), (2, 2), (4, 2)], [(2, 5), (4, 3), (1, 2)], [(4, 1)] * 5])
+def test_moments_are_read_with_the_decay_that_they_had(batches):
+    """A gradient of 1 is found to be 1 at every step, whatever the views of the steps before."""
+    for first, second in stepped_in(batches):
+        assert first == pytest.approx(1, rel=1e-5)
+        assert second == pytest.approx(1, rel=1e-4)
+
+
+def test_and_nearly_so_where_batches_do_not_divide_each_other():
+    for first, second in stepped_in([(1, 4), (3, 4), (5, 3), (7, 2)]):
+        assert first == pytest.approx(1, rel=1e-3)
+        assert second == pytest.approx(1, rel=2e-3)
+
+
+@given(begun=st.integers(0, 4000), batch=st.integers(1, 9), taken=st.integers(0, 500))
+def test_a_block_that_is_put_back_goes_on_with_the_very_same_count(begun, batch, taken):
+    stepped = adam_step(Clocks(adam_views=begun), batch)
+    for _ in range(taken):
+        stepped += 1
+    assert torch.equal(adam_step(Clocks(adam_views=begun + batch * taken), batch), stepped)

@@ -1,0 +1,118 @@
+"""Compositing: the algebra of layers, against the formula written out pixel by pixel."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.layers.compositing import composite, empty_layer, fold, over, sandwich
+from abcd_ns.engine.types import Layer
+from tests.engine.space.test_tree import SEEDS
+
+TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-6}
+DTYPES = st.sampled_from(list(TOLERANCE))
+
+
+def random_layers(seed: int, n: int, dtype: torch.dtype) -> list[Layer]:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator, dtype=dtype)
+
+    return [Layer(draw(3, 4, 3) / 2, draw(3, 4)) for _ in range(n)]
+
+
+def assert_close(layer: Layer, expected: Layer) -> None:
+    tolerance = {"rtol": 0.0, "atol": TOLERANCE[layer.color.dtype]}
+    torch.testing.assert_close(layer.color, expected.color, **tolerance)
+    torch.testing.assert_close(layer.transmittance, expected.transmittance, **tolerance)
+
+
+def by_hand(layers: list[Layer]) -> Layer:
+    """Light gathered front to back: sum of C_i times the transmittances before it, in Python floats."""
+    height, width = layers[0].transmittance.shape
+    folded = empty_layer(height, width, dtype=layers[0].color.dtype)
+    for y in range(height):
+        for x in range(width):
+            color, passing = [0.0, 0.0, 0.0], 1.0
+            for layer in layers:
+                color = [c + passing * own for c, own in zip(color, layer.color[y, x].tolist(), strict=True)]
+                passing *= float(layer.transmittance[y, x])
+            folded.color[y, x] = torch.tensor(color, dtype=folded.color.dtype)
+            folded.transmittance[y, x] = passing
+    return folded
+
+
+@given(SEEDS, st.integers(1, 7), DTYPES)
+def test_fold_is_the_sum_over_layers(seed, n, dtype):
+    layers = random_layers(seed, n, dtype)
+    assert_close(fold(layers), by_hand(layers))
+
+
+@given(SEEDS, DTYPES, st.lists(st.integers(0, 8), max_size=4))
+def test_any_cut_of_the_list_gives_the_same(seed, dtype, cuts):
+    layers = random_layers(seed, 8, dtype)
+    bounds = [0, *sorted(cuts), 8]
+    runs = [fold(layers[a:b], like=layers[0]) for a, b in pairwise(bounds)]  # Some are empty.
+    assert_close(fold(runs), fold(layers))
+
+
+@given(SEEDS, DTYPES)
+def test_over_is_associative_with_the_empty_layer_as_unit(seed, dtype):
+    a, b, c = random_layers(seed, 3, dtype)
+    assert_close(over(over(a, b), c), over(a, over(b, c)))
+    nothing = empty_layer(3, 4, dtype=dtype)
+    for same in (over(a, nothing), over(nothing, a)):
+        assert torch.equal(same.color, a.color)
+        assert torch.equal(same.transmittance, a.transmittance)
+
+
+@given(SEEDS, DTYPES, st.booleans())
+def test_a_sandwich_is_the_fold_on_the_background(seed, dtype, image):
+    front, active, back = layers = random_layers(seed, 3, dtype)
+    background = random_layers(seed + 1, 1, dtype)[0].color
+    background = background if image else background[0, 0]
+    expected = composite(fold(layers), background)
+    torch.testing.assert_close(
+        sandwich(front, active, back, background), expected, rtol=0.0, atol=TOLERANCE[dtype]
+    )
+
+
+@given(SEEDS)
+def test_the_sandwich_has_the_gradient_of_the_formula(seed):
+    front, active, back = random_layers(seed, 3, torch.float64)
+    background = torch.tensor([0.2, 0.7, 0.1], dtype=torch.float64)
+    color = active.color.requires_grad_()
+    transmittance = active.transmittance.requires_grad_()
+    image = sandwich(front, Layer(color, transmittance), back, background)
+    upstream = torch.randn(image.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    image.backward(upstream)
+    by_color = front.transmittance[..., None] * upstream
+    behind = back.color + back.transmittance[..., None] * background
+    by_transmittance = front.transmittance * (upstream * behind).sum(dim=-1)
+    torch.testing.assert_close(color.grad, by_color, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(transmittance.grad, by_transmittance, rtol=1e-12, atol=1e-12)
+
+
+def test_the_sandwich_passes_a_numerical_gradient_check():
+    front, active, back = random_layers(0, 3, torch.float64)
+    background = torch.rand(3, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    inputs = (active.color.requires_grad_(), active.transmittance.requires_grad_())
+    assert torch.autograd.gradcheck(lambda c, t: sandwich(front, Layer(c, t), back, background), inputs)
+
+
+def test_folding_nothing_needs_a_size():
+    with pytest.raises(ValueError, match="pass like="):
+        fold([])
+    like = random_layers(0, 1, torch.float64)[0]
+    folded = fold([], like=like)
+    assert folded.color.dtype == torch.float64
+    assert folded.color.shape == like.color.shape
+    assert bool((folded.color == 0).all() and (folded.transmittance == 1).all())
+
+
+def test_a_background_shows_through_nothing():
+    background = torch.tensor([0.1, 0.5, 0.9])
+    assert torch.equal(composite(empty_layer(2, 5), background), background.expand(2, 5, 3))

@@ -1,0 +1,86 @@
+"""Layers are kept under limits, rounded the same wherever they lie, and drawn anew where there is no room."""
+
+import pytest
+import torch
+
+from abcd_ns.engine.layers import visit_layers as visit
+from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
+from abcd_ns.engine.layers.painter import Parts
+from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import Layer
+from tests.engine.train.test_coordinator import equal
+from tests.reference.scenes import make_coordinator, whole_scene
+
+CPU = torch.device("cpu")
+
+
+def kept(height: int = 5, width: int = 7, near: Splats | None = None) -> Kept:
+    return Kept(rounded(torch.rand(2, height, width, 4)), near)
+
+
+def test_packing_is_undone_by_unpacking():
+    parts = Parts(*(Layer(torch.rand(5, 7, 3), torch.rand(5, 7)) for _ in range(2)))
+    again = unpacked(packed(parts))
+    for side in ("front", "back"):
+        assert torch.equal(getattr(again, side).color, getattr(parts, side).color)
+        assert torch.equal(getattr(again, side).transmittance, getattr(parts, side).transmittance)
+
+
+def test_rounding_keeps_eleven_bits_and_nothing_and_everything():
+    layers = torch.rand(2, 50, 40, 4) * torch.tensor([1.0, 1.0, 300.0, 1.0])
+    half = rounded(layers)
+    assert half.dtype == torch.float16
+    assert float(((half.float() - layers) / layers).abs().max()) <= 2**-11
+    exact = torch.tensor([0.0, 1.0]).expand(2, 3, 2, 2).reshape(2, 3, 1, 4)
+    assert torch.equal(rounded(exact).float(), exact)
+    assert torch.equal(rounded(layers.double()), layers.double())
+
+
+def test_a_colour_beyond_halves_is_their_largest():
+    assert torch.equal(rounded(torch.full((2, 1, 1, 4), 1e6)).float(), torch.full((2, 1, 1, 4), 65504.0))
+
+
+@pytest.mark.parametrize("near", [None, Splats(torch.rand(11, 3))])
+def test_what_has_no_room_is_not_kept(near):
+    one = kept(near=near)
+    assert one.nbytes == 2 * 5 * 7 * 4 * 2 + (0 if near is None else 11 * 3 * 4)
+    store = LayerStore(CPU, 2 * one.nbytes + 1, ram_bytes=1 << 30)
+    for view in range(3):
+        store.put(view, one)
+    assert store.nbytes == 2 * one.nbytes
+    assert [store.get(view) is None for view in range(4)] == [False, False, True, True]
+    assert torch.equal(store.get(1).layers, one.layers)
+    store.put(3, kept(0, 0))  # a smaller one has room yet
+    assert store.get(3) is not None
+
+
+def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start):
+    results, drawn = [], []
+    for room in (1 << 30, 60_000, 0):
+        (folder := tmp_path / str(room)).mkdir()
+        coordinator = make_coordinator(folder, start, views, blocks=2, steps=10, layer_bytes=room)
+        while not coordinator.finished:
+            train_step(coordinator, photos)
+            if coordinator._layers is not None:
+                assert coordinator._layers.nbytes <= room
+                drawn.append((room, coordinator._layers.nbytes))
+        results.append(whole_scene(coordinator))
+    assert equal(results[0], results[1])
+    assert equal(results[0], results[2])
+    most = {room: max(nbytes for of, nbytes in drawn if of == room) for room, _ in drawn}
+    assert 0 == most[0] < most[60_000] < most[1 << 30]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_layers_that_are_not_finite_are_an_error_that_says_so(
+    tmp_path, views, photos, start, monkeypatch, bad
+):
+    def spoilt(parts):
+        layers = packed(parts)
+        layers[1, 2, 3, 0] = bad
+        return layers
+
+    monkeypatch.setattr(visit, "packed", spoilt)
+    with pytest.raises(RuntimeError, match=r"layers around block \d have NaN .* diverged"):
+        train(make_coordinator(tmp_path, start, views, blocks=2, steps=10), photos)

@@ -1,0 +1,203 @@
+"""Layers: what they hold, and that folding them gives the picture of the whole scene (invariants 2 and 9)."""
+
+import math
+
+import pytest
+import torch
+
+from abcd_ns.engine.layers.compositing import fold
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.render import Shot
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.space.intervals import cell_windows, ray_interval
+from abcd_ns.engine.space.ordering import front_to_back
+from abcd_ns.engine.space.partition import build_grid, build_kd
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, Layer, View
+from tests.reference.rasterizer_scenes import as_leaves, probe, relative_error
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+DRAW = TorchRasterizer(compile="never")
+BY_SIDE = {side: TorchRasterizer(compile="never", tile_side=side) for side in (1, 4, 16)}
+"""Rasterizers by the side of their tiles, and so of their windows."""
+SETTINGS = PaintSettings(sh_degree=1)
+
+
+def painter(
+    tree: BlockTree, gaussians: Gaussians, views, *, ownership="fragments", pass_gaussians=0, draw=DRAW
+) -> Painter:
+    scene = MemoryScene(tree, gaussians)
+    return Painter(scene, views, draw, ownership=ownership, pass_gaussians=pass_gaussians)
+
+
+def merged(gaussians: Gaussians, view: View) -> Layer:
+    with torch.no_grad():
+        return DRAW(gaussians, view, sh_degree=1).layer
+
+
+def difference(a: Layer, b: Layer) -> float:
+    return max(float((a.color - b.color).abs().max()), float((a.transmittance - b.transmittance).abs().max()))
+
+
+def views_in_and_out(dtype) -> list[View]:
+    """A camera outside the scene, and two that stand among the Gaussians."""
+    size = {"width": 32, "height": 24, "dtype": dtype}
+    return [*ring_of_views(1, **size), *ring_of_views(2, radius=0.7, **size)]
+
+
+def translucent(count: int, size: float = 0.1, dtype=torch.float64) -> Gaussians:
+    """So thin that no pixel reaches T <= 1e-4, where drawing stops: the merged picture stops for the whole
+    ray, a layer for its own part of it, and the two may then differ by as much as is left out, 1e-4."""
+    gaussians = random_gaussians(count, size=size, dtype=dtype)
+    gaussians.opacities[:] -= 2.5
+    return gaussians
+
+
+@pytest.mark.parametrize("tree", ["kd", "grid", "thin"])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance", "side"),
+    [
+        (torch.float64, 1e-12, 1),
+        (torch.float64, 1e-12, 4),
+        (torch.float64, 1e-12, 16),
+        (torch.float32, 1e-6, 4),
+    ],
+)
+def test_folding_cells_by_fragments_gives_the_merged_picture(tree, dtype, tolerance, side):
+    gaussians = translucent(200, 0.12, dtype)
+    cut = {
+        "kd": lambda: build_kd(gaussians.means, 7),
+        "grid": lambda: build_grid(gaussians.means, counts=(2, 2, 2)),
+        "thin": lambda: build_grid(gaussians.means, counts=(6, 1, 1)),
+    }[tree]()
+    views = views_in_and_out(dtype)
+    paint = painter(cut, gaussians, views, draw=BY_SIDE[side])
+    for view in views:
+        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < tolerance
+
+
+@pytest.mark.parametrize("side", [4, 16])
+def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(side):
+    gaussians, (view, *_) = translucent(60, 0.12), views_in_and_out(torch.float64)
+    tree, draw = build_kd(gaussians.means, 5), BY_SIDE[side]
+    weights = probe(view.height, view.width)[..., :4]
+
+    def gradients_of(layer_of) -> dict[str, torch.Tensor]:
+        leaves = as_leaves(gaussians)
+        layer = layer_of(leaves)
+        picture = torch.cat((layer.color, layer.transmittance[..., None]), dim=-1)
+        (picture * weights).sum().backward()
+        return {name: value.grad for name, value in leaves.items()}
+
+    def folded(leaves: Gaussians) -> Layer:
+        windows = cell_windows(tree, view, draw.window_grid(view.full), [tree.node_of(b) for b in range(5)])
+        drawn = {b: draw(leaves, view, sh_degree=1, z_window=window) for b, window in enumerate(windows)}
+        return fold([drawn[block].layer for block in front_to_back(tree, view.center)])
+
+    found = gradients_of(folded)
+    expected = gradients_of(lambda leaves: draw(leaves, view, sh_degree=1).layer)
+    for name in PARAM_NAMES:
+        assert relative_error(found[name], expected[name]) < 1e-10, name
+
+
+@pytest.mark.parametrize("pass_gaussians", [0, 60, 130, 1000])
+def test_how_many_blocks_share_a_pass_changes_nothing_by_fragments(pass_gaussians):
+    gaussians = translucent(200)
+    views = views_in_and_out(torch.float64)
+    paint = painter(build_kd(gaussians.means, 8), gaussians, views, pass_gaussians=pass_gaussians)
+    assert (len(paint.units()) == 1) == (pass_gaussians >= 200)
+    for view in views:
+        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12
+
+
+def test_folding_by_means_is_the_block_major_picture_not_the_merged_one():
+    gaussians = random_gaussians(200, size=0.15, dtype=torch.float64)
+    (view,) = ring_of_views(1, dtype=torch.float64)
+    tree = build_kd(gaussians.means, 6)
+    paint = painter(tree, gaussians, [view], ownership="means")
+    owner = tree.assign(gaussians.means)
+    color, light = torch.zeros(36, 48, 3, dtype=torch.float64), torch.ones(36, 48, dtype=torch.float64)
+    for unit in paint.order(paint.units(), view):
+        (block,) = tree.leaves(unit)
+        layer = merged(gaussians[owner == block], view)
+        color, light = color + light[..., None] * layer.color, light * layer.transmittance
+    assert difference(paint.picture(view, SETTINGS), Layer(color, light)) < 1e-12
+    assert difference(Layer(color, light), merged(gaussians, view)) > 1e-3
+
+
+@pytest.mark.parametrize("ownership", ["fragments", "means"])
+def test_units_hold_every_block_but_the_active_one_exactly_once(ownership):
+    gaussians = random_gaussians(300)
+    tree = build_kd(gaussians.means, 11)
+    for pass_gaussians in (0, 90, 10_000):
+        paint = painter(tree, gaussians, ring_of_views(1), ownership=ownership, pass_gaussians=pass_gaussians)
+        for active in range(11):
+            held = [b for unit in paint.units(exclude=active) for b in tree.leaves(unit) if b != active]
+            assert sorted(held) == [b for b in range(11) if b != active]
+
+
+@pytest.mark.parametrize(("pass_gaussians", "side"), [(0, 4), (60, 4), (10_000, 4), (60, 16)])
+def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussians, side):
+    """Wherever the window lies, and however many units share the frozen blocks."""
+    gaussians = translucent(200)
+    views = views_in_and_out(torch.float64)
+    tree = build_kd(gaussians.means, 8)
+    owner = tree.assign(gaussians.means)
+    own, frozen = gaussians[owner == 3], gaussians[owner != 3]
+    draw = BY_SIDE[side]
+    paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians, draw=draw)
+    units = paint.units(exclude=3)
+    loaded = {unit: paint.load(unit, exclude=3) for unit in units}
+    assert sum(unit.own for unit in loaded.values()) == len(frozen)
+    for view in views:
+        windows = [
+            ray_interval(tree.cell(3).grown(0.2), view, draw.window_grid(view.full)),
+            draw.depth_window(own, view, crop=view.full, visible=0.05),
+        ]
+        for window in windows:
+            parts = {
+                unit: paint.paint(unit, loaded[unit], view, view.full, SETTINGS, active=3, window=window)
+                for unit in units
+            }
+            cut = paint.fold(parts, view, view.full)
+            splats = cut.inside.planes if cut.inside is not None else torch.zeros(2, 0)
+            assert splats.unique(dim=1).shape == splats.shape
+            with torch.no_grad():
+                (inside,) = draw.draw(own[:0], [Shot(view, view.full, cut.inside, window)], sh_degree=1)
+            layers = (cut.front, inside.layer, cut.back)
+            assert difference(fold(list(layers)), merged(frozen, view)) < 1e-12
+
+
+def test_the_picture_does_not_depend_on_names_order_or_empty_blocks():
+    gaussians = random_gaussians(150, size=0.1)
+    (view,) = ring_of_views(1)
+    tree = build_kd(gaussians.means, 4)
+    expected = painter(tree, gaussians, [view]).picture(view, SETTINGS)
+    generator = torch.Generator().manual_seed(3)
+    shuffled = gaussians[torch.randperm(150, generator=generator)]
+    halved = tree.split(2, axis=0, threshold=float(tree.cell(2).contains(gaussians.means).float().mean()))
+    with_empty = tree.split(0, axis=2, threshold=-50.0)
+    for other_tree, scene in ((tree, shuffled), (halved, gaussians), (with_empty, gaussians)):
+        assert difference(painter(other_tree, scene, [view]).picture(view, SETTINGS), expected) < 1e-6
+
+
+def test_a_crop_of_a_layer_is_the_layers_crop():
+    gaussians = random_gaussians(150, size=0.1)
+    (view,) = ring_of_views(1)
+    paint = painter(build_kd(gaussians.means, 5), gaussians, [view])
+    whole, crop = paint.picture(view, SETTINGS), Crop(16, 16, 32, 16)
+    part = paint.picture(view, SETTINGS, crop)
+    assert torch.equal(part.color, whole.color[crop.slices])
+    assert torch.equal(part.transmittance, whole.transmittance[crop.slices])
+
+
+def test_giants_and_far_gaussians_are_drawn_in_every_cell_they_reach():
+    gaussians = translucent(100, 0.05)
+    gaussians.scales[:3] = math.log(1.5)
+    gaussians.means[3:6] *= 40.0
+    gaussians.scales[3:6] = math.log(8.0)
+    views = views_in_and_out(torch.float64)
+    paint = painter(build_kd(gaussians.means, 8), gaussians, views)
+    for view in views:
+        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < 1e-12

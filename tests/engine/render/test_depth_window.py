@@ -1,0 +1,130 @@
+"""The z window of a visit holds what shows, and what is cut by it adds up to the merged picture."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from abcd_ns.engine.layers.compositing import sandwich
+from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow
+from abcd_ns.engine.types import Crop, Gaussians, View
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+DRAW = TorchRasterizer(compile="never")
+SIDE = DRAW.tile_side
+STOP = 2e-4
+"""Drawing stops at T <= 1e-4, so that weights may differ from those by hand by about that much."""
+SEEDS = st.integers(0, 10**6)
+
+
+def scene(seed: int, n: int = 40, size: float = 0.1) -> tuple[Gaussians, View]:
+    (view,) = ring_of_views(1, width=32, height=24, dtype=torch.float64)
+    return random_gaussians(n, seed=seed, size=size, dtype=torch.float64), view
+
+
+def weights_by_hand(gaussians: Gaussians, view: View) -> tuple[torch.Tensor, torch.Tensor]:
+    """(alpha T [n, h, w], camera z [n]), nearest first: one Gaussian drawn after the other."""
+    splats = DRAW.project(gaussians, view)
+    order = splats.depths.argsort(stable=True)
+    alone = [Shot(view, view.full, splats[index[None]]) for index in order]
+    light = torch.ones(view.height, view.width, dtype=torch.float64)
+    weights = []
+    for raster in DRAW.draw(gaussians[:0], alone, sh_degree=0):
+        weights.append((1 - raster.transmittance) * light)
+        light = light * raster.transmittance
+    return torch.stack(weights), splats.depths[order]
+
+
+def means_of_tiles(image: torch.Tensor) -> torch.Tensor:
+    """[..., tile row, tile column]."""
+    rows, cols = image.shape[-2] // SIDE, image.shape[-1] // SIDE
+    return image.reshape(*image.shape[:-2], rows, SIDE, cols, SIDE).mean(dim=(-3, -1))
+
+
+@settings(max_examples=15)
+@given(seed=SEEDS)
+def test_what_the_window_leaves_out_on_either_side_weighs_less_than_said(seed):
+    gaussians, view = scene(seed)
+    weights, z = weights_by_hand(gaussians, view)
+    weights, z = means_of_tiles(weights), z[:, None, None]
+    infinity = torch.tensor(math.inf, dtype=torch.float64)
+    for visible in (0.002, 0.02, 0.1):
+        window = DRAW.depth_window(gaussians, view, crop=view.full, visible=visible)
+        near = window.near.view(weights.shape[1:])
+        far = window.far.view(weights.shape[1:])
+        assert float((weights * (z < near)).sum(dim=0).max()) < visible + STOP
+        assert float((weights * (z >= far)).sum(dim=0).max()) < visible + STOP
+        # And it is no wider than that takes, where there is more to be seen than may be left out.
+        head, tail = weights.cumsum(0), weights.flip(0).cumsum(0).flip(0)
+        least = torch.where(head >= visible - STOP, z, infinity).amin(dim=0)
+        most = torch.where(tail >= visible - STOP, z, -infinity).amax(dim=0)
+        shows = weights.sum(dim=0) > 2 * (visible + STOP)
+        assert bool((near >= least)[shows].all())
+        assert bool((far <= most.nextafter(infinity))[shows].all())
+
+
+def test_many_faint_gaussians_together_count():
+    """Each by itself weighs less than the window may leave out; all together they are what is seen."""
+    gaussians, view = scene(0, n=400, size=0.3)
+    gaussians.opacities[:] = math.log(0.02 / 0.98)
+    window = DRAW.depth_window(gaussians, view, crop=view.full, visible=0.05)
+    through = DRAW(gaussians, view, sh_degree=0, z_window=window)
+    whole = DRAW(gaussians, view, sh_degree=0)
+    assert 1 - float(whole.transmittance.mean()) > 0.4
+    assert float((through.transmittance - whole.transmittance).mean()) < 0.1
+
+
+def test_where_nothing_shows_the_window_is_empty_and_in_the_midst():
+    gaussians, view = scene(0, n=3, size=0.02)
+    window = DRAW.depth_window(gaussians, view, crop=view.full, visible=0.01)
+    z = DRAW.project(gaussians, view).depths
+    empty = window.near >= window.far
+    assert 0.5 < float(empty.double().mean()) < 1
+    assert bool((window.near[empty] == window.far[empty]).all())
+    midst = window.near[empty]
+    assert float(z.min()) - 1e-9 < float(midst.min()) <= float(midst.max()) < float(z.max()) + 1e-9
+
+
+def test_tiles_that_stick_out_of_the_crop_count_their_own_pixels():
+    gaussians, view = scene(5)
+    visible, crop = 0.2, Crop(0, 0, 32, 21)  # the last row of tiles has a single row of pixels
+    window = DRAW.depth_window(gaussians, view, crop=crop, visible=visible)
+    shows = (window.near < window.far).view(6, 8)[-1]
+    weights, _ = weights_by_hand(gaussians, view)
+    total = weights.sum(dim=0)[20].view(8, SIDE).mean(dim=1)
+    assert bool(((total > visible) & (total < visible * SIDE)).any())  # where counting 16 pixels would show
+    clear = (total - visible).abs() > STOP
+    assert torch.equal(shows[clear], total[clear] >= visible)
+
+
+@pytest.mark.parametrize("visible", [0.0, 0.01])
+def test_a_window_of_no_gaussians_is_empty(visible):
+    _, view = scene(0)
+    window = DRAW.depth_window(Gaussians.empty(0), view, crop=Crop(3, 5, 20, 9), visible=visible)
+    assert window.near.shape == (window.grid.tiles,)
+    assert bool((window.near == window.far).all())
+
+
+@settings(max_examples=15)
+@given(seed=SEEDS, crop=st.sampled_from([None, Crop(5, 3, 18, 14)]))
+def test_at_0_front_inside_and_back_are_the_merged_picture(seed, crop):
+    everyone, view = scene(seed, n=60)
+    everyone.opacities[:] -= 2.5  # so thin that no drawing stops early
+    crop = crop or view.full
+    active, frozen = everyone[torch.arange(20)], everyone[torch.arange(20, 60)]
+    window = DRAW.depth_window(active, view, crop=crop, visible=0.0)
+    assert torch.equal(
+        DRAW(active, view, sh_degree=0, crop=crop, z_window=window).color,
+        DRAW(active, view, sh_degree=0, crop=crop).color,
+    )
+    span = ZWindow.everything(window.grid, "cpu", torch.float64)
+    before, behind = span.before(window), span.behind(window)
+    cut = DRAW.cut(frozen, view, front=before, inside=window, back=behind, crop=crop, sh_degree=0)
+    assert torch.equal(cut.members, cut.members.unique())
+    assert torch.equal(cut.inside.planes, DRAW.project(frozen, view)[cut.members].planes)
+    (middle,) = DRAW.draw(active, [Shot(view, crop, cut.inside, window)], sh_degree=0)
+    found = sandwich(cut.front, middle.layer, cut.back, torch.zeros(3, dtype=torch.float64))
+    whole = DRAW(everyone, view, sh_degree=0, crop=crop)
+    assert float((found - whole.color).abs().max()) < 1e-12

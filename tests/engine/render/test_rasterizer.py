@@ -1,0 +1,327 @@
+"""TorchRasterizer against the naive twin: forward, gradient, crops, windows, frozen Gaussians."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
+from abcd_ns.engine.render.cpu.binning import bin_splats
+from abcd_ns.engine.render.projection import project
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
+from tests.reference.naive_rasterizer import naive_rasterize
+from tests.reference.rasterizer_scenes import (
+    as_leaves,
+    gradients,
+    probe,
+    random_gaussians,
+    relative_error,
+    small_view,
+    stacked,
+)
+
+VIEW = small_view()
+CROP = Crop(5, 3, 22, 15)
+EAGER = TorchRasterizer("never")
+
+
+def window_for(grid: TileGrid, seed: int = 3) -> ZWindow:
+    """Random windows; about one in ten is empty."""
+    generator = torch.Generator().manual_seed(seed)
+    near = 4 * torch.rand(grid.tiles, generator=generator, dtype=torch.float64) + 1
+    far = near + 2.5 * torch.rand(grid.tiles, generator=generator, dtype=torch.float64) - 0.25
+    return ZWindow(grid, near, far)
+
+
+def by_pixel(window: ZWindow) -> torch.Tensor:
+    """(near, far) of each pixel, [2, h, w]."""
+    planes = torch.stack((window.near, window.far))[:, None]
+    return window.grid.to_image(planes.expand(-1, window.grid.pixels_per_tile, -1))
+
+
+@pytest.mark.parametrize(
+    ("sh_degree", "antialiased", "crop", "with_frozen", "window_side"),
+    [
+        (0, False, None, False, 0),
+        (1, True, None, False, 0),
+        (2, False, CROP, False, 0),
+        (3, False, None, True, 0),
+        (3, True, CROP, False, 4),
+        (3, False, CROP, True, 4),
+        (1, False, CROP, True, 16),
+    ],
+)
+def test_equals_the_naive_twin(sh_degree, antialiased, crop, with_frozen, window_side):
+    gaussians, frozen = random_gaussians(12), random_gaussians(8, seed=7) if with_frozen else None
+    window = window_for(TileGrid(crop or VIEW.full, window_side)) if window_side else None
+    near, far = by_pixel(window) if window else (None, None)
+    options = {"sh_degree": sh_degree, "crop": crop, "frozen": frozen, "antialiased": antialiased}
+
+    expected, expected_grads = gradients(
+        lambda g: naive_rasterize(g, VIEW, near=near, far=far, **options), gaussians
+    )
+    image, grads = gradients(lambda g: EAGER(g, VIEW, z_window=window, **options), gaussians)
+
+    torch.testing.assert_close(image, expected, rtol=1e-11, atol=1e-12)
+    for name in PARAM_NAMES:
+        assert relative_error(grads[name], expected_grads[name]) < 1e-10, name
+    assert expected_grads["means"].abs().max() > 0
+
+
+def test_scene_has_what_the_tests_are_about():
+    """Rays that stop early, alphas at the clamp, Gaussians outside the image: or the oracle proves little."""
+    gaussians = random_gaussians(12)
+    raster = naive_rasterize(gaussians, VIEW, sh_degree=0)
+    assert raster.fragments > 700
+    assert 0 in raster.radii
+    many = random_gaussians(25)
+    opaque = Gaussians(**{n: v for n, v in many.items() if n != "opacities"}, opacities=many.opacities + 9)
+    dense = naive_rasterize(opaque, VIEW, sh_degree=0)
+    expected = EAGER(opaque, VIEW, sh_degree=0)
+    assert dense.transmittance.min() < 2e-3
+    torch.testing.assert_close(stacked(expected), stacked(dense), rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize(("side", "chunk"), [(1, 2), (2, 16), (8, 3), (16, 1)])
+def test_tile_size_and_chunk_do_not_matter(side, chunk):
+    gaussians = random_gaussians(40)
+    image, grads = gradients(lambda g: EAGER(g, VIEW, sh_degree=2), gaussians)
+    other = TorchRasterizer("never", tile_side=side, chunk=chunk)
+    image2, grads2 = gradients(lambda g: other(g, VIEW, sh_degree=2), gaussians)
+    torch.testing.assert_close(image2, image, rtol=1e-13, atol=1e-13)
+    for name in PARAM_NAMES:
+        assert relative_error(grads2[name], grads[name]) < 1e-11, name
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@given(data=st.data())
+@settings(max_examples=12, derandomize=True, deadline=None)
+def test_crop_is_bit_equal_to_the_crop_of_the_full_image(dtype, data):
+    view = small_view(53, 41, dtype=dtype)
+    gaussians = random_gaussians(150, seed=1, sh_degree=1, dtype=dtype)
+    x, y = data.draw(st.integers(0, 52)), data.draw(st.integers(0, 40))
+    crop = Crop(x, y, data.draw(st.integers(1, 53 - x)), data.draw(st.integers(1, 41 - y)))
+    full = EAGER(gaussians, view, sh_degree=1)
+    part = EAGER(gaussians, view, sh_degree=1, crop=crop)
+    assert torch.equal(stacked(part), stacked(full)[crop.slices])
+    assert torch.equal(part.info["radii"], full.info["radii"])
+
+
+def test_gradients_of_crops_add_up_to_that_of_the_image():
+    gaussians = random_gaussians(30)
+    weights = probe(VIEW.height, VIEW.width)
+    crops = [Crop(0, 0, 19, 21), Crop(19, 0, 18, 8), Crop(19, 8, 18, 13)]
+
+    whole, parts = as_leaves(gaussians), as_leaves(gaussians)
+    (stacked(EAGER(whole, VIEW, sh_degree=1)) * weights).sum().backward()
+    for crop in crops:
+        (stacked(EAGER(parts, VIEW, sh_degree=1, crop=crop)) * weights[crop.slices]).sum().backward()
+    for name in PARAM_NAMES:
+        assert relative_error(getattr(parts, name).grad, getattr(whole, name).grad) < 1e-11, name
+
+
+def test_absgrad_sums_absolute_pixel_gradients():
+    gaussians = random_gaussians(6)
+    crop = Crop(9, 5, 12, 8)
+    weights = probe(crop.height, crop.width)
+
+    leaves = as_leaves(gaussians)
+    naive = naive_rasterize(leaves, VIEW, sh_degree=1, crop=crop)
+    per_pixel = (stacked(naive) * weights).sum(-1).flatten()
+    expected = torch.zeros_like(naive.means2d)
+    for value in per_pixel:
+        (grad,) = torch.autograd.grad(value, naive.means2d, retain_graph=True, allow_unused=True)
+        expected += 0 if grad is None else grad.abs()
+
+    raster = EAGER(as_leaves(gaussians), VIEW, sh_degree=1, crop=crop, frozen=None, absgrad=True)
+    raster.info["means2d"].retain_grad()
+    (stacked(raster) * weights).sum().backward()
+    assert raster.info["means2d"].absgrad.shape == (1, 6, 2)
+    assert relative_error(raster.info["means2d"].absgrad[0], expected) < 1e-10
+    assert (raster.info["means2d"].absgrad >= raster.info["means2d"].grad.abs() - 1e-12).all()
+
+
+def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():
+    gaussians, frozen = random_gaussians(12), random_gaussians(9, seed=7)
+    leaves = as_leaves(gaussians)
+    naive = naive_rasterize(leaves, VIEW, sh_degree=1, frozen=frozen)
+    weights = probe(VIEW.height, VIEW.width)
+    (expected,) = torch.autograd.grad((stacked(naive) * weights).sum(), naive.means2d)
+
+    raster = EAGER(as_leaves(gaussians), VIEW, sh_degree=1, frozen=frozen, absgrad=True)
+    info = raster.info
+    info["means2d"].retain_grad()
+    (stacked(raster) * weights).sum().backward()
+    assert info["means2d"].shape == (1, 12, 2)
+    assert relative_error(info["means2d"].grad[0], expected) < 1e-10
+    assert info["means2d"].absgrad.shape == (1, 12, 2)
+    assert info["radii"].shape == (1, 12)
+    assert info["radii"][0].tolist() == naive.radii
+    assert (info["width"], info["height"], info["n_cameras"]) == (37, 21, 1)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_fold_of_complementary_windows_is_the_whole_drawing(dtype, tolerance):
+    gaussians, view = random_gaussians(60, dtype=dtype), small_view(dtype=dtype)
+    faint = Gaussians(
+        **{n: v for n, v in gaussians.items() if n != "opacities"}, opacities=gaussians.opacities - 3
+    )
+    whole = EAGER(faint, view, sh_degree=3)
+    assert whole.transmittance.min() > 1e-4  # no ray stops early: a layer of its own would not know
+    grid = EAGER.window_grid(view.full)
+    cuts = torch.rand(3, grid.tiles, generator=torch.Generator().manual_seed(0)).to(dtype) * 4 + 2
+    edge = torch.full_like(cuts[:1], math.inf)
+    bounds = torch.cat((-edge, cuts.sort(dim=0).values, edge))
+    color, transmittance = torch.zeros_like(whole.color), torch.ones_like(whole.transmittance)
+    for near, far in pairwise(bounds):
+        layer = EAGER(faint, view, sh_degree=3, z_window=ZWindow(grid, near, far)).layer
+        color = color + transmittance[..., None] * layer.color
+        transmittance = transmittance * layer.transmittance
+    torch.testing.assert_close(color, whole.color, rtol=0, atol=tolerance)
+    torch.testing.assert_close(transmittance, whole.transmittance, rtol=0, atol=tolerance)
+
+
+def test_window_work_is_in_proportion_to_its_fragments():
+    gaussians = random_gaussians(300)
+    splats, grid = project(gaussians, VIEW), TileGrid(VIEW.full, 4)
+    everything = bin_splats(splats, grid, 16)
+    cut = float(splats.depths[splats.radii > 0].quantile(0.1))
+    everywhere = ZWindow.everything(grid, "cpu", torch.float64)
+    window = replace(everywhere, far=torch.full_like(everywhere.far, cut))
+    nothing_left = ZWindow(grid, everywhere.far, everywhere.near)
+    masked = torch.ones(300, dtype=torch.bool)
+    assert (
+        bin_splats(splats, grid, 16, masked=masked, window=window).slots.numel()
+        < 0.35 * everything.slots.numel()
+    )
+    assert bin_splats(splats, grid, 16, masked=masked, window=nothing_left).slots.numel() == 0
+    assert (
+        bin_splats(splats, grid, 16, masked=~masked, window=nothing_left).slots.numel()
+        == everything.slots.numel()
+    )
+
+
+def test_lists_hold_every_fragment_and_few_others():
+    gaussians = random_gaussians(60)
+    faint = Gaussians(
+        **{n: v for n, v in gaussians.items() if n != "opacities"}, opacities=gaussians.opacities - 4
+    )
+    drawn = naive_rasterize(faint, VIEW, sh_degree=0).fragments
+    lists = bin_splats(project(faint, VIEW), TileGrid(VIEW.full, 1), 4)
+    assert drawn <= lists.fragments <= 1.05 * drawn + 10  # with tiles of one pixel, lists are fragments
+
+
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_no_gaussians(with_frozen):
+    nothing = as_leaves(Gaussians.empty(dtype=torch.float64))
+    frozen = random_gaussians(5) if with_frozen else None
+    raster = EAGER(nothing, VIEW, sh_degree=3, frozen=frozen, absgrad=True)
+    raster.info["means2d"].retain_grad()
+    stacked(raster).sum().backward()
+    assert raster.info["means2d"].grad.shape == (1, 0, 2)
+    assert raster.color.shape == (VIEW.height, VIEW.width, 3)
+    assert bool((raster.transmittance == 1).all()) is not with_frozen
+
+
+def test_what_cannot_be_seen_leaves_nothing_and_no_gradient_breaks():
+    gaussians = random_gaussians(6)
+    z = torch.tensor([-3.0, 0.0, 0.005, -1e-9, 2e10, 1e6], dtype=torch.float64)
+    center, forward = VIEW.center, VIEW.viewmat[2, :3]
+    odd = Gaussians(
+        means=center + z[:, None] * forward, **{n: v for n, v in gaussians.items() if n != "means"}
+    )
+    leaves = as_leaves(odd)
+    raster = EAGER(leaves, VIEW, sh_degree=3, antialiased=True)
+    stacked(raster).sum().backward()
+    assert raster.info["radii"][0, :5].tolist() == [0] * 5
+    for name, value in leaves.items():
+        assert value.grad.isfinite().all(), name
+        assert not value.grad[:5].any(), name
+
+
+def test_needle_and_giant_gaussians_have_finite_gradients_in_float32():
+    gaussians = random_gaussians(8, dtype=torch.float32)
+    scales = torch.tensor([[-12.0, -12, 3], [6, 6, 6], [-20, -20, -20], [3, -9, -9]]).repeat(2, 1)
+    odd = Gaussians(scales=scales, **{n: v for n, v in gaussians.items() if n != "scales"})
+    image, grads = gradients(
+        lambda g: EAGER(g, small_view(dtype=torch.float32), sh_degree=3, antialiased=True), odd
+    )
+    assert image.isfinite().all()
+    assert all(grad.isfinite().all() for grad in grads.values())
+
+
+def test_equal_depths_are_drawn_in_the_order_of_their_index():
+    gaussians = random_gaussians(2, sh_degree=0)
+    flat = Gaussians(
+        means=torch.tensor([[0.0, 0, 4]] * 2, dtype=torch.float64),
+        scales=torch.zeros(2, 3, dtype=torch.float64),
+        quats=gaussians.quats,
+        features_dc=torch.tensor([[1.0, -1, -1], [-1, 1, -1]], dtype=torch.float64),
+        features_rest=gaussians.features_rest,
+        opacities=torch.full((2, 1), 3.0, dtype=torch.float64),
+    )
+    color = EAGER(flat, VIEW, sh_degree=0).color
+    assert color[10, 18, 0] > color[10, 18, 1]
+    swapped = EAGER(flat[torch.tensor([1, 0])], VIEW, sh_degree=0).color
+    assert swapped[10, 18, 1] > swapped[10, 18, 0]
+
+
+def test_backward_keeps_little():
+    """Saved values per fragment: five planes per chunk of 8, not the dozens that autograd would keep."""
+    gaussians = random_gaussians(300, sh_degree=0)
+    changed = {"scales": gaussians.scales + 2, "opacities": torch.full_like(gaussians.opacities, -4.5)}
+    wide = Gaussians(**{**dict(gaussians.items()), **changed})
+    fragments = bin_splats(project(wide, VIEW), TileGrid(VIEW.full, 4), 8).fragments
+    saved = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: (saved.append(x.numel()), x)[1], lambda x: x):
+        EAGER(as_leaves(wide), VIEW, sh_degree=0)
+    assert fragments > 60_000
+    assert sum(saved) < 0.75 * fragments + 150 * 300  # 150 values per Gaussian: projection and colours
+
+
+def test_nothing_is_saved_without_gradients():
+    with torch.autograd.graph.saved_tensors_hooks(lambda _: pytest.fail("saved a tensor"), lambda x: x):
+        raster = EAGER(random_gaussians(20), VIEW, sh_degree=3)
+    assert not raster.color.requires_grad
+
+
+def test_clear_errors():
+    gaussians = random_gaussians(3, sh_degree=1)
+    with pytest.raises(ValueError, match="sh_degree is 2"):
+        EAGER(gaussians, VIEW, sh_degree=2)
+    with pytest.raises(ValueError, match="tile_side is 5"):
+        TorchRasterizer(tile_side=5)
+    for grid in (TileGrid(CROP, 4), TileGrid(VIEW.full, 2)):
+        with pytest.raises(ValueError, match="a window on"):
+            EAGER(gaussians, VIEW, sh_degree=0, z_window=window_for(grid))
+    with pytest.raises(ValueError, match="window_side is 6"):
+        TorchRasterizer(window_side=6)
+    with pytest.raises(ValueError, match="CUDA device"):
+        make_rasterizer("gsplat", "cpu")
+    assert make_rasterizer("auto", "cpu").name == TorchRasterizer.name
+
+
+def test_each_view_of_a_batch_counts_by_its_own_size():
+    """Density control finds for views of two sizes drawn together what it finds for each by itself."""
+    views = [small_view(*size, dtype=torch.float32) for size in ((37, 21), (80, 30), (37, 21))]
+    control, gaussians = DensityControl(DensityConfig()), random_gaussians(12, dtype=torch.float32)
+
+    def counted(batch: list[View], cameras: int) -> dict[str, torch.Tensor]:
+        leaves, shots = as_leaves(gaussians), [Shot(view, view.full) for view in batch]
+        rasters = EAGER.draw(leaves, shots, sh_degree=1, absgrad=True)
+        infos = tuple({id(r.info): {**r.info, "n_cameras": cameras} for r in rasters}.values())
+        control.before_backward(infos)
+        weights = [probe(*r.transmittance.shape, dtype=torch.float32) for r in rasters]
+        sum((stacked(r) * w).sum() for r, w in zip(rasters, weights, strict=True)).backward()
+        return control.count(gaussians.means, infos)
+
+    together, one_by_one = counted(views, 3), [counted([view], 3) for view in views]
+    for name, value in together.items():
+        torch.testing.assert_close(value, sum(each[name] for each in one_by_one), rtol=1e-4, atol=1e-4)
+    assert float(together["grad2d"].abs().max()) > 0

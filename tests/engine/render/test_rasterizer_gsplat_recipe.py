@@ -1,0 +1,237 @@
+"""The gsplat backend's own logic (crops, frozen Gaussians, absgrad), with CPU stand-ins for the CUDA ops.
+
+The real kernels are compared under tests/gpu.
+"""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from abcd_ns.engine.render import Rasterizer, Shot, TorchRasterizer, ZWindow, self_check
+from abcd_ns.engine.render.cuda import backend as gsplat_backend
+from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
+from tests.reference.gsplat_stand_ins import lent
+from tests.reference.rasterizer_scenes import (
+    as_leaves,
+    gradients,
+    probe,
+    random_gaussians,
+    relative_error,
+    small_view,
+    stacked,
+)
+
+VIEW = small_view(70, 45)
+
+
+@pytest.fixture
+def backend():
+    """A GsplatRasterizer on CPU stand-ins."""
+    with lent():
+        yield GsplatRasterizer()
+
+
+@pytest.mark.parametrize(
+    ("crop", "with_frozen", "antialiased", "sh_degree"),
+    [(None, False, True, 3), (Crop(16, 16, 40, 20), False, False, 0), (Crop(19, 5, 30, 31), True, False, 2)],
+)
+def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_degree):
+    gaussians, frozen = random_gaussians(40), random_gaussians(15, seed=3) if with_frozen else None
+    options = {"crop": crop, "frozen": frozen, "antialiased": antialiased, "sh_degree": sh_degree}
+    image, grads = gradients(lambda g: backend(g, VIEW, **options), gaussians)
+    expected, expected_grads = gradients(lambda g: TorchRasterizer("never")(g, VIEW, **options), gaussians)
+    torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
+    for name in PARAM_NAMES:
+        assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
+
+
+def test_the_near_plane_is_the_views(backend):
+    gaussians = random_gaussians(40)
+    near = 1.001 * float(backend.project(gaussians, VIEW).depths.median())
+    cut = replace(VIEW, near=near)
+    found, expected = (
+        draw(gaussians, cut, sh_degree=0).color for draw in (backend, TorchRasterizer("never"))
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
+    assert not torch.allclose(found, backend(gaussians, VIEW, sh_degree=0).color)
+
+
+@pytest.mark.parametrize("crop", [None, Crop(19, 5, 30, 31)])
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen):
+    frozen = random_gaussians(15, seed=3) if with_frozen else None
+    raster = backend(
+        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True
+    )
+    expected = TorchRasterizer("never")(
+        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True
+    )
+    size = raster.transmittance.shape
+    for drawing in (raster, expected):
+        drawing.info["means2d"].retain_grad()
+        (stacked(drawing) * probe(*size)).sum().backward()
+    info = raster.info
+    assert torch.equal(info["radii"], expected.info["radii"])
+    assert relative_error(info["means2d"].grad, expected.info["means2d"].grad) < 1e-8
+    assert relative_error(info["means2d"].absgrad, expected.info["means2d"].absgrad) < 1e-8
+    assert (info["width"], info["height"]) == (VIEW.width, VIEW.height)
+
+
+def test_nothing_to_draw(backend):
+    raster = backend(
+        as_leaves(Gaussians.empty(dtype=torch.float64)), VIEW, sh_degree=3, crop=Crop(3, 3, 5, 4)
+    )
+    raster.info["means2d"].retain_grad()
+    assert raster.color.shape == (4, 5, 3)
+    assert (raster.transmittance == 1).all()
+    assert raster.info["means2d"].shape == (1, 0, 2)
+
+
+def test_self_check_accepts_it(backend):
+    assert 0 < self_check(backend, "cpu") < 1e-4
+
+
+TILED = TorchRasterizer("never", tile_side=16)
+"""Windows are given by tiles, so that only tiles of one size can be compared."""
+
+
+def window_for(crop: Crop, seed: int = 3) -> ZWindow:
+    grid, generator = TILED.window_grid(crop), torch.Generator().manual_seed(seed)
+    near, size = torch.rand(2, grid.tiles, generator=generator, dtype=torch.float64)
+    return ZWindow(grid, 4 * near + 1, 4 * near + 1 + 3 * size)
+
+
+@pytest.mark.parametrize("with_frozen", [False, True])
+@pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])
+def test_a_z_window_is_that_of_the_torch_backend(backend, crop, with_frozen):
+    gaussians, frozen = random_gaussians(40), random_gaussians(30, seed=3) if with_frozen else None
+    options = {"crop": crop, "frozen": frozen, "sh_degree": 1, "z_window": window_for(crop)}
+    image, grads = gradients(lambda g: backend(g, VIEW, **options), gaussians)
+    expected, expected_grads = gradients(lambda g: TILED(g, VIEW, **options), gaussians)
+    torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
+    for name in PARAM_NAMES:
+        assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
+
+
+def test_a_window_masks_what_is_frozen_where_anything_is(backend):
+    """An empty window takes everything away, but for the Gaussians that take gradients beside frozen ones."""
+    gaussians, frozen, window = random_gaussians(9), random_gaussians(9, seed=3), window_for(VIEW.full)
+    nothing = replace(window, far=window.near)
+    alone = backend(gaussians, VIEW, sh_degree=0, z_window=nothing)
+    beside = backend(gaussians, VIEW, sh_degree=0, frozen=frozen, z_window=nothing)
+    assert bool((alone.transmittance == 1).all())
+    assert torch.equal(stacked(beside), stacked(backend(gaussians, VIEW, sh_degree=0)))
+
+
+def moved(view: View, by: float, **changes) -> View:
+    viewmat = view.viewmat.clone()
+    viewmat[0, 3] += by
+    return replace(view, viewmat=viewmat, **changes)
+
+
+def several_shots(backend, windowed: bool, with_frozen: bool) -> list[Shot]:
+    """Of different sizes and near planes, with crops anywhere; some with frozen splats, none, or without."""
+    views = [
+        VIEW,
+        moved(VIEW, 0.2),
+        moved(VIEW, -0.3),
+        moved(VIEW, 0.1, width=64),
+        moved(VIEW, 0.3, near=2.5),
+    ]
+    crops = [Crop(19, 5, 30, 31), Crop(0, 0, 17, 40), Crop(53, 16, 17, 29), Crop(32, 32, 32, 13), VIEW.full]
+    shots = []
+    for k, (view, crop) in enumerate(zip(views, crops, strict=True)):
+        frozen = random_gaussians((0, 9, 12, 5, 3)[k], seed=k)
+        seen = backend.project(frozen, view) if with_frozen and k < 4 else None
+        shots.append(Shot(view, crop, seen, window_for(crop, k) if windowed and k != 2 else None))
+    return shots
+
+
+@pytest.mark.parametrize("windowed", [False, True])
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, windowed, with_frozen):
+    found = []
+    for draws in (backend, TILED):
+        leaves, shots = as_leaves(random_gaussians(40)), several_shots(TILED, windowed, with_frozen)
+        rasters = draws.draw(leaves, shots, sh_degree=2, absgrad=True)
+        infos = {id(raster.info): raster.info for raster in rasters}
+        assert {info["n_cameras"] for info in infos.values()} == {len(shots)}
+        for info in infos.values():
+            info["means2d"].retain_grad()
+        sum((stacked(r) * probe(*r.transmittance.shape)).sum() for r in rasters).backward()
+        # One info for each size and near plane, or one for all: in the order of their cameras.
+        places = [(id(raster.info), k) for k, raster in enumerate(rasters)]
+        order = [k for info in infos for which, k in places if which == info]
+        assert sum(len(info["radii"]) for info in infos.values()) == len(shots)
+        values = {"picture": torch.cat([stacked(raster).flatten() for raster in rasters])}
+        values |= {name: value.grad for name, value in leaves.items()}
+        for name in ("grad", "absgrad"):
+            rows = torch.cat([getattr(info["means2d"], name) for info in infos.values()])
+            values[name] = rows[torch.tensor(order).argsort()]
+        found.append(values)
+    for name, value in found[0].items():
+        assert relative_error(value.detach(), found[1][name].detach()) < 1e-8, name
+
+
+def test_where_many_views_see_gaussians_is_what_each_says(backend, monkeypatch):
+    monkeypatch.setattr(gsplat_backend, "SURVEY_BYTES", 2 * gsplat_backend.SURVEYED_BYTES * 12)
+    gaussians = random_gaussians(12)
+    gaussians.means[0] -= 100
+    views = [moved(VIEW, 2.0 * k, width=(70, 50)[k % 2], near=(0.01, 2.0)[k % 3 == 0]) for k in range(-9, 10)]
+    found = backend.extents(gaussians, views)
+    torch.testing.assert_close(found, TILED.extents(gaussians, views))
+    assert torch.equal(found, Rasterizer.extents(backend, gaussians, views))
+    assert bool(found.isinf().any(dim=1).any())
+    nobody = backend.extents(Gaussians.empty(dtype=torch.float64), views)
+    assert bool((nobody[:, :2] > nobody[:, 2:]).all())
+
+
+@pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])
+def test_cut_is_that_of_the_torch_backend(backend, crop):
+    gaussians, inside = random_gaussians(60), window_for(crop)
+    span = ZWindow.everything(inside.grid, "cpu", torch.float64)
+    windows = {"front": span.before(inside), "inside": inside, "back": span.behind(inside)}
+    found, expected = (
+        draw.cut(gaussians, VIEW, crop=crop, sh_degree=1, **windows) for draw in (backend, TILED)
+    )
+    for side in ("front", "back"):
+        one, other = getattr(found, side), getattr(expected, side)
+        torch.testing.assert_close(one.color, other.color, rtol=1e-9, atol=1e-10)
+        torch.testing.assert_close(one.transmittance, other.transmittance, rtol=1e-9, atol=1e-10)
+    # gsplat's lists are longer: they hold what the square of the radius touches, drawn there or not.
+    assert set(expected.members.tolist()) <= set(found.members.tolist())
+    assert torch.equal(found.members, found.members.unique())
+    torch.testing.assert_close(found.inside.depths, backend.project(gaussians, VIEW).depths[found.members])
+
+
+@pytest.mark.parametrize("crop", [VIEW.full, Crop(19, 5, 30, 31)])
+@pytest.mark.parametrize("visible", [0.06, 0.3])
+def test_the_depth_window_is_that_of_the_torch_backend(backend, crop, visible):
+    gaussians = random_gaussians(30)
+    found, expected = (
+        draw.depth_window(gaussians, VIEW, crop=crop, visible=visible) for draw in (backend, TILED)
+    )
+    assert found.grid == expected.grid
+    torch.testing.assert_close(found.near, expected.near)
+    torch.testing.assert_close(found.far, expected.far)
+
+
+def test_the_depth_window_of_no_gaussians_is_empty(backend):
+    nobody = Gaussians.empty(1, dtype=torch.float64)
+    window = backend.depth_window(nobody, VIEW, crop=Crop(16, 0, 32, 20), visible=0.06)
+    assert bool((window.near == window.far).all())
+
+
+def test_a_loss_of_nothing_has_a_gradient(backend):
+    """A block whose last Gaussian was pruned is drawn until its visit ends."""
+    leaves = as_leaves(Gaussians.empty())
+    shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2
+    rasters = backend.draw(leaves, shots, sh_degree=3, absgrad=True)
+    control = DensityControl(DensityConfig())
+    control.before_backward(tuple(raster.info for raster in rasters))
+    sum(stacked(raster).sum() for raster in rasters).backward()
+    assert leaves.means.grad.shape == (0, 3)
+    assert control.count(leaves.means, tuple(raster.info for raster in rasters)) == {}

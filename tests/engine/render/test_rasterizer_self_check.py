@@ -1,0 +1,127 @@
+"""The self-check lets a sound backend pass and refuses one that is wrong in any way."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from abcd_ns.engine.render import TorchRasterizer, self_check
+from abcd_ns.engine.render.self_check import CASES, TOLERANCE, check_scene, errors, values_and_gradients
+from abcd_ns.engine.types import Crop, Gaussians
+
+
+def wrong_sign(gaussians: Gaussians) -> Gaussians:
+    """The right picture, and a gradient of the wrong sign."""
+    return dataclasses.replace(gaussians, quats=2 * gaussians.quats.detach() - gaussians.quats)
+
+
+def no_gradient(gaussians: Gaussians) -> Gaussians:
+    """The right picture, and no gradient."""
+    return dataclasses.replace(gaussians, opacities=gaussians.opacities.detach() + 0 * gaussians.opacities)
+
+
+class Broken(TorchRasterizer):
+    """A torch backend with a fault in one place."""
+
+    name = "broken"
+
+    def __init__(self, fault: str) -> None:
+        super().__init__("never")
+        self.fault = fault
+
+    def project(self, gaussians, view, **options):
+        splats = super().project(gaussians, view, **options)
+        return splats[torch.arange(len(splats) - 1)] if self.fault == "a frozen splat missing" else splats
+
+    def draw(self, gaussians, shots, *, absgrad, **options):
+        if self.fault == "wrong sign":
+            gaussians = wrong_sign(gaussians)
+        if self.fault == "no gradient":
+            gaussians = no_gradient(gaussians)
+        if self.fault == "antialiasing lost":
+            options["antialiased"] = False
+        if self.fault == "absgrad missing":
+            absgrad = False
+        if self.fault == "degree of harmonics lost":
+            options["sh_degree"] = max(options["sh_degree"], 3)
+        rasters = super().draw(
+            gaussians, [self._shot(shot, shots[0]) for shot in shots], absgrad=absgrad, **options
+        )
+        return tuple(self._raster(raster) for raster in rasters)
+
+    def _shot(self, shot, first):
+        crop = shot.crop
+        if self.fault == "crop shifted" and crop.x:
+            return dataclasses.replace(shot, crop=Crop(crop.x - 1, crop.y, crop.width, crop.height))
+        if self.fault == "frozen ignored":
+            return dataclasses.replace(shot, frozen=None)
+        if self.fault == "window ignored":
+            return dataclasses.replace(shot, z_window=None)
+        if self.fault == "window of own" and shot.frozen is not None:
+            return dataclasses.replace(shot, z_window=None)
+        if self.fault == "camera of the first":
+            return dataclasses.replace(shot, view=dataclasses.replace(shot.view, K=first.view.K))
+        return shot
+
+    def _raster(self, raster):
+        if self.fault in ("color", "depth"):
+            return dataclasses.replace(raster, **{self.fault: 1.01 * getattr(raster, self.fault)})
+        if self.fault == "transmittance":
+            return dataclasses.replace(raster, transmittance=raster.transmittance * float("nan"))
+        return raster
+
+
+def test_a_sound_backend_passes():
+    assert self_check(TorchRasterizer("never"), "cpu") == 0.0
+    # Other tiles add up in another order: close, and not the very same computation.
+    assert 0 < self_check(TorchRasterizer("never", tile_side=8, chunk=5), "cpu") < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("fault", "what", "case"),
+    [
+        ("color", "color", "a whole view"),
+        ("transmittance", "transmittance", "a whole view"),
+        ("depth", "depth", "a whole view"),
+        ("wrong sign", "gradient of quats", "a whole view"),
+        ("no gradient", "gradient of opacities", "a whole view"),
+        ("absgrad missing", "absolute gradient of means2d", "a whole view"),
+        ("antialiasing lost", "color", "an antialiased view"),
+        ("crop shifted", "color", "a crop"),
+        ("degree of harmonics lost", "color", "a crop"),
+        ("frozen ignored", "color", "a view with frozen splats"),
+        ("a frozen splat missing", "color", "a view with frozen splats"),
+        ("camera of the first", "color", "two views of different sizes"),
+        ("window ignored", "color", "a z window"),
+        ("window of own", "color", "a crop with frozen splats in a z window"),
+    ],
+)
+def test_a_fault_is_refused(fault, what, case):
+    with pytest.raises(
+        RuntimeError, match=rf'"broken" on cpu is off in {what} of {case} by .* Set the rasterizer to "torch"'
+    ):
+        self_check(Broken(fault), "cpu")
+
+
+def test_the_scene_would_show_faults():
+    gaussians, view = check_scene("cpu")
+    raster = TorchRasterizer("never")(gaussians, view, sh_degree=3)
+    assert int((raster.info["radii"] > 0).sum()) > 20
+    assert raster.transmittance.min() < 0.2
+    assert raster.transmittance.max() > 0.9
+    assert all(value.dtype == torch.float32 for _, value in gaussians.items())
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("shift", [-3e-5, 3e-5])
+@pytest.mark.parametrize("window_side", [4, 16])
+def test_no_case_hangs_on_rounding(case, shift, window_side):
+    """No fragment is so near to a threshold of drawing that other kernels' rounding would change sides."""
+    draw = TorchRasterizer("never", window_side=window_side)
+    found, expected = (values_and_gradients(draw, "cpu", case, s) for s in (shift, 0.0))
+    assert max(errors(found, expected).values()) < TOLERANCE / 4
+
+
+def test_gradients_are_checked_where_they_are_switched_off():
+    with torch.no_grad():
+        assert self_check(TorchRasterizer("never"), "cpu") < 1e-6

@@ -1,0 +1,155 @@
+"""Culling by bounds: what is passed over could not have been drawn."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.space.culling import BOUNDS_SLANT, EVERYWHERE, Frusta, Optics, bounds_of, intersection
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.space.visibility import DRAWN_SIGMAS
+from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.types import Crop, Gaussians
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+DRAW = TorchRasterizer(compile="never")
+SETTINGS = PaintSettings(sh_degree=1)
+
+
+class Watched(MemoryScene):
+    """Remembers which blocks were read."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.read: set[int] = set()
+
+    def gaussians(self, block):
+        self.read.add(block)
+        return super().gaussians(block)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    size=st.sampled_from([0.01, 0.1, 0.6]),
+    where=st.tuples(*[st.floats(-4, 4)] * 3),
+    crop=st.sampled_from([None, Crop(0, 0, 16, 8), Crop(32, 16, 16, 16)]),
+)
+def test_what_may_not_show_draws_nothing(seed, size, where, crop):
+    """Blocks beside, behind and around the cameras, inside crops and outside."""
+    gaussians = random_gaussians(12, size=size, seed=seed, dtype=torch.float64)
+    gaussians.means[:] = gaussians.means + torch.tensor(where, dtype=torch.float64)
+    views = ring_of_views(3, dtype=torch.float64)
+    seen = [(view, crop or view.full) for view in views]
+    shows = Frusta(seen, 4).may_show([bounds_of(gaussians)])[0].tolist()
+    for (view, crop), shown in zip(seen, shows, strict=True):
+        if not shown:
+            drawn = DRAW(gaussians, view, crop=crop, sh_degree=0).layer
+            assert bool((drawn.transmittance == 1).all())
+
+
+def test_most_of_what_is_beside_and_behind_is_passed_over():
+    (view,) = ring_of_views(1, dtype=torch.float64)
+    forward = view.viewmat[2, :3]
+    right = view.viewmat[0, :3]
+    boxes = [
+        Box(center - 0.1, center + 0.1)
+        for center in (
+            view.center + 2 * forward,
+            view.center - 2 * forward,
+            view.center + 20 * right + forward,
+        )
+    ]
+    assert Frusta([(view, view.full)], 4).may_show(boxes)[:, 0].tolist() == [True, False, False]
+
+
+def test_a_box_without_end_may_always_show():
+    (view,) = ring_of_views(1)
+    assert Frusta([(view, view.full)], 4).may_show([EVERYWHERE]).tolist() == [[True]]
+    assert Frusta([(view, view.full)], 4).may_show([]).shape == (0, 1)
+    assert Frusta([], 4).may_show([EVERYWHERE]).shape == (1, 0)
+
+
+def test_bounds_hold_means_and_extents():
+    gaussians = random_gaussians(30, dtype=torch.float64)
+    bounds = bounds_of(gaussians)
+    reach = (1 - 1e-9) * BOUNDS_SLANT * DRAWN_SIGMAS * gaussians.scales.exp().amax(dim=1, keepdim=True)
+    assert bool((bounds.lower <= gaussians.means - reach).all())
+    assert bool((gaussians.means + reach <= bounds.upper).all())
+    assert bounds_of(gaussians[:0]) is None
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_never_passed_over(bad):
+    gaussians = random_gaussians(5)
+    gaussians.means[2, 1] = bad
+    assert bounds_of(gaussians) is EVERYWHERE
+
+
+def test_intersection_of_boxes():
+    a, b = (
+        Box(torch.zeros(3).double(), torch.ones(3).double()),
+        Box(torch.ones(3).double(), 2 * torch.ones(3).double()),
+    )
+    shared = intersection(a, b)
+    assert shared is not None
+    assert shared.lower.tolist() == shared.upper.tolist() == [1, 1, 1]
+    assert intersection(a, b.grown(-0.0)) is not None
+    assert intersection(a, Box(b.lower + 0.1, b.upper)) is None
+
+
+def test_too_wide_a_lens_switches_bounds_off():
+    views = ring_of_views(2)
+    assert (
+        Optics(views, 4).drawn_within(Box(torch.zeros(3).double(), torch.ones(3).double())) is not EVERYWHERE
+    )
+    optics = Optics(views, 4)
+    optics.slant = BOUNDS_SLANT + 0.1
+    assert optics.drawn_within(Box(torch.zeros(3).double(), torch.ones(3).double())) is EVERYWHERE
+
+
+def street(blocks: int) -> Gaussians:
+    """Clusters in a row, far apart, each in a cell of its own."""
+    parts = []
+    for k in range(blocks):
+        part = random_gaussians(10, size=0.03, seed=k, dtype=torch.float64)
+        part.means[:, 0] += 40.0 * k
+        parts.append(part)
+    return Gaussians.cat(parts)
+
+
+@pytest.mark.parametrize("ownership", ["fragments", "means"])
+def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership):
+    gaussians = street(8)
+    views = ring_of_views(3, dtype=torch.float64)  # around the first cluster
+    tree = build_kd(gaussians.means, 8)
+    scene = Watched(tree, gaussians)
+    paint = Painter(scene, views, DRAW, ownership=ownership, pass_gaussians=0)
+    for view in views:
+        found = paint.picture(view, SETTINGS)
+        expected = DRAW(gaussians, view, sh_degree=1).layer
+        assert torch.allclose(found.color, expected.color, atol=1e-12)
+        assert torch.allclose(found.transmittance, expected.transmittance, atol=1e-12)
+    assert len(scene.read) < 8
+    assert int(tree.assign(torch.zeros(1, 3))[0]) in scene.read
+
+
+@pytest.mark.parametrize("ownership", ["fragments", "means"])
+def test_few_parts_are_held_while_units_are_folded(ownership):
+    gaussians = random_gaussians(128, dtype=torch.float64)
+    views = ring_of_views(2, dtype=torch.float64)
+    tree = build_kd(gaussians.means, 32)
+    paint = Painter(MemoryScene(tree, gaussians), views, DRAW, ownership=ownership, pass_gaussians=0)
+    for view in views:
+        parts, most = {}, 0
+        for unit in paint.units():
+            parts[unit] = paint.paint(unit, paint.load(unit), view, view.full, SETTINGS)
+            paint.fold_up(parts, unit, view)
+            most = max(most, len(parts))
+        assert list(parts) == [0]
+        assert most <= 6  # one for each level of a tree of 32, and the one that came last

@@ -1,0 +1,161 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.render import Shot, TorchRasterizer
+from abcd_ns.engine.space.influence import coarser, influence, weights, worth_training
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.training_loop import train
+from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
+
+SH_0 = 0.28209479177387814
+
+
+@pytest.fixture
+def rasterizer():
+    return TorchRasterizer("never")
+
+
+def painted(gaussians, chosen):
+    """White where `chosen`, black elsewhere."""
+    shade = torch.where(chosen, 0.5, -0.5).to(gaussians.means) / SH_0
+    return replace(gaussians, features_dc=shade[:, None].expand(-1, 3).contiguous())
+
+
+def test_influence_is_what_a_block_painted_white_adds_to_a_black_picture(rasterizer):
+    gaussians, views = random_gaussians(80, seed=4, size=0.15), ring_of_views(3)
+    owner = torch.arange(80) % 3
+    found = influence(gaussians, owner, views, rasterizer)
+    for block in range(3):
+        for view in views:
+            small = coarser(view, 2)
+            picture = rasterizer(painted(gaussians, owner == block), small, sh_degree=0)
+            assert found[block][view.index] == pytest.approx(float(picture.color[..., 0].mean()), abs=2e-6)
+
+
+def test_large_views_are_looked_at_in_small_pictures():
+    sizes = []
+
+    class Watching(TorchRasterizer):
+        def draw(self, gaussians, shots, **options):
+            sizes.extend((shot.crop.width, shot.crop.height) for shot in shots)
+            return super().draw(gaussians, shots, **options)
+
+    views = ring_of_views(2, width=800, height=600)
+    found = influence(
+        random_gaussians(20, size=0.2), torch.zeros(20, dtype=torch.int64), views, Watching("never")
+    )
+    assert set(sizes) == {(80, 60)}
+    full = weights(random_gaussians(20, size=0.2), TorchRasterizer("never"), Shot(views[0], views[0].full))
+    assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
+
+
+def test_what_stands_in_front_takes_its_share(rasterizer):
+    gaussians, (view,) = random_gaussians(20, seed=2, size=0.2), ring_of_views(1)
+    shot = Shot(view, view.full)
+    bare = weights(gaussians, rasterizer, shot)
+    half = weights(gaussians, rasterizer, shot, torch.full((view.height, view.width), 0.5))
+    assert float(bare.sum()) > 1
+    torch.testing.assert_close(half, bare / 2)
+
+
+def test_a_view_that_sees_nothing_has_no_influence(rasterizer):
+    view = ring_of_views(2)[1]
+    behind = replace(random_gaussians(5), means=view.center + view.viewmat[2, :3] * -5 + torch.zeros(5, 3))
+    assert influence(behind, torch.zeros(5, dtype=torch.int64), [view], rasterizer) == {}
+    assert not weights(behind, rasterizer, Shot(view, view.full)).any()
+
+
+def test_a_coarser_view_sees_the_same():
+    view = ring_of_views(1, width=50, height=37)[0]
+    small = coarser(view, 2)
+    assert (small.width, small.height) == (25, 19)
+    torch.testing.assert_close(small.K[:2] * 2, view.K[:2])
+    assert float(small.K[2, 2]) == 1
+
+
+@given(
+    st.dictionaries(st.integers(0, 99), st.floats(1e-6, 1), max_size=30),
+    st.floats(0, 1, exclude_max=True),
+)
+def test_the_fewest_views_that_hold_the_share(views, share):
+    kept, total = worth_training(views, share), sum(views.values())
+    held = sum(views[view] for view in kept)
+    assert held >= share * total * (1 - 1e-9)
+    assert list(kept) == sorted(set(kept))
+    if kept:
+        smallest = min(views[view] for view in kept)
+        assert held - smallest <= share * total * (1 + 1e-9)
+        assert all(views[view] <= smallest for view in views if view not in kept)
+
+
+def grown(tmp_path, start, views, **options):
+    return make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=4,
+        steps=60,
+        scaffold=40,
+        warmup=0.2,
+        density=DensityConfig(strategy="off"),
+        **options,
+    )
+
+
+def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views, influence_share=0.6)
+    seen = []
+
+    def note(event):
+        if isinstance(event, VisitBegan) and event.block is not None:
+            seen.append((event.block, coordinator.state.active.views, coordinator.state.active.looked_at))
+
+    coordinator.announce.subscribe(note)
+    train(coordinator, photos, steps=12)
+    known = coordinator.state.influence
+    assert sorted(known) == [0, 1, 2, 3]
+    assert all(0 < sum(row[view] for row in known.values()) <= 1 + 1e-5 for view in range(5))
+    train(coordinator, photos)
+    assert any(len(used) < 5 for _, used, _ in seen)
+    assert all(len(looked_at) <= 1 and set(looked_at) <= set(used) for _, used, looked_at in seen)
+    for block in range(4):
+        visits = [set(looked_at) for b, _, looked_at in seen if b == block]
+        assert set.union(*visits), "a doubtful view of every block is looked at sooner or later"
+
+
+def test_with_a_share_of_one_every_view_counts(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views, influence_share=1.0)
+    train(coordinator, photos)
+    assert all(count == 5 for count in coordinator.state.views.values())
+
+
+def test_influence_survives_a_save(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views, influence_share=0.6)
+    train(coordinator, photos, steps=12)
+    coordinator.next_batch()
+    assert coordinator.state.influence
+    again = RunState.from_json(coordinator.state.to_json())
+    assert again.influence == coordinator.state.influence
+    assert again.active.looked_at == coordinator.state.active.looked_at
+
+
+def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views)
+    train(coordinator, photos, steps=12)
+    coordinator.state.influence = {0: {}, 1: {99: 0.5}}
+    visited = {}
+
+    def note(event):
+        if isinstance(event, VisitBegan):
+            visited.setdefault(event.block, coordinator.state.active.views)
+
+    coordinator.announce.subscribe(note)
+    train(coordinator, photos)
+    assert sorted(visited) == [0, 1, 2, 3]
+    assert all(sorted(used) == [0, 1, 2, 3, 4] for used in visited.values())

@@ -1,0 +1,209 @@
+"""Intervals: along every ray the cells' windows tile camera z, with no gap or overlap, to the last bit.
+
+Most tests look at tiles of one pixel, which are the pixels' own rays.
+"""
+
+import math
+import random
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.render import ZWindow
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.space.intervals import cell_windows, ray_directions, ray_interval
+from abcd_ns.engine.space.ordering import front_to_back
+from abcd_ns.engine.space.partition import build_grid
+from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.types import Crop, View
+from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
+
+DTYPES = st.sampled_from([torch.float32, torch.float64])
+
+
+def random_view(seed: int, dtype: torch.dtype, center: torch.Tensor | None = None) -> View:
+    """A 6x5 camera. Axis-aligned half of the time: rays then run along faces, with components exactly 0."""
+    generator, rng = torch.Generator().manual_seed(seed), random.Random(seed)
+    if rng.random() < 0.5:
+        rotation = torch.eye(3, dtype=dtype)[torch.randperm(3, generator=generator)]
+        rotation = rotation * torch.randint(0, 2, (3, 1), generator=generator).mul(2).sub(1)
+    else:
+        rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=dtype)).Q
+    center = (lattice_points(seed, 1)[0] if center is None else center).to(dtype)
+    viewmat = torch.eye(4, dtype=dtype)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -(rotation @ center)
+    # Principal point on a pixel's centre: that pixel's ray is the optical axis itself.
+    K = torch.tensor([[4.0, 0, 2.5], [0, 5.0, 2.5], [0, 0, 1]], dtype=dtype)
+    return View(viewmat, K, width=6, height=5)
+
+
+def tree_around(seed: int, view: View) -> BlockTree:
+    """A random tree with more planes through the camera's centre as computed, or one step beside it."""
+    tree, rng = random_tree(seed, 1 + seed % 9), random.Random(seed)
+    for axis, c in enumerate(view.center.tolist()):
+        plane = rng.choice([c, math.nextafter(c, math.inf), math.nextafter(c, -math.inf)])
+        for block in range(tree.num_blocks):
+            cell = tree.cell(block)
+            if cell.lower[axis] < plane < cell.upper[axis] and rng.random() < 0.7:
+                tree = tree.split(block, axis, plane)
+    return tree
+
+
+def pixels(view: View) -> TileGrid:
+    """The image in tiles of one pixel."""
+    return TileGrid(view.full, 1)
+
+
+def leaf_windows(tree: BlockTree, view: View) -> tuple[torch.Tensor, torch.Tensor]:
+    """near and far of all blocks, [K, h, w]."""
+    windows = cell_windows(tree, view, pixels(view), [tree.node_of(b) for b in range(tree.num_blocks)])
+    near, far = torch.stack([w.near for w in windows]), torch.stack([w.far for w in windows])
+    return near.view(-1, view.height, view.width), far.view(-1, view.height, view.width)
+
+
+@given(SEEDS, DTYPES)
+def test_exactly_one_cell_holds_any_z(seed, dtype):
+    view = random_view(seed, dtype)
+    near, far = leaf_windows(tree_around(seed, view), view)
+    ends = torch.cat([near, far]).nan_to_num(posinf=3.0, neginf=-3.0)
+    infinity = torch.full_like(ends, math.inf)
+    scattered = torch.randn(20, *ends.shape[1:], generator=torch.Generator().manual_seed(seed), dtype=dtype)
+    z = torch.cat(
+        [ends, torch.nextafter(ends, infinity), torch.nextafter(ends, -infinity), scattered, 10**scattered]
+    )
+    holders = ((near[:, None] <= z) & (z < far[:, None])).sum(dim=0)
+    assert int((holders != 1).sum()) == 0
+
+
+@given(SEEDS, DTYPES)
+def test_windows_follow_one_another_in_front_to_back_order(seed, dtype):
+    view = random_view(seed, dtype)
+    tree = tree_around(seed, view)
+    near, far = leaf_windows(tree, view)
+    at = torch.full_like(near[0], -math.inf)
+    for block in front_to_back(tree, view.center):
+        met = near[block] < far[block]
+        assert torch.equal(near[block][met], at[met])
+        at = torch.where(met, far[block], at)
+    assert bool((at == math.inf).all())
+
+
+@given(SEEDS, DTYPES)
+def test_the_window_is_the_one_of_the_cell_that_holds_the_point(seed, dtype):
+    """Checked in float64 a little away from the planes, where rounding cannot matter."""
+    view = random_view(seed, dtype)
+    tree = tree_around(seed, view)
+    near, far = leaf_windows(tree, view)
+    z = 10 ** torch.empty(5, 6, dtype=dtype).uniform_(-2, 1, generator=torch.Generator().manual_seed(seed))
+    inverse = torch.linalg.inv(view.viewmat.double())
+    for row in range(5):
+        for column in range(6):
+            pixel = torch.tensor([column + 0.5, row + 0.5, 1.0], dtype=torch.float64)
+            in_camera = torch.linalg.inv(view.K.double()) @ pixel * z[row, column]
+            point = inverse[:3, :3] @ in_camera + inverse[:3, 3]
+            inner = tree.axis >= 0
+            if (point[tree.axis[inner]] - tree.threshold[inner]).abs().min() < 1e-4:
+                continue
+            block = int(tree.assign(point[None]))
+            assert near[block, row, column] <= z[row, column] < far[block, row, column]
+
+
+@given(SEEDS, DTYPES, st.integers(0, 5), st.integers(0, 4), st.sampled_from([1, 2, 4]))
+def test_a_crop_of_the_windows_is_the_windows_of_the_crop(seed, dtype, x, y, side):
+    view = random_view(seed, dtype)
+    tree, crop = tree_around(seed, view), Crop(x, y, 6 - x, 5 - y)
+    for block in range(tree.num_blocks):
+        whole = ray_interval(tree.cell(block), view, TileGrid(view.full, side))
+        part = ray_interval(tree.cell(block), view, TileGrid(crop, side))
+        assert torch.equal(part.near, whole.on(part.grid).near)
+        assert torch.equal(part.far, whole.on(part.grid).far)
+
+
+@pytest.mark.parametrize("side", [2, 4])
+def test_a_tile_has_the_ray_through_its_middle(side):
+    view = random_view(1, torch.float64)
+    grid = TileGrid(view.full, side)
+    found = ray_directions(view, grid).view(3, grid.rows, grid.cols)
+    for row in range(grid.rows):
+        for col in range(grid.cols):
+            pixel = torch.tensor([(col + 0.5) * side, (row + 0.5) * side, 1.0], dtype=torch.float64)
+            expected = view.viewmat[:3, :3].T @ torch.linalg.inv(view.K) @ pixel
+            torch.testing.assert_close(found[:, row, col], expected)
+
+
+@given(SEEDS, st.sampled_from([(1, 1), (2, 1), (4, 2), (16, 4)]), st.data())
+def test_a_window_says_the_same_of_parts_of_its_tiles(seed, sides, data):
+    outer = Crop(data.draw(st.integers(0, 40)), data.draw(st.integers(0, 40)), 37, 29)
+    x, y = data.draw(st.integers(0, 36)), data.draw(st.integers(0, 28))
+    inner = Crop(outer.x + x, outer.y + y, 37 - x, 29 - y)
+    grid, finer = TileGrid(outer, sides[0]), TileGrid(inner, sides[1])
+    near, far = torch.randn(2, grid.tiles, generator=torch.Generator().manual_seed(seed))
+    found = ZWindow(grid, near, far).on(finer)
+    by_pixel = grid.to_image(near.expand(1, grid.pixels_per_tile, -1))[0, y:, x:]
+    assert torch.equal(finer.to_image(found.near.expand(1, finer.pixels_per_tile, -1))[0], by_pixel)
+
+
+def test_a_window_says_nothing_about_larger_tiles_or_what_lies_beside_it():
+    window = ZWindow.everything(TileGrid(Crop(8, 8, 16, 16), 4), "cpu", torch.float32)
+    for grid in (TileGrid(Crop(8, 8, 16, 16), 8), TileGrid(Crop(4, 8, 16, 16), 4)):
+        with pytest.raises(ValueError, match="says nothing"):
+            window.on(grid)
+
+
+@given(SEEDS, DTYPES)
+def test_a_block_and_its_siblings_tile_z_too(seed, dtype):
+    view = random_view(seed, dtype)
+    tree = tree_around(seed, view)
+    block = seed % tree.num_blocks
+    nodes = [tree.node_of(block), *tree.siblings_to_root(block)]
+    windows = cell_windows(tree, view, pixels(view), nodes)
+    z = torch.stack([end for w in windows for end in (w.near, w.far)]).nan_to_num(posinf=9.0, neginf=-9.0)
+    holders = sum(((w.near <= z) & (z < w.far)).int() for w in windows)
+    assert bool((holders == 1).all())
+
+
+def test_grid_windows_tile_z():
+    view = random_view(3, torch.float32)
+    tree = build_grid(torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2, counts=(4, 3, 5))
+    near, far = leaf_windows(tree, view)
+    z = torch.cat([near, far]).nan_to_num(posinf=9.0, neginf=-9.0)
+    assert bool((((near[:, None] <= z) & (z < far[:, None])).sum(dim=0) == 1).all())
+
+
+@given(SEEDS, DTYPES)
+def test_a_box_in_front_of_the_camera_is_entered_and_left_where_the_slab_test_says(seed, dtype):
+    view = random_view(seed, dtype)
+    corner, size = torch.randn(2, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    box = Box(corner, corner + size.abs())
+    window = ray_interval(box, view, pixels(view))
+    # Directions of exactly 0 become tiny here, which sends the planes they are parallel to far away.
+    direction = ray_directions(view, pixels(view)).double().movedim(0, -1)
+    direction = torch.where(direction == 0, 1e-300, direction)
+    a, b = (box.lower - view.center) / direction, (box.upper - view.center) / direction
+    enter, leave = torch.minimum(a, b).amax(dim=-1), torch.maximum(a, b).amin(dim=-1)
+    hit = (leave - enter.clamp(min=0)) > 1e-4
+    inside = bool(box.contains(view.center[None]))
+    missed = (leave - enter.clamp(min=0)) < -1e-4
+    close = {"rtol": 1e-3, "atol": 1e-4, "check_dtype": False}
+    torch.testing.assert_close(window.far[hit], leave[hit], **close)
+    if inside:
+        assert bool((window.near == -math.inf).all())
+    else:
+        torch.testing.assert_close(window.near[hit], enter[hit], **close)
+        assert bool((window.near[missed] == math.inf).all() and (window.far[missed] == math.inf).all())
+
+
+def test_rays_that_miss_get_an_empty_window_at_infinity():
+    view = random_view(0, torch.float32, center=torch.zeros(3))
+    behind_camera = view.center.double() - 10 * view.viewmat[2, :3].double()
+    box = Box(behind_camera - 0.1, behind_camera + 0.1)
+    window = ray_interval(box, view, pixels(view))
+    assert bool((window.near == math.inf).all() and (window.far == math.inf).all())
+
+
+def test_windows_have_the_views_dtype():
+    for dtype in (torch.float32, torch.float64):
+        view = random_view(0, dtype)
+        assert ray_interval(random_tree(0, 4).cell(2), view, pixels(view)).near.dtype == dtype

@@ -1,0 +1,134 @@
+"""Order: what a ray meets, cell by cell, found by brute force."""
+
+from fractions import Fraction
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.space.ordering import front_to_back, node_children_in_order, split_around
+from abcd_ns.engine.space.partition import build_grid
+from abcd_ns.engine.space.tree import BlockTree
+from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
+
+
+def corners(tree: BlockTree) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lower and upper corners of all cells, [K, 3] float64."""
+    cells = [tree.cell(block) for block in range(tree.num_blocks)]
+    return torch.stack([c.lower for c in cells]), torch.stack([c.upper for c in cells])
+
+
+def order_of(tree: BlockTree, center: torch.Tensor) -> torch.Tensor:
+    """The order under test, [K]; each block is in it once."""
+    order = torch.tensor(front_to_back(tree, center))
+    assert sorted(order.tolist()) == list(range(tree.num_blocks))
+    return order
+
+
+def misordered(cells: tuple, order: torch.Tensor, center: torch.Tensor, directions: torch.Tensor) -> int:
+    """How many rays meet a cell before one that the order puts in front of it; a slab test on every cell."""
+    to_lower, to_upper = ((corner[order] - center) / directions[:, None, :] for corner in cells)
+    enter = torch.minimum(to_lower, to_upper).amax(dim=2).clamp(min=0)
+    leave = torch.maximum(to_lower, to_upper).amin(dim=2)
+    met = leave > enter
+    assert met.any(dim=1).all()
+    latest = torch.where(met, enter, -1.0).cummax(dim=1).values
+    return int((met & (enter < latest)).any(dim=1).sum())
+
+
+def test_order_is_right_for_a_hundred_thousand_rays():
+    """Trees and grids; cameras inside, outside, on faces, edges and corners, and one step beside them."""
+    generator = torch.Generator().manual_seed(0)
+    wrong = rays = 0
+    for seed in range(26):
+        if seed % 4:
+            tree = random_tree(seed, 2 + seed % 19)
+        else:
+            tree = build_grid(lattice_points(seed, 100), counts=(2 + seed % 3, 2, 3))
+        cells, cameras = corners(tree), lattice_points(seed, 16)
+        planes = tree.threshold[tree.axis >= 0]
+        cameras[8:] = planes[torch.randint(len(planes), (8, 3), generator=generator)].float()
+        for i, center in enumerate(cameras.double()):
+            if i % 2:
+                center = torch.nextafter(center, center + torch.randint(-1, 2, (3,), generator=generator))
+            directions = torch.randn(250, 3, generator=generator, dtype=torch.float64)
+            wrong += misordered(cells, order_of(tree, center), center, directions)
+            rays += len(directions)
+    assert rays >= 100_000
+    assert wrong == 0
+
+
+@given(SEEDS, st.integers(1, 10))
+def test_order_is_right_in_exact_arithmetic(seed, num_blocks):
+    """Rays with small whole-numbered directions: along faces and straight through edges and corners."""
+    tree = random_tree(seed, num_blocks)
+    center, generator = lattice_points(seed, 1)[0], torch.Generator().manual_seed(seed)
+    rank = order_of(tree, center).argsort().tolist()
+    boxes = [
+        [(low, high) for low, high in zip(cell.lower.tolist(), cell.upper.tolist(), strict=True)]
+        for cell in map(tree.cell, range(num_blocks))
+    ]
+    start = [Fraction(c) for c in center.tolist()]
+    for direction in torch.randint(-2, 3, (5, 3), generator=generator).tolist():
+        crossings = {Fraction(0)}
+        for axis, threshold in zip(tree.axis.tolist(), tree.threshold.tolist(), strict=True):
+            if axis >= 0 and direction[axis]:
+                crossings.add((Fraction(threshold) - start[axis]) / direction[axis])
+        stops = sorted(t for t in crossings if t >= 0)
+        middles = [(a + b) / 2 for a, b in pairwise(stops)] + [stops[-1] + 1]
+        met = []
+        for t in middles:
+            point = [c + t * d for c, d in zip(start, direction, strict=True)]
+            holders = [
+                block
+                for block, box in enumerate(boxes)
+                if all(low <= x < high for x, (low, high) in zip(point, box, strict=True))
+            ]
+            assert len(holders) == 1
+            met += holders
+        places = [rank[block] for block in met]
+        assert places == sorted(places)
+
+
+@given(SEEDS, st.integers(1, 12))
+def test_split_around_cuts_the_order_at_the_block(seed, num_blocks):
+    tree, center = random_tree(seed, num_blocks), lattice_points(seed, 1)[0]
+    for block in range(num_blocks):
+        front, behind = split_around(tree, center, block)
+        assert (*front, block, *behind) == front_to_back(tree, center)
+
+
+def test_a_grid_is_ordered_by_manhattan_distance_of_cells():
+    points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 4
+    tree = build_grid(points, counts=(4, 4, 4))
+    planes = [torch.tensor(sorted(set(tree.threshold[tree.axis == axis].tolist()))) for axis in range(3)]
+    lower, upper = corners(tree)
+    middles = torch.where(lower.isinf(), upper - 0.1, lower + 0.1)
+    index = torch.stack([torch.bucketize(middles[:, a].contiguous(), planes[a]) for a in range(3)], dim=1)
+    center = torch.tensor([1.5, 2.5, 9.0])
+    own = index[int(tree.assign(center[None]))]
+    steps = index - own
+    rank = order_of(tree, center).argsort()
+    for i in range(tree.num_blocks):
+        for j in range(tree.num_blocks):
+            # On the way from the camera's cell to j, a ray may pass i: then i has to come first.
+            passed = ((steps[i] * steps[j] >= 0) & (steps[i].abs() <= steps[j].abs())).all()
+            assert i == j or not passed or rank[i] < rank[j]
+
+
+def test_a_camera_on_the_plane_belongs_to_the_right():
+    tree = build_grid(torch.zeros(0, 3), counts=(2, 1, 1))
+    threshold = float(tree.threshold[0])
+    center = torch.tensor([threshold, 0.0, 0.0], dtype=torch.float64)
+    assert front_to_back(tree, center) == (1, 0)
+    assert front_to_back(tree, torch.nextafter(center, center - 1)) == (0, 1)
+
+
+def test_bad_nodes_and_blocks_are_refused():
+    tree, center = random_tree(0, 3), torch.zeros(3)
+    with pytest.raises(ValueError, match="block 3 does not exist"):
+        split_around(tree, center, 3)
+    with pytest.raises(ValueError, match="is the leaf of block 1"):
+        node_children_in_order(tree, tree.node_of(1), center)

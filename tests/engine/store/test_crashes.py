@@ -1,0 +1,88 @@
+"""A run that is killed and gone on with is the run that was not, bit for bit; so is one that a disk refused.
+
+`python -m benchmarks.faults` does the same at many more moments.
+"""
+
+import random
+
+import pytest
+
+from abcd_ns.engine.store import ParameterStore, crash_points
+from tests.reference.crash_runs import DISK_FULL, STEPS, Kill, Runs, digest, lost_steps, points_reached
+
+
+@pytest.fixture(scope="module")
+def runs() -> Runs:
+    return Runs()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(runs, tmp_path_factory):
+    """The folder of a run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    assert runs.finish(folder) == 0
+    assert ParameterStore.open(folder / "store", read_only=True).state["step"] == STEPS
+    return folder
+
+
+@pytest.mark.parametrize("trial", range(4))
+def test_a_run_killed_at_any_time_ends_as_it_would_have(runs, undisturbed, tmp_path, trial):
+    kill = random.Random(trial)
+    killed = runs.killed_after(kill.uniform(0.1, 2.0), tmp_path)
+    assert lost_steps(tmp_path) == 0
+    assert runs.finish(tmp_path) == 0
+    assert digest(tmp_path) == digest(undisturbed), killed
+
+
+@pytest.mark.parametrize(
+    "kill",
+    [
+        Kill(crash_points.SHARDS_IN_PLACE, 4),
+        Kill(crash_points.GENERATION_PUBLISHED, 6),
+        Kill(crash_points.VISIT_TRAINED, 2),
+    ],
+    ids=lambda kill: kill.point,
+)
+def test_a_run_killed_at_a_bad_moment_ends_as_it_would_have(runs, undisturbed, tmp_path, kill):
+    assert runs.finish(tmp_path, kill=kill) == -9
+    assert lost_steps(tmp_path) == 0
+    assert runs.finish(tmp_path, kill=Kill(crash_points.SHARDS_LINKED)) == -9
+    assert runs.finish(tmp_path) == 0
+    assert digest(tmp_path) == digest(undisturbed)
+
+
+WRITING = [
+    crash_points.FILE_WRITTEN,
+    crash_points.FILE_SYNCED,
+    crash_points.FILE_IN_PLACE,
+    crash_points.SHARDS_IN_PLACE,
+    crash_points.GENERATION_PUBLISHED,
+    crash_points.SHARD_DELETED,
+]
+
+
+@pytest.mark.parametrize("point", WRITING)
+def test_a_run_killed_while_it_writes_beside_the_training_ends_as_it_would_have(
+    runs, undisturbed, tmp_path, point
+):
+    assert runs.finish(tmp_path, kill=Kill(point, 9), commit_seconds=0.02) == -9
+    assert lost_steps(tmp_path) == 0
+    assert runs.finish(tmp_path, commit_seconds=0.02) == 0
+    assert digest(tmp_path) == digest(undisturbed)
+
+
+def test_a_run_that_the_disk_refuses_goes_on_when_there_is_room(runs, undisturbed, tmp_path):
+    largest = max(path.stat().st_size for path in (undisturbed / "store").glob("*.safetensors"))
+    assert runs.finish(tmp_path, file_bytes=largest - 1) == DISK_FULL
+    (line,) = (tmp_path / "error.txt").read_text().splitlines()
+    assert "failed" in line
+    assert "intact: free space" in line
+    assert lost_steps(tmp_path) == 0
+    assert runs.finish(tmp_path) == 0
+    assert digest(tmp_path) == digest(undisturbed)
+
+
+def test_a_run_reaches_every_point_at_which_it_can_be_killed(tmp_path):
+    begun = points_reached(tmp_path)
+    resumed = points_reached(tmp_path)
+    assert set(begun) | set(resumed) == set(crash_points.ENGINE)

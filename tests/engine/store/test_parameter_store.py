@@ -1,0 +1,260 @@
+"""The store gives back what was committed, pinned and cloned: it is a dictionary with generations."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from abcd_ns.engine.store import ParameterStore, StoreError, atomic, shard
+from tests.reference.store_helpers import FailAt, assert_block, block, names_in
+
+DTYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool)
+
+
+@pytest.fixture
+def store(tmp_path):
+    with ParameterStore.create(tmp_path / "store", {"tree": [1, 2]}) as store:
+        store.commit({0: block(3, 1.0), 7: block(0, 2.0)}, state={"clock": 5})
+        yield store
+
+
+def test_what_was_committed_is_there_after_reopening(store):
+    assert store.generation == 1
+    store.commit({7: block(2, 9.0)}, header={"tree": "new"})
+    store.close()
+    with ParameterStore.open(store.folder) as again:
+        assert (again.generation, again.blocks, again.state) == (2, [0, 7], {"clock": 5})
+        assert again.header == {"tree": "new"}
+        assert (again.version(0), again.version(7)) == (1, 2)
+        assert_block(again, 0, 3, 1.0)
+        assert_block(again, 7, 2, 9.0)
+        assert again.nbytes == sum(p.stat().st_size for p in again.folder.glob("*.safetensors"))
+
+
+@given(st.data())
+@settings(max_examples=25)
+def test_any_tensor_survives(tmp_path_factory, data):
+    tensors = {}
+    for name in data.draw(st.lists(st.text("abcdef._é", min_size=1, max_size=8), max_size=4, unique=True)):
+        shape = data.draw(st.lists(st.integers(0, 3), max_size=4))
+        count = int(np.prod(shape))
+        tensors[name] = torch.arange(count).reshape(shape).to(data.draw(st.sampled_from(DTYPES)))
+    meta = data.draw(st.dictionaries(st.text(max_size=5), st.none() | st.floats(allow_nan=False) | st.text()))
+    with ParameterStore.create(tmp_path_factory.mktemp("any") / "s", {}) as store:
+        store.commit({3: (tensors, meta)})
+        back, back_meta = store.load(3)
+        assert back_meta == meta
+        assert back.keys() == tensors.keys()
+        for name, tensor in tensors.items():
+            assert (back[name].dtype, back[name].shape) == (tensor.dtype, tensor.shape)
+            assert torch.equal(back[name], tensor)
+
+
+def test_views_shared_tensors_and_autograd_are_written_by_value(store):
+    base = torch.arange(12.0).reshape(3, 4).requires_grad_()
+    store.commit({1: ({"a": base, "b": base, "turned": base.T, "row": base[1:2]}, {})})
+    tensors, _ = store.load(1)
+    assert torch.equal(tensors["a"], base.detach())
+    assert torch.equal(tensors["b"], base.detach())
+    assert torch.equal(tensors["turned"], base.detach().T)
+    assert torch.equal(tensors["row"], base.detach()[1:2])
+    tensors["a"].zero_()
+    assert torch.equal(store.load(1)[0]["a"], base.detach())
+
+
+def test_json_reads_back_alike_before_and_after_reopening(store):
+    store.commit({}, state={"pair": (1, 2), "by block": {4: "x"}})
+    before = store.state
+    assert before == {"pair": [1, 2], "by block": {"4": "x"}}
+    before["pair"].append(3)
+    store.close()
+    with ParameterStore.open(store.folder) as again:
+        assert again.state == store.state == {"pair": [1, 2], "by block": {"4": "x"}}
+
+
+def test_some_tensors_can_be_loaded_alone(store):
+    tensors = store.load_names(0, ["means"])
+    assert tensors.keys() == {"means"}
+    assert torch.equal(tensors["means"], block(3, 1.0)[0]["means"])
+    with pytest.raises(KeyError, match="no tensor 'moments'"):
+        store.load_names(0, ["moments"])
+    with pytest.raises(KeyError, match="no block 5"):
+        store.load(5)
+
+
+def test_bad_updates_are_refused_and_change_nothing(store):
+    before = names_in(store.folder)
+    with pytest.raises(TypeError):
+        store.commit({0: block(1), 1: ({}, {"x": object()})})
+    with pytest.raises(ValueError, match="negative"):
+        store.commit({-1: block(1)})
+    assert store.generation == 1
+    assert names_in(store.folder) == before
+
+
+# Pins and clones
+
+
+def test_a_pin_keeps_its_generation_until_it_is_removed(store):
+    store.pin("best")
+    store.commit({0: block(4, 5.0)}, state={"clock": 6})
+    store.commit({0: block(6, 6.0)})
+    pinned = ParameterStore.open(store.folder, "best")
+    assert (pinned.generation, pinned.state, store.pins) == (1, {"clock": 5}, ["best"])
+    assert_block(pinned, 0, 3, 1.0)
+    with pytest.raises(StoreError, match="open for reading"):
+        pinned.commit({})
+    shards = {p.name for p in store.folder.glob("*.safetensors")}
+    assert {name[:12] for name in shards} == {"block-000000", "block-000007"}
+    assert len(shards) == 3  # block 0 at generations 1 and 3, block 7 at 1; generation 2 is gone
+    store.unpin("best")
+    assert len(list(store.folder.glob("*.safetensors"))) == 2
+    with pytest.raises(StoreError, match="best"):
+        store.unpin("best")
+
+
+def test_restoring_never_gives_a_version_twice(store):
+    store.pin("best")
+    store.commit({0: block(4, 5.0)})
+    assert store.restore("best") == 3
+    assert_block(store, 0, 3, 1.0)
+    assert store.version(0) == 1
+    store.pin("other")
+    assert store.commit({0: block(2, 7.0)}) == 4
+    assert store.version(0) == 4
+    assert_block(ParameterStore.open(store.folder, "other"), 0, 3, 1.0)
+
+
+def test_a_damaged_pin_stops_the_collection_and_not_the_training(store):
+    store.pin("best")
+    pin = store.folder / "manifest-best.json"
+    pin.write_bytes(pin.read_bytes()[:-1])
+    with pytest.warns(UserWarning, match="best"):
+        store.commit({0: block(4, 5.0)})
+    assert len(list(store.folder.glob("*.safetensors"))) == 3
+    store.unpin("best")
+    assert len(list(store.folder.glob("*.safetensors"))) == 2
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../x", "a b"])
+def test_a_pin_cannot_leave_the_folder(store, name):
+    with pytest.raises(ValueError, match="name"):
+        store.pin(name)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_clone_is_a_store_of_its_own(store, tmp_path, monkeypatch, links):
+    if not links:
+        monkeypatch.setattr(shard.os, "link", FailAt(os.link, 1, persistent=True))
+    store.pin("start")
+    store.commit({0: block(4, 5.0)})
+    store.clone_to(tmp_path / "now")
+    store.clone_to(tmp_path / "then", "start")
+    with ParameterStore.open(tmp_path / "now") as clone:
+        assert (clone.generation, clone.header, clone.pins) == (2, store.header, [])
+        file = next(clone.folder.glob("block-000000-*"))
+        assert (file.stat().st_nlink > 1) is links
+        clone.commit({0: block(1, 6.0)})
+        assert_block(store, 0, 4, 5.0)
+    with ParameterStore.open(tmp_path / "then") as clone:
+        assert_block(clone, 0, 3, 1.0)
+    with pytest.raises(StoreError, match="already holds a store"):
+        store.clone_to(tmp_path / "then")
+
+
+def test_a_failed_clone_is_no_store(store, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic.os, "replace", FailAt(os.replace, 1))
+        with pytest.raises(StoreError, match="could not be cloned"):
+            store.clone_to(tmp_path / "clone")
+    assert names_in(tmp_path / "clone") == {"lock"}
+    store.clone_to(tmp_path / "clone")
+    assert_block(ParameterStore.open(tmp_path / "clone", read_only=True), 0, 3, 1.0)
+
+
+class StoreMachine(RuleBasedStateMachine):
+    """The store against a dictionary, through commits, failures, pins and reopening."""
+
+    blocks_ = st.dictionaries(st.integers(0, 4), st.tuples(st.integers(0, 3), st.integers(0, 99)), max_size=3)
+    names = st.sampled_from(["a", "b"])
+
+    def __init__(self):
+        super().__init__()
+        self.folder = Path(StoreMachine.base.mktemp("machine")) / "s"
+        self.store = ParameterStore.create(self.folder, {})
+        self.model: dict = {}
+        self.pins: dict = {}
+        self.generation = 0
+
+    def update(self, blocks):
+        return {number: block(rows, float(value)) for number, (rows, value) in blocks.items()}
+
+    @rule(blocks=blocks_)
+    def commit(self, blocks):
+        self.generation += 1
+        assert self.store.commit(self.update(blocks), state={"n": self.generation}) == self.generation
+        self.model |= {number: (*what, self.generation) for number, what in blocks.items()}
+
+    @rule(blocks=blocks_, n=st.integers(1, 4))
+    def fail(self, blocks, n):
+        fsync = os.fsync
+        atomic.os.fsync = FailAt(fsync, min(n, len(blocks) + 3))
+        try:
+            with pytest.raises(StoreError):
+                self.store.commit(self.update(blocks))
+        finally:
+            atomic.os.fsync = fsync
+
+    @rule(name=names)
+    def pin(self, name):
+        self.store.pin(name)
+        self.pins[name] = dict(self.model)
+
+    @precondition(lambda self: self.pins)
+    @rule(data=st.data())
+    def restore(self, data):
+        name = data.draw(st.sampled_from(sorted(self.pins)))
+        self.generation += 1
+        assert self.store.restore(name) == self.generation
+        self.model = dict(self.pins[name])
+
+    @precondition(lambda self: self.pins)
+    @rule(data=st.data())
+    def unpin(self, data):
+        name = data.draw(st.sampled_from(sorted(self.pins)))
+        self.store.unpin(name)
+        del self.pins[name]
+
+    @rule()
+    def reopen(self):
+        self.store.close()
+        self.store = ParameterStore.open(self.folder)
+
+    @invariant()
+    def agree(self):
+        views = [(self.store, self.model)]
+        views += [(ParameterStore.open(self.folder, name), model) for name, model in self.pins.items()]
+        files = {"lock", "manifest.json"} | {f"manifest-{name}.json" for name in self.pins}
+        for view, model in views:
+            assert view.blocks == sorted(model)
+            for number, (rows, value, version) in model.items():
+                assert_block(view, number, rows, float(value))
+                assert view.version(number) == version
+                files.add(f"block-{number:06d}-{version:08d}.safetensors")
+        assert names_in(self.folder) == files
+        assert self.store.generation == self.generation
+
+    def teardown(self):
+        self.store.close()
+
+
+def test_the_store_is_a_dictionary(tmp_path_factory):
+    StoreMachine.base = tmp_path_factory
+    case = StoreMachine.TestCase
+    case.settings = settings(max_examples=15, stateful_step_count=15, deadline=None, derandomize=True)
+    case().runTest()

@@ -1,0 +1,188 @@
+"""The warm-up: bounded, lossless, resumable."""
+
+import pytest
+import torch
+
+from abcd_ns.engine.events import VisitBegan, VisitEnded
+from abcd_ns.engine.gaussians.initialize import split_off
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store.scaffold import REVEALED_OPACITY, WAITING, blocks_at_rest
+from abcd_ns.engine.store.special_blocks import RESERVE
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.schedule import WARM_UP_BATCH
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import Gaussians
+from tests.reference.scenes import make_coordinator, whole_scene
+
+STILL = DensityConfig(strategy="off")
+
+
+def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
+    return {tuple(row) for row in gaussians.quats.tolist()}
+
+
+def test_scaffold_and_reserve_are_all_there_is(start):
+    scaffold, waiting = split_off(start, 30, seed=3)
+    assert len(scaffold) == 30
+    assert rows(scaffold) | rows(waiting) == rows(start)
+    assert not rows(scaffold) & rows(waiting)
+    originals = {tuple(q): s for q, s in zip(start.quats.tolist(), start.scales, strict=True)}
+    for quat, scales in zip(scaffold.quats.tolist(), scaffold.scales, strict=True):
+        assert bool((scales >= originals[tuple(quat)]).all())
+    assert float(scaffold.scales.mean()) > float(start.scales.mean()) + 0.2
+
+
+def test_without_a_scaffold_nothing_waits(start):
+    tree = build_kd(start.means, 4)
+    assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
+    assert sorted(blocks_at_rest(tree, start, keep=30)) == [0, 1, 2, 3, RESERVE]
+
+
+def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=1000, warmup=0.25, density=STILL
+    )
+    train(coordinator, photos, steps=3)
+    assert coordinator.state.active.is_whole
+    assert len(coordinator.params["means"]) == len(start)
+    train(coordinator, photos, steps=7)
+    assert coordinator.state.active is None
+    assert len(whole_scene(coordinator)) == coordinator.count() == len(start)
+    assert [coordinator.scene.count(block) for block in range(4)] == pytest.approx([30] * 4, abs=2)
+    train(coordinator, photos)
+    assert coordinator.finished
+
+
+def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=40, scaffold=30)
+    train(coordinator, photos, steps=3)
+    assert coordinator.state.active.is_whole
+    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == 30
+    batch = coordinator.next_batch()
+    assert [sample.crop for sample in batch.samples] == [views[0].full] * WARM_UP_BATCH
+    assert all(sample.layers is None for sample in batch.samples)
+    assert len({sample.view.index for sample in batch.samples}) == WARM_UP_BATCH
+
+
+def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL
+    )
+    begun = []
+    coordinator.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
+    train(coordinator, photos, steps=10)
+    assert coordinator.state.active is None
+    scene = coordinator.scene
+    assert scene.rows(RESERVE) == 0
+    for block in range(4):
+        state = scene.state(block)
+        assert bool((scene.tree.assign(state.gaussians.means) == block).all())
+        waits = state.gaussians.opacities[:, 0] == WAITING
+        trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)
+        assert bool(waits.any())
+        assert not bool((waits & trained).any())
+        assert state.clocks.adam_views == 10 * WARM_UP_BATCH
+        assert state.clocks.visits == 0
+        assert state.clocks.steps == 0
+    assert coordinator.count() == 120
+    train(coordinator, photos)
+    assert [event.block for event in begun][:2] != [None, None]
+    assert begun[0].block is None
+    assert {event.block for event in begun[1:]} == {0, 1, 2, 3}
+
+
+def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL, heal=False
+    )
+    scene, visited = coordinator.scene, set()
+    train(coordinator, photos, steps=10)
+    assert len(whole_scene(coordinator)) == 30
+    while len(visited) < 4:
+        coordinator.next_batch()
+        active = coordinator.state.active
+        if active.done == 0:
+            live, found = coordinator.params["opacities"].detach()[:, 0], scene.count(active.geometry.block)
+            faint = torch.sigmoid(live).sub(REVEALED_OPACITY).abs() < 1e-6
+            assert len(live) == found
+            assert bool(faint.any())
+            assert len(scene.at_rest(active.geometry.block)) == found  # what windows and views go by
+            visited.add(active.geometry.block)
+        for block in set(range(4)) - visited:
+            assert 0 < len(scene.gaussians(block)) < scene.count(block)
+        train_step(coordinator, photos)
+    assert len(whole_scene(coordinator)) == coordinator.count() == 120
+
+
+@pytest.mark.parametrize("stop", [4, 10, 13])
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop):
+    """Bit for bit: within the warm-up, at its end, and after it (invariant 7)."""
+    runs = {}
+    for name in ("whole", "stopped"):
+        (tmp_path / name).mkdir()
+        runs[name] = make_coordinator(
+            tmp_path / name, start, views, blocks=4, steps=24, scaffold=30, warmup=0.4
+        )
+    train(runs["whole"], photos)
+    train(runs["stopped"], photos, steps=stop)
+    runs["stopped"].save()
+    runs["stopped"].scene.store.close()
+    again = make_coordinator(tmp_path / "stopped", start, views, steps=24, warmup=0.4, resume=True)
+    train(again, photos)
+    found, expected = whole_scene(again), whole_scene(runs["whole"])
+    assert all(torch.equal(value, getattr(found, name)) for name, value in expected.items())
+
+
+def test_no_more_is_live_than_in_the_largest_block(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, density=STILL, warmup=0.25
+    )
+    most = 0
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        most = max(most, len(coordinator.params["means"]))
+    assert most <= 32  # a migrant or two
+
+
+def test_density_controls_clock_starts_when_the_warm_up_is_over(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.5, density=STILL
+    )
+    found = []
+    watched = coordinator.density.after_step
+
+    def watch(params, optimizers, growth, infos, clock):
+        found.append(clock.progress)
+        return watched(params, optimizers, growth, infos, clock)
+
+    coordinator.density.after_step = watch
+    train(coordinator, photos)
+    assert found == pytest.approx([(step + 1) / 20 for step in range(20)])
+
+
+@pytest.mark.parametrize(("passes", "expected"), [(1, 3), (2, 5), (0, 25)])
+def test_the_warm_up_ends_when_each_view_was_used_often_enough(
+    tmp_path, views, photos, start, passes, expected
+):
+    """Growing begins then, and not only when the share of the run is over that it might have taken."""
+    coordinator = make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=4,
+        steps=10 * len(views),
+        scaffold=30,
+        warmup=0.5,
+        scaffold_passes=passes,
+        density=STILL,
+    )
+    ended = []
+    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    while not ended:
+        train_step(coordinator, photos)
+    assert coordinator.state.step == expected
+    assert coordinator.state.warm == pytest.approx(expected / (10 * len(views)))
+    assert not coordinator.state.active
+    train_step(coordinator, photos)
+    rest = 10 * len(views) - coordinator.state.step + 1
+    assert coordinator._density_clock(taken=4).progress == pytest.approx(1 / rest)

@@ -1,0 +1,181 @@
+"""Random parts of crops: the same at every resume, within the limit, and right on average."""
+
+import itertools
+import random
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
+from abcd_ns.engine.train.batch import Sample, part_to_draw
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.cutouts import ALIGN, random_part
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.types import Crop, Layer
+from abcd_ns.peers.exact import ExactCoordinator
+from abcd_ns.peers.independent import IndependentCoordinator, independent_at_rest
+from tests.reference.scenes import make_coordinator, ring_of_views, whole_scene
+
+CROPS = st.builds(Crop, st.integers(0, 200), st.integers(0, 200), st.integers(1, 2000), st.integers(1, 2000))
+
+
+class Fixed(random.Random):
+    """Gives the numbers that it is told, in turn, and notes the ranges that it was asked for."""
+
+    def __init__(self, numbers: tuple[int, ...] = ()) -> None:
+        super().__init__()
+        self.numbers, self.ranges = list(numbers), []
+
+    def randrange(self, stop: int) -> int:  # as it is called
+        self.ranges.append(stop)
+        return self.numbers[len(self.ranges) - 1] if self.numbers else 0
+
+
+def all_parts(crop: Crop, most: int) -> list[Crop]:
+    """Every part that may be drawn, as often as it is likely."""
+    asked = Fixed()
+    random_part(crop, most, asked)
+    return [
+        random_part(crop, most, Fixed(numbers)) for numbers in itertools.product(*map(range, asked.ranges))
+    ]
+
+
+@given(CROPS, st.integers(1, 3_000_000), st.integers())
+def test_parts_lie_in_the_crop_keep_to_the_limit_and_meet_at_whole_tiles(crop, most, seed):
+    part = random_part(crop, most, random.Random(seed))
+    if crop.pixels <= most:
+        assert part == crop
+        return
+    inside = part.within(crop)
+    assert min(inside.x, inside.y) >= 0 < min(part.width, part.height)
+    assert inside.x + part.width <= crop.width
+    assert inside.y + part.height <= crop.height
+    assert part.pixels <= max(most, ALIGN * ALIGN)
+    for edge, own in ((part.x, crop.x), (part.y, crop.y)):
+        assert edge == own or edge % ALIGN == 0
+    for end, own in (
+        (part.x + part.width, crop.x + crop.width),
+        (part.y + part.height, crop.y + crop.height),
+    ):
+        assert end == own or end % ALIGN == 0
+
+
+@given(CROPS, st.integers(300_000, 3_000_000), st.integers())
+def test_parts_use_most_of_what_they_may(crop, most, seed):
+    parts = [random_part(crop, most, random.Random(f"{seed} {k}")).pixels for k in range(200)]
+    assert sum(parts) / 200 > 0.25 * min(most, crop.pixels)
+
+
+@pytest.mark.parametrize(("crop", "most"), [(Crop(16, 32, 40, 33), 600), (Crop(5, 0, 60, 17), 500)])
+def test_every_pixel_counts_alike_on_average(crop, most):
+    """The expectation of crop.pixels / part.pixels over the parts that hold a pixel is 1, for every pixel."""
+    parts = all_parts(crop, most)
+    counted = torch.zeros(crop.height, crop.width, dtype=torch.float64)
+    for part in parts:
+        counted[part.within(crop).slices] += crop.pixels / part.pixels
+    assert len(set(parts)) > 1
+    assert torch.allclose(counted / len(parts), torch.ones_like(counted))
+
+
+@pytest.mark.parametrize("background", [0.0, 0.4])
+@pytest.mark.parametrize("pixel_loss", ["l1", "l2"])
+def test_the_loss_of_parts_is_on_average_that_of_the_whole(background, pixel_loss):
+    crop, view = Crop(8, 5, 40, 28), ring_of_views(1)[0]
+    config = TrainingConfig(ssim_lambda=0.0, pixel_loss=pixel_loss)
+    generator = torch.Generator().manual_seed(0)
+    picture = torch.rand(28, 40, 3, generator=generator, dtype=torch.float64)
+    photo = torch.full_like(picture, background)
+
+    def loss(part: Crop) -> torch.Tensor:
+        sample = Sample(view, part, None, None, None, photo[0, 0], share=part.pixels / crop.pixels)
+        place = part.within(crop).slices
+        return sample.loss(picture[place], photo[place], config)
+
+    parts = all_parts(crop, 500)
+    assert torch.stack([loss(part) for part in parts]).mean() == pytest.approx(loss(crop).item())
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 40), st.integers(500, 3000), st.sampled_from([50_000, 200_000, 900_000]))
+def test_a_line_between_columns_crosses_an_ssim_window_one_time_in_five_at_most(x, width, most):
+    crop = Crop(x, 0, width, 2000)
+    asked = Fixed()
+    random_part(crop, most, asked)
+    if len(asked.ranges) < 4:  # rows alone
+        return
+    for start in range(0, width - SSIM_WINDOW, 37):
+        parts = [random_part(crop, most, Fixed((shift, start, 0, 0))) for shift in range(asked.ranges[0])]
+        whole = sum(x + start + SSIM_WINDOW <= part.x + part.width for part in parts)
+        assert whole >= 0.8 * len(parts)
+
+
+def test_a_part_depends_on_seed_step_and_place_alone():
+    crop = Crop(0, 0, 640, 480)
+    config = TrainingConfig(crop_pixels=40_000)
+    drawn = [part_to_draw(config, crop, step, place) for step in range(20) for place in range(4)]
+    again = [part_to_draw(config, crop, step, place) for step in range(20) for place in range(4)]
+    assert drawn == again
+    assert len(set(drawn)) > 20
+    assert part_to_draw(TrainingConfig(crop_pixels=40_000, seed=1), crop, 0, 0) != drawn[0]
+    assert part_to_draw(TrainingConfig(), crop, 0, 0) == crop
+
+
+def test_a_layer_is_cut_from_its_own_corner():
+    layer = Layer(torch.rand(5, 7, 3), torch.rand(5, 7))
+    part = layer[Crop(2, 1, 4, 3)]
+    assert torch.equal(part.color, layer.color[1:4, 2:6])
+    assert torch.equal(part.transmittance, layer.transmittance[1:4, 2:6])
+
+
+@pytest.mark.parametrize("room", [0, 1 << 20])
+def test_a_part_of_a_batch_shows_what_the_whole_shows_there(tmp_path, views, start, room):
+    pictures = []
+    for most in (0, 700):
+        (folder := tmp_path / str(most)).mkdir()
+        still = {"density": DensityConfig(strategy="off"), "layer_bytes": room}
+        coordinator = make_coordinator(folder, start, views, blocks=4, steps=8, crop_pixels=most, **still)
+        batch = coordinator.next_batch()
+        pictures.append((batch.samples, coordinator.render(batch).pictures))
+    whole, parts = pictures
+    assert any(sample.share < 1 for sample in parts[0])
+    for big, small, picture, part in zip(whole[0], parts[0], whole[1], parts[1], strict=True):
+        assert small.share == pytest.approx(small.crop.pixels / big.crop.pixels)
+        assert torch.equal(picture[small.crop.within(big.crop).slices], part)
+
+
+EACH_ALONE = {
+    "blocks": 2,
+    "kind": IndependentCoordinator,
+    "content": independent_at_rest,
+    "layers": False,
+    "overlap": 0.3,
+}
+
+
+@pytest.mark.parametrize("options", [{"blocks": 4}, EACH_ALONE, {"blocks": 2, "kind": ExactCoordinator}])
+def test_a_run_on_parts_that_stops_and_goes_on_is_the_run_that_did_not(
+    tmp_path, views, photos, start, options
+):
+    def coordinator(name, resume=False):
+        (tmp_path / name).mkdir(exist_ok=True)
+        return make_coordinator(
+            tmp_path / name, start, views, steps=10, crop_pixels=600, resume=resume, **options
+        )
+
+    straight = coordinator("straight")
+    train(straight, photos)
+    stopped = coordinator("stopped")
+    train(stopped, photos, steps=4)
+    stopped.save()
+    stopped.scene.store.close()
+    resumed = coordinator("stopped", resume=True)
+    train(resumed, photos)
+    for (name, found), (_, expected) in zip(
+        whole_scene(resumed).items(), whole_scene(straight).items(), strict=True
+    ):
+        assert found.shape == expected.shape
+        # By all blocks at once the order in which gradients are added up changes with a resume.
+        assert torch.equal(found.sort(dim=0).values, expected.sort(dim=0).values), name

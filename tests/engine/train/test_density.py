@@ -1,0 +1,279 @@
+"""Growing and pruning: gsplat's strategies on a block's own clock."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from gsplat.strategy import DefaultStrategy
+
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, make_adam
+from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
+from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from tests.reference.scenes import random_gaussians
+
+
+def live(gaussians: Gaussians):
+    params = {n: torch.nn.Parameter(v) for n, v in Gaussians.empty(gaussians.sh_degree).items()}
+    optimizers = make_adam(params)
+    attach(BlockState.fresh(gaussians), params, optimizers)
+    return params, optimizers
+
+
+def fake_info(count: int, gradient: float) -> dict:
+    """What a drawing leaves behind, with the same gradient for every Gaussian."""
+    means2d = torch.zeros(1, count, 2, requires_grad=True)
+    means2d.grad = torch.full((1, count, 2), gradient)
+    means2d.absgrad = means2d.grad.clone()
+    radii = torch.ones(1, count, dtype=torch.int32)
+    return {"means2d": means2d, "radii": radii, "width": 2, "height": 2, "n_cameras": 1, "gaussian_ids": None}
+
+
+def clock(**changes) -> DensityClock:
+    return DensityClock(
+        **{"progress": 0.2, "steps": 100, "taken": 1, "views": 5, "room": None, "seed": 1, **changes}
+    )
+
+
+@pytest.mark.parametrize("views", [1, 3, 30, 300, 3000, 15_000])
+def test_every_number_of_views_gets_refinements(views):
+    control = DensityControl(DensityConfig(refine_every=100, warmup_passes=4))
+    steps = range(1, 20 * max(views, 100) + 1)
+    due = [s for s in steps if control.is_due(clock(steps=s, views=views))]
+    assert len(due) >= 10
+    assert all(b - a >= max(100, views) for a, b in pairwise(due))
+    assert due[0] >= 4 * views
+
+
+@pytest.mark.parametrize(("progress", "expected"), [(0.0, False), (0.1, True), (0.49, True), (0.5, False)])
+def test_refinement_keeps_to_its_share_of_the_run(progress, expected):
+    assert DensityControl(DensityConfig()).is_due(clock(progress=progress)) is expected
+
+
+def test_the_default_strategy_clones_where_gradients_are_high():
+    params, optimizers = live(random_gaussians(8, size=0.001))
+    control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
+    growth = control.after_step(params, optimizers, {}, (fake_info(8, gradient=1.0),), clock())
+    assert len(params["means"]) == 16
+    assert {name: len(value) for name, value in growth.items()} == {"grad2d": 16, "count": 16}
+    assert all(len(optimizers[n].param_groups[0]["params"][0]) == 16 for n in PARAM_NAMES)
+
+
+def test_between_refinements_statistics_add_up():
+    params, optimizers = live(random_gaussians(8))
+    control = DensityControl(DensityConfig())
+    growth: dict = {}
+    for _ in range(3):
+        growth = control.after_step(params, optimizers, growth, (fake_info(8, 1.0),), clock(steps=7))
+    assert growth["count"].tolist() == [3.0] * 8
+    assert growth["grad2d"].tolist() == pytest.approx([3 * math.sqrt(2)] * 8)
+    assert len(params["means"]) == 8
+
+
+def test_without_room_nothing_is_added_but_the_transparent_go():
+    gaussians = random_gaussians(8, size=0.001)
+    gaussians.opacities[:] = 2.0
+    gaussians.opacities[:3] = -8.0
+    params, optimizers = live(gaussians)
+    control = DensityControl(DensityConfig(densify_grad_thresh=0.5))
+    control.after_step(params, optimizers, {}, (fake_info(8, 1.0),), clock(room=0))
+    assert torch.equal(params["means"], gaussians.means[3:])
+
+
+def test_opacities_are_reset_on_the_blocks_own_clock_alone():
+    gaussians = random_gaussians(8)
+    gaussians.opacities[:] = 3.0
+    control = DensityControl(DensityConfig(reset_every=500))
+    for steps, reset in ((499, False), (500, True), (501, False), (1000, True)):
+        params, optimizers = live(gaussians)
+        control.after_step(params, optimizers, {}, (fake_info(8, 0.0),), clock(steps=steps))
+        assert bool((torch.sigmoid(params["opacities"]) < 0.02).all()) is reset, steps
+
+
+def test_a_reset_waits_for_a_visit_that_can_make_it_good():
+    control = DensityControl(DensityConfig(reset_every=500))
+    late, early = {"steps": 520, "spent": 0.3}, {"steps": 560, "spent": 0.2}
+    assert not control.resets(clock(resets=0, **late))
+    assert control.resets(clock(resets=0, **early))
+    assert not control.resets(clock(resets=1, **early))
+    assert not control.resets(clock(resets=0, progress=0.6, **early))
+
+
+def test_a_block_among_others_refines_early_in_its_visits_and_makes_up_for_what_it_missed():
+    control = DensityControl(DensityConfig(refine_every=30))
+    late = {"views": 20, "taken": 4, "refined": 100, "spent": 0.6}
+    assert not control.is_due(clock(steps=128, **{**late, "spent": 0.1}))
+    assert control.is_due(clock(steps=132, **{**late, "spent": 0.1}))
+    assert not control.is_due(clock(steps=132, **late))
+    assert control.is_due(clock(steps=190, **{**late, "spent": 0.0}))  # overdue: no multiple of 30 is here
+    assert not control.is_due(clock(steps=19, **{**late, "refined": 0, "spent": 0.0, "views": 40}))
+
+
+def test_giants_are_pruned_only_once_opacities_were_reset():
+    gaussians = random_gaussians(8, size=0.01)
+    gaussians.opacities[:] = 3.0
+    gaussians.scales[0] = math.log(5.0)
+    control = DensityControl(DensityConfig(reset_every=500, refine_every=10))
+    for steps, left in ((490, 8), (510, 7)):
+        params, optimizers = live(gaussians)
+        control.after_step(params, optimizers, {}, (fake_info(8, 0.0),), clock(steps=steps))
+        assert len(params["means"]) == left
+
+
+def test_after_the_last_refinement_nothing_changes():
+    params, optimizers = live(random_gaussians(8))
+    control = DensityControl(DensityConfig())
+    assert control.after_step(params, optimizers, {}, (fake_info(8, 9.0),), clock(progress=0.6)) == {}
+    assert len(params["means"]) == 8
+
+
+def test_mcmc_relocates_the_dead_and_grows_up_to_the_limit():
+    gaussians = random_gaussians(100)
+    gaussians.opacities[:] = 2.0
+    gaussians.opacities[:10] = -9.0
+    params, optimizers = live(gaussians)
+    control = DensityControl(DensityConfig(strategy="mcmc", noise_lr=0.0))
+    control.after_step(params, optimizers, {}, (), clock(room=3))
+    assert len(params["means"]) == 103
+    assert float(torch.sigmoid(params["opacities"].detach()).min()) > 0.005
+    control.after_step(params, optimizers, {}, (), clock(room=0))
+    assert len(params["means"]) == 103
+
+
+def test_mcmc_noise_moves_the_transparent_and_depends_on_the_seed():
+    gaussians = random_gaussians(20, size=0.5)
+    gaussians.opacities[:10], gaussians.opacities[10:] = -6.0, 6.0
+    control = DensityControl(DensityConfig(strategy="mcmc"))
+    moved = []
+    for seed in (1, 1, 2):
+        params, optimizers = live(gaussians)
+        before = torch.get_rng_state()
+        control.after_step(params, optimizers, {}, (), clock(steps=7, seed=seed))
+        assert torch.equal(torch.get_rng_state(), before)
+        moved.append(live_gaussians(params).means.detach() - gaussians.means)
+    assert torch.equal(moved[0], moved[1])
+    assert not torch.equal(moved[0], moved[2])
+    assert float(moved[0][:10].norm()) > 10 * float(moved[0][10:].norm())
+
+
+@pytest.mark.parametrize("copies", [1, 2, 5])
+def test_relocated_copies_have_together_the_opacity_of_the_original(copies):
+    opacities, scales = torch.tensor([0.7]), torch.tensor([[0.3, 0.2, 0.1]])
+    new, _ = compute_relocation(opacities, scales, torch.tensor([copies]), binomials())
+    assert float((1 - new) ** copies) == pytest.approx(0.3, abs=1e-6)
+
+
+def test_relocation_keeps_the_mass_along_a_ray():
+    """Equation 9 equates the integrals over a line through the centre; here by quadrature."""
+    opacity, sigma, copies = 0.7, 0.3, 3
+    new, scale = compute_relocation(
+        torch.tensor([opacity]), torch.full((1, 3), sigma), torch.tensor([copies]), binomials()
+    )
+    x = torch.linspace(-6, 6, 20001, dtype=torch.float64)
+
+    def mass(o: float, s: float, n: int) -> float:
+        return float(torch.trapezoid(1 - (1 - o * torch.exp(-(x**2) / (2 * s * s))) ** n, x))
+
+    assert mass(float(new), float(scale[0, 0]), copies) == pytest.approx(mass(opacity, sigma, 1), rel=1e-4)
+
+
+def test_covariances_against_the_definition():
+    gaussians = random_gaussians(5, dtype=torch.float64)
+    scales = gaussians.scales.exp()
+    found, _ = covariances(gaussians.quats, scales)
+    eigenvalues = torch.linalg.eigvalsh(found)
+    assert torch.allclose(eigenvalues, (scales**2).sort(dim=1).values)
+    assert torch.allclose(found, found.transpose(1, 2))
+
+
+@pytest.mark.parametrize(("blocks", "given", "expected"), [(1, 0, 100), (8, 0, 30), (1, 7, 7), (8, 7, 7)])
+def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given, expected):
+    config = DensityConfig(refine_every=given, refine_stop=0.3)
+    assert for_blocks(config, blocks) == replace(config, refine_every=expected)
+
+
+@pytest.mark.parametrize("resets", [None, 0])
+def test_a_reset_needs_no_gradients(resets):
+    """Those of a step may be unsound; the reset is counted, and so it must happen."""
+    gaussians = random_gaussians(8)
+    gaussians.opacities[:] = 3.0
+    params, optimizers = live(gaussians)
+    growth = {"grad2d": torch.ones(8), "count": torch.ones(8)}
+    control, due = DensityControl(DensityConfig(reset_every=500)), clock(steps=500, resets=resets)
+    assert control.resets(due)
+    found = control.after_step(params, optimizers, growth, (), due)
+    assert bool((torch.sigmoid(params["opacities"]) < 0.02).all())
+    assert {name: value.tolist() for name, value in found.items()} == {n: [1.0] * 8 for n in growth}
+
+
+def test_refining_needs_gradients():
+    control, due = DensityControl(DensityConfig()), clock()
+    assert control.refines(due, (fake_info(3, 1.0),))
+    assert not control.refines(due, ())
+    assert not control.refines(clock(steps=101), (fake_info(3, 1.0),))
+    assert DensityControl(DensityConfig("mcmc")).refines(due, ())
+
+
+def drawn_info(views: int, count: int, seed: int, size) -> dict:
+    """What a drawing leaves behind: not every view sees every Gaussian."""
+    generator = torch.Generator().manual_seed(seed)
+    means2d = torch.zeros(views, count, 2, requires_grad=True)
+    radii = torch.randint(0, 3, (views, count), generator=generator, dtype=torch.int32)
+    unseen = (radii == 0)[..., None]
+    means2d.grad = (torch.randn(views, count, 2, generator=generator) * 1e-4).masked_fill(unseen, 0.0)
+    means2d.absgrad = means2d.grad.abs() * 3
+    return {"means2d": means2d, "radii": radii, "n_cameras": 5, "gaussian_ids": None, **size}
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 37, 1000])
+@pytest.mark.parametrize("views", [1, 2, 4, 33])
+def test_statistics_are_gsplats_to_the_last_bit(views, count, absgrad):
+    sizes = torch.arange(2 * views).view(2, views, 1) + 40
+    infos = (
+        drawn_info(views, count, 0, {"width": 641, "height": 427}),
+        drawn_info(views, count, 1, {"width": sizes[0], "height": sizes[1]}),
+    )
+    control = DensityControl(DensityConfig(use_absgrad=absgrad))
+    state: dict = {"grad2d": None, "count": None}
+    strategy = DefaultStrategy(absgrad=absgrad)
+    for info in infos:
+        strategy._update_state({"means": torch.zeros(count, 3)}, state, info)
+    found = control.count(torch.zeros(count, 3), infos)
+    assert {name: value.dtype for name, value in found.items()} == dict.fromkeys(state, torch.float32)
+    assert all(torch.equal(found[name], value) for name, value in state.items())
+
+
+def test_statistics_pass_over_what_is_no_number():
+    info = fake_info(4, 1.0)
+    info["means2d"].absgrad[0, 2] = math.nan
+    found = DensityControl(DensityConfig()).count(torch.zeros(4, 3), (info,))
+    assert found["count"].tolist() == [1, 1, 0, 1]
+    assert float(found["grad2d"][2]) == 0
+
+
+def test_random_numbers_are_forked_only_where_any_are_drawn(monkeypatch):
+    """It takes a wait on a device."""
+    forks, fork = [], torch.random.fork_rng
+    monkeypatch.setattr(torch.random, "fork_rng", lambda **options: forks.append(1) or fork(**options))
+    params, optimizers = live(random_gaussians(8))
+    control = DensityControl(DensityConfig())
+    growth = control.after_step(params, optimizers, {}, (fake_info(8, 1.0),), clock(steps=7))
+    assert forks == []
+    control.after_step(params, optimizers, growth, (fake_info(8, 1.0),), clock())
+    assert forks == [1]
+
+
+def test_a_refinement_leaves_the_allocator_its_memory(monkeypatch):
+    emptied = []
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(1))
+    lent = torch.cuda.empty_cache
+    params, optimizers = live(random_gaussians(8, size=0.001))
+    control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
+    control.after_step(params, optimizers, {}, (fake_info(8, 1.0),), clock())
+    assert len(params["means"]) == 16
+    assert emptied == []
+    assert torch.cuda.empty_cache is lent

@@ -1,0 +1,357 @@
+"""What goes wrong while a block is trained is noticed, told and mended; what is healthy is left as it is."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
+from abcd_ns.engine.gaussians.param_swap import attach
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.store.settle import with_mail
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.health import health_rules
+from abcd_ns.engine.train.health.health import Health
+from abcd_ns.engine.train.health.health_rules import is_worse, loss_rise, stand_ins, unsound
+from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
+from abcd_ns.engine.train.memory import OutOfRoomError, bytes_for, check_room
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+
+STILL = DensityConfig(strategy="off")
+GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
+
+
+def equal(a: Gaussians, b: Gaussians) -> bool:
+    return len(a) == len(b) and all(torch.equal(value, getattr(b, name)) for name, value in a.items())
+
+
+def listen(coordinator, kind) -> list:
+    found = []
+    coordinator.announce.subscribe(lambda event: found.append(event) if isinstance(event, kind) else None)
+    return found
+
+
+def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
+    """The row's gradient of one parameter is `value` in every step: a hook that runs before all others."""
+    optimizer = coordinator.optimizers[name]
+
+    def spoil(optimizer, args, kwargs):  # noqa: ARG001 - torch's signature
+        gradient = optimizer.param_groups[0]["params"][0].grad
+        if gradient is not None and len(gradient) > row:
+            gradient[row] = value
+
+    handle = optimizer.register_step_pre_hook(spoil)
+    optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
+
+
+def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, start, monkeypatch):
+    results = []
+    for watched in (True, False):
+        if not watched:
+            monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
+        folder = tmp_path / str(watched)
+        folder.mkdir()
+        options = {"blocks": 2, "steps": 18, "density": GROWING, "scaffold": 120}
+        coordinator = make_coordinator(folder, start, views, heal=watched, **options)
+        told = listen(coordinator, Mended | VisitUndone)
+        train(coordinator, photos)
+        results.append(whole_scene(coordinator))
+        assert told == []
+    assert equal(*results)
+
+
+@pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (math.nan, 1), (math.inf, 1), (1e30, 1)])
+def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(
+    tmp_path, views, photos, start, value, blocks
+):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=12, density=GROWING)
+    told = listen(coordinator, Mended)
+    spoil_gradients(coordinator, "scales", 2, value)
+    train(coordinator, photos)
+    assert {event.what for event in told} == {"gradients"}
+    assert sum(event.count for event in told) == 12
+    assert sum(record.gradients for record in coordinator.state.health.values()) == 12
+    for block in range(blocks):
+        tensors, _ = coordinator.scene.state(block).to_tensors()
+        assert all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values())
+
+
+def test_without_the_watch_they_would_spread(tmp_path, views, photos, start, monkeypatch):
+    monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
+    monkeypatch.setattr(Health, "_mend", lambda *_: None)
+    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=3, density=STILL)
+    spoil_gradients(coordinator, "scales", 2, math.nan)
+    train(coordinator, photos)
+    assert bool(unsound(whole_scene(coordinator)).any())
+
+
+def test_a_value_that_is_no_number_is_put_back_as_it_was_at_rest(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30, density=STILL)
+    train_step(coordinator, photos)
+    block = coordinator.state.active.geometry.block
+    before, told = coordinator.scene.at_rest(block), listen(coordinator, Mended)
+    with torch.no_grad():
+        coordinator.params["means"][4, 1] = math.nan
+        coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0
+    coordinator.save()
+    assert [(event.what, event.count, event.block) for event in told] == [("values", 1, block)]
+    live = coordinator.scene.gaussians(block)
+    assert all(torch.equal(value[4], getattr(before, name)[4]) for name, value in live.items())
+    moments = coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"]
+    assert bool((moments[4] == 0).all())
+    assert bool((moments[5] != 0).any())
+
+
+def test_where_rows_have_changed_a_transparent_one_takes_its_place(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, density=GROWING)
+    attached = listen(coordinator, VisitBegan)
+    while not attached or len(coordinator.params["means"]) == attached[-1].gaussians:
+        train_step(coordinator, photos)
+    with torch.no_grad():
+        coordinator.params["scales"][0] = 100.0
+    coordinator.save()
+    assert bool(torch.isfinite(coordinator.params["scales"]).all())
+    assert float(torch.sigmoid(coordinator.params["opacities"].detach()[0])) < 1 / 255
+
+
+def test_moments_that_are_no_numbers_are_set_to_zero(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30, density=STILL)
+    train_step(coordinator, photos)
+    told = listen(coordinator, Mended)
+    adam = coordinator.optimizers["quats"].state[coordinator.params["quats"]]
+    kept = adam["exp_avg_sq"][1].clone()
+    adam["exp_avg_sq"][0] = math.inf
+    coordinator.save()
+    assert [(event.what, event.count) for event in told] == [("moments", 1)]
+    assert bool((adam["exp_avg_sq"][0] == 0).all())
+    assert torch.equal(adam["exp_avg_sq"][1], kept)
+
+
+def darkened(coordinator, photos, visit: int) -> None:
+    """Train on, and make every Gaussian of the block all but transparent in the midst of one visit."""
+    done = False
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        active = coordinator.state.active
+        if active is not None and active.number == visit and 2 * active.done > active.steps and not done:
+            done = True
+            with torch.no_grad():
+                coordinator.params["opacities"].fill_(-4.0)
+    assert done
+
+
+def test_a_visit_that_made_its_pictures_worse_is_undone(tmp_path, views, photos, start):
+    options = {"blocks": 2, "steps": 60, "density": STILL, "background": "black", "batch": 1}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    undone, states = listen(coordinator, VisitUndone), []
+
+    def remember(event) -> None:
+        if isinstance(event, VisitEnded):
+            states.append([with_mail(coordinator.scene, b) for b in range(2)])
+
+    coordinator.announce.subscribe(remember)
+    darkened(coordinator, photos, visit=2)
+    assert [event.visit for event in undone] == [2]
+    block, (before, after) = undone[0].block, (states[1], states[2])
+    assert undone[0].after > undone[0].before
+    assert equal(before[block].gaussians, after[block].gaussians)
+    assert equal(before[block].exp_avg, after[block].exp_avg)
+    assert after[block].clocks.visits == before[block].clocks.visits + 1
+    assert after[block].clocks.steps > before[block].clocks.steps
+    record = coordinator.state.health[block]
+    assert (record.undone, record.damping) == (1, 0.5)
+
+
+def test_the_visit_after_an_undone_one_is_damped(tmp_path, views, photos, start):
+    options = {"blocks": 2, "steps": 60, "density": STILL, "batch": 1}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    train_step(coordinator, photos)
+    block = coordinator.state.active.geometry.block
+    rates = {name: o.param_groups[0]["lr"] for name, o in coordinator.optimizers.items()}
+    coordinator.state.health[block] = BlockHealth(visits=1, undone=1, damping=0.5)
+    coordinator.next_batch()
+    assert coordinator.optimizers["scales"].param_groups[0]["lr"] == 0.5 * rates["scales"]
+    while coordinator.state.active is not None:
+        train_step(coordinator, photos)
+    assert coordinator.state.health[block].damping == 1.0
+
+
+def test_off_nothing_is_undone(tmp_path, views, photos, start):
+    options = {"blocks": 2, "steps": 60, "density": STILL, "background": "black", "batch": 1}
+    coordinator = make_coordinator(tmp_path, start, views, heal=False, **options)
+    undone = listen(coordinator, VisitUndone)
+    darkened(coordinator, photos, visit=2)
+    assert undone == []
+
+
+def test_a_run_with_an_undone_visit_can_be_resumed_within_it(tmp_path, views, photos, start):
+    options = {"blocks": 2, "steps": 60, "density": STILL, "background": "black", "batch": 1}
+    results = []
+    for stops in (False, True):
+        folder = tmp_path / str(stops)
+        folder.mkdir()
+        coordinator = make_coordinator(folder, start, views, **options)
+        train(coordinator, photos, steps=25)
+        with torch.no_grad():
+            coordinator.params["opacities"].fill_(-4.0)
+        if stops:
+            coordinator.save()
+            coordinator.scene.store.close()
+            coordinator = make_coordinator(folder, start, views, resume=True, **options)
+        undone = listen(coordinator, VisitUndone)
+        train(coordinator, photos)
+        assert len(undone) == 1
+        results.append(whole_scene(coordinator))
+    assert equal(*results)
+
+
+def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30)
+    train_step(coordinator, photos)
+    means, scales = coordinator.params["means"].detach(), coordinator.params["scales"].detach()
+    with torch.no_grad():
+        scales[0] = torch.tensor([5.0, -3.0, 5.0])
+        means[1], scales[1] = torch.tensor([500.0, 0.0, 0.0]), math.log(100.0)
+    told, kept = listen(coordinator, Mended), scales[2:].clone()
+    coordinator.health.hold_back_giants(views)
+    assert [(event.what, event.count) for event in told] == [("giants", 1)]
+    nearest = min(float((means[0] - view.center).norm()) for view in views)
+    limit = health_rules.GIANT_ANGLE * nearest
+    assert scales[0].tolist() == pytest.approx([math.log(limit), -3.0, math.log(limit)])
+    assert float(scales[1].max()) == pytest.approx(math.log(100.0))
+    assert torch.equal(scales[2:], kept)
+
+
+def test_giants_are_held_back_in_visits_that_refine_nothing(tmp_path, views, photos, start):
+    start.scales[0] = 5.0
+    still = DensityConfig(strategy="off")
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=20, warmup=0.0, density=still)
+    told = listen(coordinator, Mended)
+    train(coordinator, photos)
+    assert {event.what for event in told} == {"giants"}
+    scene = whole_scene(coordinator)
+    nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
+    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) < 1.2 * health_rules.GIANT_ANGLE
+
+
+def test_what_no_picture_can_show_is_dropped_and_no_picture_changes(tmp_path, views, photos, start):
+    start.opacities[::5] = -7.0
+    density = dataclasses.replace(GROWING, cull_alpha_thresh=0.0, refine_stop=0.0)
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, density=density)
+    ended, told, draw = listen(coordinator, VisitEnded), listen(coordinator, Mended), TorchRasterizer("never")
+    while not ended:
+        train_step(coordinator, photos)
+    left = torch.sigmoid(coordinator.scene.gaussians(ended[0].block).opacities)
+    assert {event.what for event in told} == {"transparent"}
+    assert float(left.min()) >= 1 / 255
+    scene = whole_scene(coordinator)
+    shows = torch.sigmoid(scene.opacities[:, 0]) >= 1 / 255
+    assert not bool(shows.all())
+    for view in views:
+        assert torch.equal(draw(scene, view, sh_degree=0).color, draw(scene[shows], view, sh_degree=0).color)
+
+
+def test_losses_that_scatter_are_no_rise():
+    noisy = [[1.0, 1.5], [1.0, 0.6], [1.0, 1.4], [1.0, 0.9]]
+    assert not is_worse(*loss_rise(noisy))
+    assert is_worse(*loss_rise([[1.0, 1.1], [1.0, 1.12], [1.0, 1.11], [2.0, 2.2]]))
+    assert not is_worse(*loss_rise([[1.0, 1.01]] * 5))
+    assert loss_rise([[1.0, 2.0]] * 3 + [[1.0]] * 5) is None
+
+
+def test_stand_ins_are_numbers_even_among_none():
+    for sound in (random_gaussians(7), Gaussians.empty(1)):
+        made = stand_ins(sound, 3)
+        assert len(made) == 3
+        assert not bool(unsound(made).any())
+
+
+@pytest.mark.parametrize("name", PARAM_NAMES)
+def test_every_parameter_is_looked_at(name):
+    gaussians = random_gaussians(5)
+    getattr(gaussians, name)[3].view(-1)[-1] = math.nan
+    assert unsound(gaussians).tolist() == [False, False, False, True, False]
+
+
+def test_the_record_survives_json():
+    state = RunState(
+        health={-1: BlockHealth(gradients=3), 4: BlockHealth(visits=2, damping=0.25, hidden=True)}
+    )
+    again = RunState.from_json(state.to_json())
+    assert again.health == state.health
+
+
+def test_how_blocks_stand_is_said_in_words():
+    ledger = {
+        0: BlockHealth(visits=3),
+        1: BlockHealth(visits=2),
+        2: BlockHealth(visits=1, hidden=True),
+        4: BlockHealth(visits=2, undone=2, gradients=1200),
+    }
+    views = {0: 9, 1: 1, 2: 8, 3: 0, 4: 7, 5: 6}
+    words = [standing(block, ledger.get(block), views) for block in range(6)]
+    assert words == [
+        "trained",
+        "seen by 1 view only",
+        "hidden behind others, passed over",
+        "seen by no view, left as it was",
+        "every visit undone",
+        "not visited yet",
+    ]
+    lines = summary(6, ledger, views)
+    assert "block 4: seen by no view, left as it was" in lines
+    assert lines[-1].startswith("1,200 gradients that were no numbers set to zero, 2 visits undone")
+    assert summary(2, {0: BlockHealth(visits=1), 1: BlockHealth(visits=1)}, {0: 5, 1: 5}) == [
+        "all 2 blocks: trained"
+    ]
+
+
+def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(
+    tmp_path, views, photos, start, monkeypatch
+):
+    with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
+        check_room(10**12, 3, torch.device("cpu"))
+    check_room(1000, 3, torch.device("cpu"))
+    monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: bytes_for(30, 1))
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=10)
+    with pytest.raises(OutOfRoomError, match="A block of 60 Gaussians"):
+        train_step(coordinator, photos)
+
+
+@pytest.mark.parametrize(("seen", "expected"), [(3, 3), (3000, 40)])
+def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
+    tmp_path, views, photos, start, seen, expected
+):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, visit_steps=10)
+    train_step(coordinator, photos)
+    coordinator.state.views[coordinator.state.active.geometry.block] = seen
+    assert coordinator._density_clock(4).views == expected
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_a_block_that_is_emptied_in_its_visit_ends_it(tmp_path, views, photos, start, blocks, strategy):
+    """All its Gaussians may be pruned; the run goes on, and can be resumed."""
+    density = DensityConfig(strategy, refine_start=0.0)
+    options = {"blocks": blocks, "steps": 30, "density": density}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    train(coordinator, photos, steps=2)
+    nobody = coordinator._detached()[:0]
+    attach(nobody, coordinator.params, coordinator.optimizers, batch=coordinator.batch)
+    coordinator._growth = {}
+    batch = coordinator.next_batch()
+    wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
+    assert coordinator.loss(batch, coordinator.render(batch).pictures, wanted).requires_grad
+    train(coordinator, photos, steps=2)
+    assert coordinator.state.active is not None
+    coordinator.save()
+    coordinator.scene.store.close()
+    resumed = make_coordinator(tmp_path, start, views, resume=True, **options)
+    left = resumed.state.active.steps - resumed.state.active.done
+    train(resumed, photos, steps=left)
+    assert resumed.state.active is None
+    assert resumed.count() == coordinator.count()

@@ -1,0 +1,61 @@
+"""A worker process that trains nothing: it makes runs up, and does what a test tells it."""
+
+import json
+import sys
+from pathlib import Path
+
+from abcd_ns.lab.runs.records import encode
+from tests.lab.compare.records import made_up_run
+
+WORKER = """
+import json, os, pathlib, sys
+path = pathlib.Path(sys.argv[1])
+job = json.loads(path.read_text())
+changes = [f"{change['path']}={change['value']}" for change in job["variant"]["changes"]]
+here = pathlib.Path(__file__).parent
+with open(here / "calls.txt", "a") as calls:
+    calls.write(" ".join([job["method"], *changes]) + "\\n")
+print("starting")
+behaviours = json.loads((here / "behaviour.json").read_text())
+behaviour = behaviours.get(" ".join(changes) or job["method"])
+if behaviour == "raises":
+    print()
+    sys.exit("ValueError: the scene is empty\\n")
+if behaviour == "is killed":
+    os.kill(os.getpid(), 9)
+if behaviour == "is silent":
+    sys.exit(0)
+run = json.loads((here / "run.json").read_text())
+run.update(method=job["method"], seed=job["seed"])
+run.update(behaviour or {})
+path.with_name("run.json").write_text(json.dumps(run))
+"""
+
+
+class FakeWorker:
+    """A worker process that trains nothing and does what it is told."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir()
+        (folder / "worker.py").write_text(WORKER)
+        (folder / "run.json").write_text(json.dumps(encode(made_up_run())))
+        self.behave()
+
+    def behave(self, changed: dict[str, str | dict] | None = None, **by_method: str) -> None:
+        """What to do, by what is changed or by method: "raises", "is killed", "is silent", or fields of the
+        run that is made up."""
+        named = {name.replace("_", "-"): what for name, what in by_method.items()}
+        (self.folder / "behaviour.json").write_text(json.dumps({**named, **(changed or {})}))
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """What starts it."""
+        return (sys.executable, str(self.folder / "worker.py"))
+
+    def calls(self) -> list[str]:
+        """Methods, and what was changed of them, that it was started for since the last call of this."""
+        path = self.folder / "calls.txt"
+        found = path.read_text().splitlines() if path.exists() else []
+        path.unlink(missing_ok=True)
+        return found

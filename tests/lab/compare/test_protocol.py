@@ -1,0 +1,138 @@
+"""Options, plans and TOML files: what is refused, and what wins."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.errors import UserError
+from abcd_ns.lab.compare.protocol import Options, make_plan, read_options
+from abcd_ns.lab.runs.configs import trainer_config
+from abcd_ns.lab.runs.job import METHODS, Settings
+
+CONFIGS = [
+    path
+    for path in sorted((Path(__file__).resolve().parents[3] / "configs").glob("*.toml"))
+    if "method = " not in path.read_text()  # those are for `abcd train`
+]
+
+
+def options(scene: Path, **given) -> Options:
+    return Options(**{"data": str(scene), "out": "out", "steps": 10, **given})
+
+
+def test_defaults_make_a_plan(tmp_path):
+    plan = make_plan(options(tmp_path))
+    assert plan.methods == ("abcd-monolithic", "abcd", "abcd-ablated")
+    assert [(job.method, job.seed) for job in plan.jobs] == [(method, 0) for method in plan.methods]
+    assert plan.settings.scene == tmp_path.name
+    assert (plan.settings.steps, plan.settings.seconds, plan.settings.densify) == (10, None, True)
+
+
+def test_every_method_runs_with_every_seed_in_its_own_folder(tmp_path):
+    plan = make_plan(options(tmp_path, methods=("abcd", "abcd-monolithic"), seeds=(3, 1)))
+    assert [(job.method, job.seed) for job in plan.jobs] == [
+        ("abcd-monolithic", 3),
+        ("abcd", 3),
+        ("abcd-monolithic", 1),
+        ("abcd", 1),
+    ]
+    assert len({job.folder(plan.out) for job in plan.jobs}) == 4
+
+
+@pytest.mark.parametrize("method", [method for method in METHODS if method != "splatfacto"])
+def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, method):
+    (job,) = make_plan(options(tmp_path, methods=(method,), steps=90, blocks=4)).jobs
+    config = trainer_config(job, tmp_path)
+    training = config.pipeline.training
+    assert config.method_name == method
+    assert config.pipeline.blocks == (1 if method == "abcd-monolithic" else 4)
+    assert (training.overlap > 0) == (method == "abcd-partition")
+    assert training.exact == (method == "abcd-exact")
+    assert training.visit_steps == (23 if method == "abcd-paper" else 0)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"data": None}, "--data"),
+        ({"data": "nowhere"}, "--data nowhere does not exist"),
+        ({"out": None}, "--out"),
+        ({"steps": None}, "either --seconds or --steps"),
+        ({"seconds": 5.0}, "either --seconds or --steps"),
+        ({"steps": 0}, "--steps is 0"),
+        ({"steps": None, "seconds": 0.0}, "--seconds is 0.0"),
+        ({"steps": None, "seconds": float("nan")}, "--seconds is nan"),
+        ({"blocks": 0}, "--blocks is 0"),
+        ({"downscale": 0}, "--downscale is 0"),
+        ({"evals": 0}, "--evals is 0"),
+        ({"max_gaussians": -1}, "--max-gaussians is -1"),
+        ({"methods": ("nerfacto",)}, "no method 'nerfacto'"),
+        ({"methods": ()}, "at least one"),
+        ({"methods": ("abcd-paper",), "steps": None, "seconds": 9.0}, "abcd-paper .* use --steps"),
+        ({"seeds": (1, 1)}, "different numbers"),
+        ({"seeds": (-1,)}, "different numbers"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, given, message):
+    with pytest.raises(UserError, match=message) as caught:
+        make_plan(options(tmp_path, **given))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_command_line_goes_before_the_file():
+    file = Options(steps=100, blocks=4, methods=("abcd",), downscale=2)
+    merged = Options(seconds=5.0, blocks=2).over(file)
+    assert (merged.seconds, merged.steps) == (5.0, None)
+    assert (merged.blocks, merged.downscale, merged.methods) == (2, 2, ("abcd",))
+    assert Options().over(file) == file
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_the_examples_make_plans(path, tmp_path):
+    plan = make_plan(Options(data=str(tmp_path), out="out").over(read_options(path)))
+    assert set(plan.methods) <= set(METHODS)
+
+
+def test_there_are_examples():
+    assert "compare-castle" in [path.stem for path in CONFIGS]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bloks = 3", "unknown field 'bloks'; did you mean 'blocks'"),
+        ("blocks = 'three'", "blocks must be a whole number, not 'three'"),
+        ("methods = ['abcd', 3]", r"methods\[1\] must be a text, not 3"),
+        ("seeds = 0", "seeds must be a list, not 0"),
+        ("blocks = ", "cannot be read as TOML"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
+    path = tmp_path / "compare.toml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=message) as caught:
+        read_options(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_absent_file_is_refused(tmp_path):
+    with pytest.raises(UserError, match="does not exist"):
+        read_options(tmp_path / "absent.toml")
+
+
+@given(st.integers(1, 50))
+def test_moments_rise_to_the_end_of_the_run(evals):
+    settings = Settings("scene", 1, 8, None, 100, evals, 0, True, 3)
+    assert len(settings.moments) == evals
+    assert list(settings.moments) == sorted(set(settings.moments))
+    assert settings.moments[0] > 0
+    assert settings.moments[-1] == 1
+
+
+def test_the_command_states_what_is_not_default(tmp_path):
+    plan = make_plan(options(tmp_path, max_gaussians=500, no_densify=True, seeds=(1, 2)))
+    for part in ("--steps 10", "--max-gaussians 500", "--no-densify", "--seeds 1 2", "--out out"):
+        assert part in plan.command

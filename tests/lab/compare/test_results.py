@@ -1,0 +1,154 @@
+"""results.json: what is written comes back, and what does not fit is refused by name."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.lab.compare.protocol import Options
+from abcd_ns.lab.compare.results import SCHEMA, read_results, write_results
+from abcd_ns.lab.runs.evaluate import mean, ordering_gap
+from abcd_ns.lab.runs.records import RecordError, decode, encode
+from abcd_ns.lab.runs.run import CurvePoint, Run
+from abcd_ns.nerfstudio.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
+from tests.lab.compare.records import made_up_results, made_up_run
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
+
+
+@given(
+    psnr=finite,
+    gap=st.none() | finite,
+    gaussians=st.integers(0, 2**40),
+    curve=st.lists(st.tuples(finite, st.integers(0, 10**9), finite), min_size=1, max_size=4),
+    reason=st.none() | st.text(max_size=20),
+)
+def test_results_come_back_as_they_were_written(tmp_path_factory, psnr, gap, gaussians, curve, reason):
+    path = tmp_path_factory.mktemp("results") / "results.json"
+    points = tuple(CurvePoint(*point) for point in curve)
+    fields = {"ordering_gap_db": gap, "gaussians": gaussians, "curve": points, "lpips_reason": reason}
+    results = made_up_results(made_up_run(**fields), made_up_run("abcd-monolithic", psnr=psnr))
+
+    write_results(path, results)
+
+    assert read_results(path) == results
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_no_number_that_json_lacks_is_written(tmp_path, number):
+    bad = made_up_run(curve=(CurvePoint(1.0, 1, 20.0), CurvePoint(2.0, 2, number)))
+    with pytest.raises(ValueError, match=r"runs\[1\]\.curve\[1\]\.psnr is (nan|-?inf)"):
+        write_results(tmp_path / "results.json", made_up_results(made_up_run(), bad))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity"])
+def test_no_number_that_json_lacks_is_read(tmp_path, constant):
+    path = tmp_path / "results.json"
+    write_results(path, made_up_results(made_up_run(ssim=0.875)))
+    path.write_text(path.read_text().replace("0.875", constant))
+    with pytest.raises(RecordError, match=f"holds {constant}"):
+        read_results(path)
+
+
+def spoil(data: dict, *steps, value=None, drop=False) -> dict:
+    """`data` with the value at `steps` replaced or dropped."""
+    *way, last = steps
+    place = data
+    for step in way:
+        place = place[step]
+    if drop:
+        del place[last]
+    else:
+        place[last] = value
+    return data
+
+
+@pytest.mark.parametrize(
+    ("steps", "change", "message"),
+    [
+        (("schema",), {"value": SCHEMA + 1}, f"has schema {SCHEMA + 1}"),
+        (("runs", 0, "psnr"), {"value": "24"}, r"runs\[0\]: psnr must be a number, not '24'"),
+        (("runs", 0, "psnr"), {"value": None}, "psnr must be a number, not None"),
+        (("runs", 0, "steps"), {"value": 1.5}, "steps must be a whole number, not 1.5"),
+        (("runs", 0, "steps"), {"value": True}, "steps must be a whole number, not True"),
+        (("runs", 0, "curve"), {"value": 3}, "curve must be a list"),
+        (("runs", 0, "method"), {"drop": True}, "lacks the field 'method'"),
+        (("runs", 0, "psrn"), {"value": 1.0}, "unknown field 'psrn'; did you mean 'psnr'"),
+        (("machine",), {"value": []}, "machine must be a table"),
+        (("protocol", "densify"), {"value": 1}, "densify must be true or false, not 1"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused_by_field(tmp_path, steps, change, message):
+    path = tmp_path / "results.json"
+    data = json.loads(json.dumps(encode(made_up_results(made_up_run()))))
+    path.write_text(json.dumps(spoil(data, *steps, **change)))
+    with pytest.raises(RecordError, match=message) as caught:
+        read_results(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "3"])
+def test_what_is_no_results_file_is_refused(tmp_path, content):
+    path = tmp_path / "results.json"
+    path.write_text(content)
+    with pytest.raises(RecordError, match=r"results\.json"):
+        read_results(path)
+
+
+def test_every_field_of_a_run_is_required():
+    """But for those that came later: older results are read."""
+    data = encode(made_up_run())
+    required = [field for field in dataclasses.fields(Run) if field.default is dataclasses.MISSING]
+    assert len(required) > 10
+    for field in required:
+        with pytest.raises(RecordError, match=f"lacks the field '{field.name}'"):
+            decode(Run, {name: value for name, value in data.items() if name != field.name}, "run.json")
+
+
+def test_whole_numbers_are_numbers():
+    assert decode(Options, {"seconds": 60}, "x.toml").seconds == 60.0
+
+
+@given(st.lists(st.floats(1e-12, 1.0), min_size=1, max_size=6))
+def test_ordering_gap_is_the_psnr_of_the_mean_squared_difference(squared):
+    gap, note = ordering_gap(squared, blocks=2)
+    assert note is None
+    assert 10 ** (-gap / 10) == pytest.approx(sum(squared) / len(squared))
+
+
+@pytest.mark.parametrize(("squared", "blocks"), [([1e-3], 1), ([0.0, 0.0], 4)])
+def test_no_ordering_gap_has_a_reason(squared, blocks):
+    gap, note = ordering_gap(squared, blocks)
+    assert gap is None
+    assert note
+
+
+def test_a_mean_with_a_missing_value_is_missing():
+    assert mean([1.0, 2.0]) == 1.5
+    assert mean([1.0, None]) is None
+    assert mean([]) is None
+
+
+def test_this_machine_and_environment_fit_their_records():
+    for record in (describe_machine(), describe_versions()):
+        assert decode(type(record), encode(record), "") == record
+
+
+def test_peak_memory_grows_with_what_is_held():
+    before = peak_rss_bytes()
+    held = bytearray(before + (64 << 20))  # zeroed pages are not resident until they are written
+    for i in range(0, len(held), 4096):
+        held[i] = 1
+    assert peak_rss_bytes() >= before + (32 << 20)
+
+
+def test_disk_bytes_counts_what_is_there(tmp_path):
+    assert disk_bytes(tmp_path / "absent") == 0
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "data").write_bytes(b"x" * 100_000)
+    assert 100_000 <= disk_bytes(tmp_path) <= 200_000

@@ -1,0 +1,92 @@
+"""Made-up studies for tests of what `abcd study` writes. No number here was ever measured."""
+
+import math
+import random
+
+from abcd_ns.lab.runs.run import Run
+from abcd_ns.lab.study.findings import findings_of
+from abcd_ns.lab.study.results import SCHEMA, Arm, StudyProtocol, StudyResults
+from tests.lab.compare.records import MACHINE, VERSIONS, made_up_run
+
+
+def made_up_arm(variant: str, value: int | None, psnrs: dict[int, float], method="abcd", **fields) -> Arm:
+    """An arm whose runs end at `psnrs`, by seed."""
+    runs = (made_up_run(method, seed, psnr_merged=psnr, psnr=psnr, **fields) for seed, psnr in psnrs.items())
+    return Arm(method, variant, value, tuple(runs))
+
+
+def made_up_study(study: str, *arms: Arm, seeds: tuple[int, ...] = (0,), **fields) -> StudyResults:
+    """A study with these arms, and what it says."""
+    protocol = StudyProtocol(
+        scene="made-up",
+        downscale=4,
+        held_out="every 8th view",
+        seconds=60.0,
+        steps=None,
+        methods=tuple(dict.fromkeys(arm.method for arm in arms)) or ("abcd",),
+        varied=tuple(dict.fromkeys(arm.variant for arm in arms)),
+        seeds=seeds,
+        blocks=8,
+        evals=4,
+        max_gaussians=0,
+        date="2026-01-01T00:00:00+00:00",
+        command="abcd study",
+    )
+    values = {"schema": SCHEMA, "study": study, "protocol": protocol, "machine": MACHINE}
+    values |= {"versions": VERSIONS, "arms": arms, **fields}
+    return StudyResults(**values, findings=findings_of(StudyResults(**values)))
+
+
+def blocks_study(seeds: tuple[int, ...] = (0,)) -> StudyResults:
+    """A plausible study of blocks: slightly worse, smaller in memory and slower with more of them."""
+    chance = random.Random(0)
+    arms = []
+    for count in (1, 2, 4, 8, 16, 27):
+        psnr = 25.4 - 0.12 * math.log2(count)
+        runs = tuple(_blocks_run(seed, count, psnr + chance.gauss(0, 0.1)) for seed in seeds)
+        arms.append(Arm("abcd", f"blocks={count}", count, runs))
+    return made_up_study("blocks", *arms, seeds=seeds)
+
+
+def _blocks_run(seed: int, count: int, psnr: float) -> Run:
+    return made_up_run(
+        seed=seed,
+        blocks=count,
+        psnr_merged=psnr,
+        psnr=psnr - 0.06 * math.log2(count),
+        gaussians=int(38000 - 1500 * math.log2(count)),
+        steps=int(2400 / (1 + 0.15 * math.log2(count))),
+        peak_rss_bytes=int((1.1 + 1.4 / count) * 2**30),
+    )
+
+
+def gaussians_study(seeds: tuple[int, ...] = (0,)) -> StudyResults:
+    """A plausible study of limits: two methods, both levelling off."""
+    chance = random.Random(1)
+    arms = []
+    for method, top in (("abcd-monolithic", 26.0), ("abcd", 24.6)):
+        for limit in (2000, 4000, 8000, 16000, 32000):
+            psnrs = {seed: top - 5 * (900 / limit) ** 0.9 + chance.gauss(0, 0.05) for seed in seeds}
+            count = min(limit, 27000)
+            arms.append(made_up_arm(f"limit {limit}", limit, psnrs, method, gaussians=count))
+    return made_up_study("gaussians", *arms, seeds=seeds)
+
+
+def options_study(seeds: tuple[int, ...] = (0,)) -> StudyResults:
+    """A plausible ablation."""
+    chance = random.Random(2)
+    changes = {
+        "default": 0.0,
+        "training.warmup=0": -1.3,
+        "training.batch=1": -0.45,
+        "training.layers=false": -7.4,
+        "training.visit_views=16": 0.08,
+        "partition=grid blocks=27": -0.6,
+        "training.density.strategy=mcmc": 0.5,
+    }
+    base = {seed: 24.0 + chance.gauss(0, 0.3) for seed in seeds}
+    arms = [
+        made_up_arm(name, None, {seed: base[seed] + gain + chance.gauss(0, 0.12) for seed in seeds})
+        for name, gain in changes.items()
+    ]
+    return made_up_study("options", *arms, seeds=seeds)

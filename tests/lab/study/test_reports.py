@@ -1,0 +1,300 @@
+"""What a study says of its runs: findings, table, chart; and runs that are reused or fail."""
+
+import dataclasses
+import xml.etree.ElementTree as ET
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs import runner
+from abcd_ns.lab.runs.runner import claim, run_jobs
+from abcd_ns.lab.study.charts import draw_study
+from abcd_ns.lab.study.command import carry_out
+from abcd_ns.lab.study.findings import find_difference, find_gap, find_knee
+from abcd_ns.lab.study.plan import Conditions, StudyPlan, plan_blocks, plan_options
+from abcd_ns.lab.study.results import read_study, write_study
+from abcd_ns.lab.study.tables import notes, rows, write_table
+from tests.lab.compare.fake_worker import FakeWorker
+from tests.lab.compare.records import MACHINE
+from tests.lab.study.records import (
+    blocks_study,
+    gaussians_study,
+    made_up_arm,
+    made_up_study,
+    options_study,
+)
+from tests.reference.colmap_scene import write_scene
+
+STUDIES = [blocks_study, gaussians_study, options_study]
+
+
+def arms(psnrs: dict[int, float], method: str = "abcd"):
+    return [made_up_arm(f"x={value}", value, {0: psnr}, method) for value, psnr in psnrs.items()]
+
+
+# Findings
+
+
+def test_the_gap_is_between_best_and_worst():
+    gap = find_gap(arms({1: 24.0, 2: 25.0, 4: 24.7}))
+    assert (gap.best.value, gap.worst.value) == (2, 1)
+    assert gap.decibels == pytest.approx(1.0)
+    assert find_gap(arms({1: 24.0})) is None
+
+
+@pytest.mark.parametrize(("worst", "verdict"), [(24.6, "within the 0.5 dB"), (24.4, "above the 0.5 dB")])
+def test_a_study_of_blocks_says_whether_the_goal_is_met(worst, verdict):
+    (finding,) = made_up_study("blocks", *arms({1: 25.0, 27: worst})).findings
+    assert verdict in finding
+    assert finding.startswith(f"Best: 1 block, 25.00 dB. Worst: 27 blocks, {worst:.2f} dB.")
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "knee"),
+    [
+        ({2: 20.0, 4: 22.0, 8: 22.15, 16: 22.19}, 4),
+        ({2: 20.0, 4: 21.0, 8: 22.0}, 8),
+        ({2: 22.0, 4: 22.1, 8: 22.1}, 2),
+        ({2: 20.0, 4: 23.0, 8: 22.0}, 4),
+    ],
+)
+def test_the_knee_is_the_smallest_budget_near_the_best(psnrs, knee):
+    assert find_knee(arms(psnrs)).value == knee
+
+
+def test_each_method_has_its_own_knee_and_a_knee_at_the_edge_says_so():
+    study = made_up_study(
+        "gaussians",
+        *arms({2: 20.0, 4: 23.0, 8: 23.1}, "abcd-monolithic"),
+        *arms({2: 18.0, 4: 19.0, 8: 20.0}),
+    )
+    monolithic, blocks = study.findings
+    assert monolithic.startswith("abcd-monolithic: a limit of 4 Gaussians is enough: 23.00 dB")
+    assert "tried" not in monolithic
+    assert blocks.endswith("It is the largest that was tried: more may be better.")
+
+
+def test_differences_are_taken_seed_by_seed():
+    default = made_up_arm("default", None, {0: 20.0, 1: 24.0, 2: 9.0})
+    other = made_up_arm("training.batch=1", None, {0: 21.0, 1: 25.5})
+    difference = find_difference(other, default)
+    assert difference.by_seed == pytest.approx((1.0, 1.5))
+    assert difference.mean == pytest.approx(1.25)
+    assert difference.deviation == pytest.approx(0.5 / 2**0.5)
+    assert find_difference(made_up_arm("x=1", None, {7: 20.0}), default) is None
+
+
+@pytest.mark.parametrize(
+    ("psnr", "begins"),
+    [
+        (21.0, "Best change: training.batch=1, +1.00 dB. One seed"),
+        (19.5, "No change is better than the default; nearest: training.batch=1, -0.50 dB."),
+    ],
+)
+def test_an_ablation_says_which_change_is_best(psnr, begins):
+    default, other = (
+        made_up_arm(n, None, {0: p}) for n, p in (("default", 20.0), ("training.batch=1", psnr))
+    )
+    (finding,) = made_up_study("options", default, other).findings
+    assert finding.startswith(begins)
+
+
+# Tables
+
+
+def test_an_ablation_has_a_row_for_each_change_with_its_difference():
+    default = made_up_arm("default", None, {0: 20.0, 1: 24.0})
+    other = made_up_arm("training.batch=1", None, {0: 21.0, 1: 25.5})
+    titles, first, second = rows(made_up_study("options", default, other, seeds=(0, 1)))
+    assert titles[:3] == ["changed", "difference (dB)", "PSNR, merged (dB)"]
+    assert {"SSIM, merged", "Gaussians", "training (s)"} <= set(titles)
+    assert first[:3] == ["default", "-", "22.00 ± 2.83"]
+    assert second[:3] == ["training.batch=1", "+1.25 ± 0.35", "23.25 ± 3.18"]
+
+
+def test_several_methods_have_a_column_of_their_own():
+    titles, *body = rows(gaussians_study())
+    assert titles[:2] == ["method", "limit"]
+    assert len(body) == 10
+    assert body[-1][:2] == ["abcd", "32,000"]
+    titles, *_ = rows(blocks_study())
+    assert titles[0] == "blocks"
+    assert "peak RAM (GiB)" in titles
+    assert "peak GPU memory (GiB)" not in titles  # nowhere measured
+
+
+@pytest.mark.parametrize("make", STUDIES)
+def test_the_written_table_begins_with_what_was_found(make, tmp_path):
+    study = make((0, 1))
+    write_table(study, tmp_path / "table.md")
+    text = (tmp_path / "table.md").read_text()
+    assert text.startswith(study.findings[0])
+    assert len({line.count("|") for line in text.splitlines() if line.startswith("|")}) == 1
+    assert all(note in text for note in notes(study))
+    assert "seeds 0, 1" in text
+
+
+# Charts
+
+
+def texts_of(svg: Path) -> list[str]:
+    nodes = ET.fromstring(svg.read_bytes()).iter("{http://www.w3.org/2000/svg}text")
+    return ["".join(node.itertext()) for node in nodes]
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1, 2)])
+@pytest.mark.parametrize("make", STUDIES)
+def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp_path):
+    study, drawn = make(seeds), []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        paths = draw_study(study, tmp_path / name)
+        assert [path.name for path in paths] == [f"{study.study}.png", f"{study.study}.svg"]
+        drawn.append(paths[1].read_bytes())
+    assert drawn[0] == drawn[1]
+    texts = texts_of(paths[1])
+    wanted = {
+        "blocks": ["held-out PSNR (dB)", "blocks", "27", "Gaussians", "peak RAM (GiB)", "best - 0.5 dB"],
+        "gaussians": ["held-out PSNR (dB)", "32k", "knee 16k"],
+        "options": ["training.warmup=0", "change", "PSNR", "Gaussians"],
+    }[study.study]
+    assert [text for text in wanted if text not in texts] == []
+
+
+def test_what_chance_does_hardly_shows_in_a_chart_of_options(tmp_path):
+    near = made_up_arm("default", None, {0: 25.0}), made_up_arm("training.batch=1", None, {0: 25.01})
+    _, svg = draw_study(made_up_study("options", *near), tmp_path)
+    ticks = [
+        float(t.replace("\N{MINUS SIGN}", "-"))
+        for t in texts_of(svg)
+        if t.strip("\N{MINUS SIGN}.0123456789") == ""
+    ]
+    assert min(ticks) <= -0.2
+    assert max(tick for tick in ticks if tick < 20) >= 0.2
+
+
+@pytest.mark.parametrize("study", ["blocks", "gaussians", "options"])
+def test_no_run_no_chart(study, tmp_path):
+    assert draw_study(made_up_study(study), tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("study", ["blocks", "gaussians"])
+def test_a_single_run_has_a_chart_too(study, tmp_path):
+    assert len(draw_study(made_up_study(study, *arms({4: 24.0})), tmp_path)) == 2
+
+
+# Runs
+
+
+@pytest.fixture
+def worker(tmp_path, monkeypatch) -> FakeWorker:
+    fake = FakeWorker(tmp_path / "worker")
+    monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr("abcd_ns.lab.study.command.run_jobs", lambda p, c: run_jobs(p, c, fake.command))
+    return fake
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("study") / "scene")
+
+
+@pytest.fixture
+def conditions(scene, tmp_path) -> Conditions:
+    return Conditions(scene, tmp_path / "out", steps=10)
+
+
+def carried_out(plan: StudyPlan) -> tuple[int, str]:
+    stream = StringIO()
+    return carry_out(plan, Console(file=stream, width=100)), stream.getvalue()
+
+
+def test_a_study_writes_all_it_found(conditions, worker):
+    worker.behave({"blocks=1": {"psnr_merged": 25.0}, "blocks=2": {"psnr_merged": 24.75}})
+    plan = plan_blocks(conditions, "abcd", (1, 2))
+    code, printed = carried_out(plan)
+    assert code == 0
+    assert worker.calls() == ["abcd blocks=1", "abcd blocks=2"]
+    results = read_study(plan.out / "results.json")
+    assert [(arm.value, arm.psnr) for arm in results.arms] == [(1, 25.0), (2, 24.75)]
+    assert "Gap: 0.25 dB" in results.findings[0]
+    assert results.findings[0] in printed
+    assert "--blocks 1 2" in results.protocol.command
+    for name in ("table.md", "blocks.png", "blocks.svg"):
+        assert (plan.out / name).stat().st_size > 0
+
+
+def test_more_numbers_and_seeds_may_join_and_what_is_there_is_reused(conditions, worker):
+    carried_out(plan_blocks(conditions, "abcd", (1, 2)))
+    worker.calls()
+    more = dataclasses.replace(conditions, seeds=(0, 1))
+    _, printed = carried_out(plan_blocks(more, "abcd", (1, 2, 4)))
+    assert worker.calls() == ["abcd blocks=4", "abcd blocks=1", "abcd blocks=2", "abcd blocks=4"]
+    assert printed.count("reused") == 2
+
+
+def test_a_failed_run_is_named_and_the_others_are_reported(conditions, worker):
+    worker.behave({"training.batch=1": "raises"})
+    plan = plan_options(conditions, "abcd", ("training.batch=1", "training.warmup=0"))
+    code, _ = carried_out(plan)
+    assert code == 1
+    results = read_study(plan.out / "results.json")
+    assert [arm.variant for arm in results.arms] == ["default", "training.warmup=0"]
+    assert [failure.variant for failure in results.failures] == ["training.batch=1"]
+    text = (plan.out / "table.md").read_text()
+    assert "abcd, training.batch=1, seed 0 failed" in text
+    assert "ValueError: the scene is empty" in text
+
+
+def test_where_the_default_failed_there_is_no_difference(conditions, worker):
+    worker.behave(abcd="raises")
+    plan = plan_options(conditions, "abcd", ("training.batch=1",))
+    assert carried_out(plan)[0] == 1
+    assert "the default's runs failed" in (plan.out / "table.md").read_text()
+    assert not (plan.out / "options.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"steps": 11}, "holds runs with steps 10, not 11"), ({"downscale": 2}, "downscale")],
+)
+def test_another_protocol_is_refused(conditions, worker, change, message):
+    plan = plan_blocks(conditions, "abcd", (1, 2))
+    claim(plan.out, plan, MACHINE, overwrite=False)
+    other = plan_blocks(dataclasses.replace(conditions, **change), "abcd", (1, 2))
+    with pytest.raises(UserError, match=message):
+        claim(other.out, other, MACHINE, overwrite=False)
+    assert worker.calls() == []
+
+
+def test_another_kind_of_study_is_refused(conditions):
+    plan = plan_blocks(conditions, "abcd", (1, 2))
+    claim(plan.out, plan, MACHINE, overwrite=False)
+    other = plan_options(conditions, "abcd", ("blocks=2",))
+    with pytest.raises(UserError, match="holds no study of options"):
+        claim(other.out, other, MACHINE, overwrite=True)
+
+
+@pytest.mark.parametrize("make", STUDIES)
+def test_results_come_back_as_they_were_written(make, tmp_path):
+    study = make((0, 1))
+    write_study(tmp_path / "results.json", study)
+    assert read_study(tmp_path / "results.json") == study
+
+
+@pytest.mark.cli
+def test_a_study_that_really_trains(scene, tmp_path):
+    """Two numbers of blocks, under a limit below the scene's 300 points."""
+    conditions = Conditions(scene, tmp_path / "out", steps=12, evals=2, max_gaussians=150)
+    code, printed = carried_out(plan_blocks(conditions, "abcd", (1, 3)))
+    assert code == 0, printed
+    results = read_study(tmp_path / "out" / "results.json")
+    for arm, blocks in zip(results.arms, (1, 3), strict=True):
+        (run,) = arm.runs
+        assert (run.blocks, run.steps, run.gaussians) == (blocks, 12, 150)
+        assert [point.gaussians for point in run.curve][-1] == 150
+        assert arm.psnr > 8

@@ -1,0 +1,171 @@
+"""`abcd scale`: the land is what it claims to be, and a measurement can be made and read back."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from abcd_ns.engine.types import Crop
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.records import decode, encode, read_json, read_record
+from abcd_ns.lab.scale.arm import Arm, ArmJob, run
+from abcd_ns.lab.scale.chart import draw
+from abcd_ns.lab.scale.command import scale
+from abcd_ns.lab.scale.land import Land, color_of
+from abcd_ns.lab.scale.results import SCHEMA, ScaleResults, growth, notes_of, rows_of, write_table
+from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+
+MIB = 2**20
+
+
+@pytest.mark.parametrize("tiles", [1, 2, 8, 32])
+def test_each_block_of_the_land_is_one_tile(tiles):
+    land = Land(tiles, 50)
+    tree = land.tree()
+    assert sorted(land.tile_of(tree)) == list(range(tiles))
+    for block, tile in enumerate(land.tile_of(tree)):
+        means = land.make_tile(tile).means
+        assert bool((tree.assign(means) == block).all())
+        x, y = land.corner(tile)
+        assert bool(
+            ((means[:, :2] > torch.tensor([x, y])) & (means[:, :2] < torch.tensor([x + 1, y + 1]))).all()
+        )
+
+
+def test_only_powers_of_two_part_in_equal_halves():
+    with pytest.raises(ValueError, match="power of 2"):
+        Land(6, 10)
+
+
+def test_a_tile_does_not_depend_on_how_large_the_land_is():
+    assert torch.equal(Land(2, 20).make_tile(1).means, Land(2, 20).make_tile(1).means)
+    assert not torch.equal(Land(2, 20).make_tile(0).means + 1, Land(2, 20).make_tile(1).means)
+
+
+def test_a_photo_shows_the_lands_colour_where_the_ray_meets_it():
+    land = Land(4, 10)
+    for view in land.cameras()[::5]:
+        photo = land.photo(view, view.full)
+        to_world = torch.linalg.inv(view.viewmat)
+        for u, v in ((3, 5), (80, 60), (150, 110)):
+            pixel = torch.tensor([u + 0.5, v + 0.5, 1.0])
+            ray = to_world[:3, :3] @ (torch.linalg.inv(view.K) @ pixel)
+            x, y, _ = (to_world[:3, 3] - to_world[2, 3] / ray[2] * ray).tolist()
+            inside = 0 <= x < 2 and 0 <= y < 2
+            expected = color_of(torch.tensor(x), torch.tensor(y)) if inside else torch.zeros(3)
+            assert torch.allclose(photo[v, u], expected, atol=1e-3)
+        crop = Crop(16, 32, 48, 16)
+        assert torch.equal(land.photo(view, crop), photo[crop.slices])
+
+
+def test_cameras_see_their_own_tile():
+    land = Land(2, 10)
+    for view in land.cameras():
+        x, y = land.corner(view.index // land.views)
+        at = view.viewmat[:3, :3] @ torch.tensor([x + 0.5, y + 0.5, 0.0]) + view.viewmat[:3, 3]
+        pixel = view.K @ (at / at[2])
+        assert 0 < at[2] < 2
+        assert 0 < pixel[0] < view.width
+        assert 0 < pixel[1] < view.height
+
+
+@pytest.mark.parametrize("monolithic", [False, True])
+def test_a_measurement_trains_and_says_what_it_took(tmp_path, monolithic):
+    job = ArmJob(2, 300, monolithic, 0 if monolithic else 1, MIB, 0)
+    arm = run(job, tmp_path)
+    assert arm.gaussians == 600
+    assert arm.peak_rss_bytes >= arm.base_rss_bytes > 0
+    assert arm.store_bytes >= 600 * 3 * 59 * 4
+    assert arm.steps > 0
+    assert arm.psnr > 10
+    assert (arm.visit_seconds is None) == monolithic
+    assert decode(Arm, encode(arm), "here") == arm
+
+
+def made_up(tiles: int, peak: int, monolithic: bool = False, device: int | None = None) -> Arm:
+    visit = None if monolithic else 2.0
+    return Arm(
+        tiles, tiles * 1000, monolithic, 400 * MIB, peak * MIB, device, 10, 1.0, 1.0, visit, visit, 5, 20.0
+    )
+
+
+def test_growth_is_from_the_smallest_to_the_largest():
+    arms = [made_up(8, 520), made_up(2, 500), made_up(4, 900), made_up(8, 9000, True)]
+    found = growth(arms)
+    assert found is not None
+    assert found.blocks == (2, 8)
+    assert found.ram == pytest.approx(0.04)
+    assert found.device is None
+    assert growth([made_up(2, 500, device=100), made_up(4, 500, device=150)]).device == pytest.approx(0.5)
+    assert growth(arms[:1]) is None
+
+
+def test_results_are_written_in_words_and_drawn(tmp_path):
+    arms = (made_up(2, 500), made_up(8, 520), made_up(2, 450, True), made_up(8, 900, True))
+    results = ScaleResults(
+        SCHEMA, "2026-01-01", "abcd scale", describe_machine(), describe_versions(), arms, growth(arms), ()
+    )
+    write_table(results, tmp_path / "table.md")
+    text = (tmp_path / "table.md").read_text()
+    assert "ABCD, 8 blocks" in text
+    assert "grows by 4.0%" in text
+    assert len(rows_of(results)) == 5
+    assert any("400 MiB" in note for note in notes_of(results))
+    assert all(path.stat().st_size > 1000 for path in draw(results, tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"blocks": (2, 6)}, "powers of 2"),
+        ({"blocks": (4, 4)}, "different"),
+        ({"blocks": (0,)}, "from 1 on"),
+        ({"gaussians": 0}, "--gaussians"),
+        ({"visits": 0}, "--visits"),
+        ({"blocks": (2**18,), "gaussians": 10**6}, "GiB free"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_anything_is_written(tmp_path, options, expected):
+    with pytest.raises(UserError, match=expected):
+        scale(tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_something_else_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="not empty"):
+        scale(tmp_path, blocks=(2, 4))
+
+
+def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are_not_tried(
+    tmp_path, monkeypatch
+):
+    """No GPU here: the processes' ends are made up."""
+    tried = []
+
+    def made_up_end(job: ArmJob, _: Path) -> Arm | str:
+        tried.append((job.tiles, job.monolithic))
+        assert job.device_limit_bytes == 512 * MIB
+        if job.monolithic and job.tiles > 2:
+            return "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
+        return made_up(job.tiles, 500, job.monolithic, device=100)
+
+    monkeypatch.setattr("abcd_ns.lab.scale.command.measure", made_up_end)
+    assert scale(tmp_path, blocks=(2, 4, 8), gaussians=10, device_limit_mb=512) == 0
+    assert tried == [(2, False), (4, False), (8, False), (2, True), (4, True)]
+    found = read_record(tmp_path / "scale.json", ScaleResults, SCHEMA)
+    assert (found.one_block_too_large, found.failures, len(found.arms)) == (4, (), 4)
+    assert "As one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
+    assert "--device-limit-mb 512" in found.command
+
+
+@pytest.mark.cli
+def test_the_command_measures_writes_and_reuses(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert scale(out, blocks=(2, 4), gaussians=200, visits=1) == 0
+    first = read_json(out / "scale.json")
+    assert {arm["tiles"] for arm in first["arms"]} == {2, 4}
+    assert scale(out, blocks=(2, 4), gaussians=200, visits=1) == 0
+    assert read_json(out / "scale.json")["arms"] == first["arms"]
+    assert not list(out.glob("arms/*/store"))
+    assert "peak RAM grows by" in capsys.readouterr().out.replace("\n", " ")

@@ -1,0 +1,68 @@
+"""nerfstudio's trainer in processes that are killed; see tests.reference.crash_runs for the engine's."""
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from abcd_ns.engine.events import Event, StepTaken
+from abcd_ns.engine.store import crash_points
+from tests.nerfstudio.test_training import configure
+from tests.reference.crash_runs import Kill, Runs, killer
+
+STEPS_PER_SAVE = 10
+
+
+def train(
+    data: Path,
+    out: Path,
+    kill: Kill | None = None,
+    kill_at_step: int | None = None,
+    commit_seconds: float = 60.0,
+    **options: Any,
+):
+    """Train as `ns-train` does; the body of a process.
+
+    Args:
+        kill, kill_at_step: where it kills itself.
+        commit_seconds: as of TrainingConfig.
+        options: of the trainer's config.
+    """
+    torch.set_num_threads(1)
+    if kill is not None:
+        crash_points.reached = killer(kill)
+    config = configure(data, out, **options)
+    config.pipeline.training.commit_seconds = commit_seconds
+    config.set_timestamp()
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+
+    def end(event: Event) -> None:
+        if isinstance(event, StepTaken) and event.step == kill_at_step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    trainer.pipeline.coordinator.announce.subscribe(end)
+    trainer.train()
+
+
+class Trainings(Runs):
+    """Starts trainings in processes of their own."""
+
+    body = staticmethod(train)
+    modules = ("tests.nerfstudio.crash_training",)
+
+
+def run_folder(out: Path) -> Path:
+    """Of the one run under `out`."""
+    (folder,) = out.glob("*/abcd/run")
+    return folder
+
+
+def gaussians(run: Path) -> dict[str, torch.Tensor]:
+    """The scene in the run's last checkpoint."""
+    newest = sorted((run / "nerfstudio_models").glob("step-*.ckpt"))[-1]
+    state = torch.load(newest, weights_only=True)["pipeline"]
+    return {name: value for name, value in state.items() if "gauss_params" in name}

@@ -1,0 +1,52 @@
+"""What a run chose by the device's memory, it keeps: through training, on disk, and when it goes on."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.nerfstudio.datamanager import AbcdDataManager
+from abcd_ns.nerfstudio.room import GB, Room
+from tests.nerfstudio.crash_training import gaussians
+from tests.nerfstudio.test_training import configure, run
+from tests.reference.colmap_scene import write_scene
+
+STEPS = 16
+ROOM = Room(blocks=3, limit=5000, sole=5000, budget=GB, gaussians=300, batch=2, crop_pixels=600)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_path, monkeypatch, capsys):
+    crops, photo = [], AbcdDataManager.photo
+
+    def noted(manager, row, crop):
+        crops.append(crop)
+        return photo(manager, row, crop)
+
+    monkeypatch.setattr(AbcdDataManager, "photo", noted)
+    with monkeypatch.context() as patched:
+        patched.setattr("abcd_ns.nerfstudio.pipeline.find_room", lambda *_: ROOM)
+        straight = run(configure(data, tmp_path / "straight", blocks=0, steps=STEPS))
+        stopped = run(configure(data, tmp_path / "stopped", blocks=0, steps=STEPS), stop_after=9)
+    assert "a step draws 0.0006 megapixels of 2 views" in capsys.readouterr().out
+    with ParameterStore.open(stopped.base_dir / "abcd/store", read_only=True) as store:
+        assert {name: store.header[name] for name in ROOM.options} == ROOM.options
+    resumed = run(configure(data, tmp_path / "again", blocks=0, steps=STEPS, load_dir=stopped.base_dir))
+    assert resumed.pipeline.coordinator.config.crop_pixels == 600
+    assert resumed.pipeline.coordinator.batch == 2
+    assert len(crops) > STEPS
+    assert max(crop.pixels for crop in crops) <= 600
+    found, expected = gaussians(resumed.base_dir), gaussians(straight.base_dir)
+    assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_an_explicit_crop_is_kept_where_blocks_are_given(data, tmp_path):
+    config = configure(data, tmp_path, steps=4)
+    config.pipeline.training.crop_pixels, config.pipeline.training.batch = 700, 1
+    coordinator = run(config).pipeline.coordinator
+    assert (coordinator.config.crop_pixels, coordinator.batch) == (700, 1)

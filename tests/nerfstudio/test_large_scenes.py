@@ -1,0 +1,122 @@
+"""Pictures of a scene that the device could not draw at once: unit by unit, and still the merged picture."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from abcd_ns import methods
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.nerfstudio.model import AbcdModel
+from abcd_ns.nerfstudio.trainer import AbcdTrainer
+from tests.nerfstudio.test_training import configure, run
+from tests.reference.colmap_scene import write_scene
+
+CLOSE = 5e-4
+"""Drawing stops where 1e-4 of the light is left, and a unit knows nothing of the others."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+@pytest.fixture(scope="module", params=["fragments", "means"])
+def trained(request, data, tmp_path_factory) -> AbcdTrainer:
+    config = configure(data, tmp_path_factory.mktemp("out"), steps=12)
+    config.pipeline.training.ownership = config.pipeline.model.ownership = request.param
+    return run(config)
+
+
+@pytest.fixture
+def drawn(monkeypatch) -> list[int]:
+    """How many Gaussians each drawing was given."""
+    counts, draw = [], TorchRasterizer.draw
+
+    def watched(self, gaussians, *args, **options):
+        counts.append(len(gaussians))
+        return draw(self, gaussians, *args, **options)
+
+    monkeypatch.setattr(TorchRasterizer, "draw", watched)
+    return counts
+
+
+def short_of_memory(monkeypatch, gaussians: int = 1) -> None:
+    monkeypatch.setattr(AbcdModel, "_room", lambda _: gaussians)
+
+
+def pictures(pipeline) -> list[dict]:
+    pipeline.eval()
+    loader = pipeline.datamanager.fixed_indices_eval_dataloader
+    return [pipeline.model.get_outputs_for_camera(camera) for camera, _ in loader]
+
+
+def assert_same_pictures(found: list[dict], expected: list[dict]) -> None:
+    assert len(found) == len(expected) > 0
+    for one, other in zip(found, expected, strict=True):
+        for name in ("rgb", "accumulation"):
+            assert float((one[name] - other[name]).abs().max()) < CLOSE, name
+        seen = other["accumulation"][..., 0] > 0.1
+        torch.testing.assert_close(one["depth"][seen], other["depth"][seen], rtol=1e-2, atol=1e-2)
+
+
+def test_a_checkpoint_is_drawn_by_units(trained, monkeypatch, drawn):
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
+    expected, count = pictures(pipeline), len(pipeline.model.means)
+    assert set(drawn) == {count}
+    drawn.clear()
+    short_of_memory(monkeypatch)
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
+    assert_same_pictures(pictures(pipeline), expected)
+    assert max(drawn) < count
+    assert len(drawn) > len(expected)
+
+
+def test_with_room_for_some_blocks_they_are_drawn_together(trained, monkeypatch, drawn):
+    model = trained.pipeline.model
+    count = len(model.merged())
+    short_of_memory(monkeypatch, int(0.8 * count))
+    some = pictures(trained.pipeline)
+    several = len(drawn)
+    drawn.clear()
+    short_of_memory(monkeypatch)
+    assert_same_pictures(pictures(trained.pipeline), some)
+    assert several < len(drawn)
+
+
+def test_evaluation_while_training_is_drawn_by_units(trained, monkeypatch, drawn):
+    expected, count = pictures(trained.pipeline), len(trained.pipeline.model.merged())
+    assert set(drawn) == {count}
+    drawn.clear()
+    short_of_memory(monkeypatch)
+    assert_same_pictures(pictures(trained.pipeline), expected)
+    assert max(drawn) < count
+    assert trained.pipeline.get_average_eval_image_metrics()["psnr"] > 0
+
+
+def test_blocks_that_are_all_live_are_drawn_by_units_too(data, tmp_path, monkeypatch, drawn):
+    trainer = run(configure(data, tmp_path, methods.abcd_exact, steps=2))
+    drawn.clear()
+    expected, count = pictures(trainer.pipeline), len(trainer.pipeline.model.merged())
+    assert set(drawn) == {count}
+    drawn.clear()
+    short_of_memory(monkeypatch)
+    assert_same_pictures(pictures(trainer.pipeline), expected)
+    assert max(drawn) < count
+
+
+def test_a_scene_that_is_too_large_stays_on_the_cpu(trained, monkeypatch):
+    """The model's own device has no part in loading it."""
+    checkpoint = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
+    monkeypatch.setattr(AbcdModel, "device", torch.device("meta"))
+    short_of_memory(monkeypatch)
+    pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])
+    model = pipeline.model
+    assert {value.device.type for value in model.gauss_params.values()} == {"cpu"}
+    assert torch.equal(model.means, checkpoint["pipeline"]["_model.gauss_params.means"])
+    assert all(name in model.state_dict() for name in ("gauss_params.means", "gauss_params.quats"))
+    monkeypatch.setattr(AbcdModel, "_room", lambda _: 10**9)
+    with pytest.raises(Exception, match="meta"):  # where there is room, it goes there
+        pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])

@@ -1,0 +1,45 @@
+"""What the terminal says of a run's health: alarms at once, the blocks' standing at the end."""
+
+import pytest
+
+from abcd_ns.engine.events import Mended, VisitUndone
+from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.nerfstudio.run.progress import ProgressReport
+from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
+
+
+@pytest.fixture
+def coordinator(tmp_path):
+    return make_coordinator(tmp_path, random_gaussians(40), ring_of_views(3), blocks=3)
+
+
+def test_what_is_no_number_and_what_is_undone_is_said_at_once(coordinator, capsys):
+    report = ProgressReport(coordinator)
+    report(Mended(4, 1, "gradients", 12))
+    report(Mended(4, None, "values", 1))
+    report(Mended(4, 1, "transparent", 5))
+    report(VisitUndone(5, 2, before=0.1, after=0.125))
+    assert capsys.readouterr().out.splitlines() == [
+        "block 2: 12 gradients that were no numbers set to zero",
+        "warm-up: 1 Gaussians that were no numbers replaced",
+        "block 3: visit undone, it raised the loss of its views by 25%",
+    ]
+
+
+def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
+    coordinator.state.views = {0: 3, 1: 0, 2: 1}
+    coordinator.state.health = {0: BlockHealth(visits=2, giants=3), 2: BlockHealth(visits=1)}
+    ProgressReport(coordinator).close()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("Trained 0 steps in 0 visits")
+    assert lines[1:] == [
+        "  block 1: trained",
+        "  block 2: seen by no view, left as it was",
+        "  block 3: seen by 1 view only",
+        "  3 giants shrunk",
+    ]
+
+
+def test_without_visits_nothing_is_said_of_them(coordinator, capsys):
+    ProgressReport(coordinator).close()
+    assert len(capsys.readouterr().out.splitlines()) == 1

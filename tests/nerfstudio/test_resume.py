@@ -1,0 +1,286 @@
+"""`--load-dir` goes on from where a run was left: by a kill, a signal, a full disk. Or it says why not."""
+
+import random
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from abcd_ns.engine.events import LayersDrawn, StepTaken
+from abcd_ns.engine.store import ParameterStore, crash_points
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.run.run_folder import MadeFor
+from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
+from tests.nerfstudio.test_training import STEPS, configure, run
+from tests.reference.colmap_scene import write_scene
+from tests.reference.crash_runs import Kill
+from tests.reference.scenes import ring_of_views
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(data, tmp_path_factory) -> Path:
+    """The folder of a run that nothing disturbed. Read only."""
+    return run(configure(data, tmp_path_factory.mktemp("out"))).base_dir
+
+
+@pytest.fixture(scope="module")
+def trainings() -> Trainings:
+    return Trainings()
+
+
+@pytest.fixture
+def stopped(data, tmp_path) -> Path:
+    """The folder of a run that was broken off, without saving, after its first checkpoint."""
+    return run(configure(data, tmp_path / "stopped"), stop_after=14).base_dir
+
+
+def assert_same(found: Path, expected: Path) -> None:
+    """Both runs ended with the same scene."""
+    mine, theirs = gaussians(found), gaussians(expected)
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
+
+
+def refusal(config, capsys) -> str:
+    """What a run that cannot begin says before it exits with code 2."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        run(config)
+    assert ended.value.code == 2
+    said = capsys.readouterr().out
+    assert "error:" in said
+    return said
+
+
+# Kills
+
+
+def test_a_run_that_is_killed_before_its_first_checkpoint_goes_on(trainings, data, undisturbed, tmp_path):
+    killed_at = STEPS_PER_SAVE
+    options = {"kill_at_step": killed_at, "commit_seconds": 0.0}
+    assert trainings.finish(data, tmp_path / "killed", **options) == -signal.SIGKILL
+    killed = run_folder(tmp_path / "killed")
+    assert not list(killed.rglob("*.ckpt"))
+    for name, load_dir in (("models", killed / "nerfstudio_models"), ("run", killed)):
+        resumed = run(configure(data, tmp_path / name, load_dir=load_dir))
+        assert 0 < resumed.resumed_from.step <= killed_at
+        assert_same(resumed.base_dir, undisturbed)
+
+
+@pytest.mark.parametrize("point", crash_points.TRAINER)
+def test_a_run_that_is_killed_while_it_saves_goes_on(trainings, data, undisturbed, tmp_path, point):
+    assert trainings.finish(data, tmp_path / "killed", kill=Kill(point, 2)) == -signal.SIGKILL
+    killed = run_folder(tmp_path / "killed")
+    files = [path.name for path in (killed / "nerfstudio_models").iterdir()]
+    assert files
+    assert all(name.startswith("step-") for name in files)  # nerfstudio trips over anything else
+    resumed = run(configure(data, tmp_path / "killed", load_dir=killed))  # in the same folder
+    assert resumed.base_dir == killed
+    assert resumed.resumed_from.step == 2 * STEPS_PER_SAVE + 1
+    assert_same(killed, undisturbed)
+    assert len(list((killed / "nerfstudio_models").iterdir())) == 1
+    assert not list(killed.glob(".*"))
+
+
+def test_only_the_visit_under_way_is_lost(data, undisturbed, tmp_path):
+    ends = []
+
+    def note(trainer) -> None:
+        store = trainer.pipeline.coordinator.scene.store
+        if store.generation not in [generation for generation, _ in ends]:
+            ends.append((store.generation, trainer.pipeline.coordinator.state.step))
+
+    config = configure(data, tmp_path / "stopped")
+    config.pipeline.training.commit_seconds = 0.0
+    stopped = run(config, stop_after=29, after_step=note)
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped.checkpoint_dir))
+    assert resumed.resumed_from.step == ends[-1][1] > 2 * STEPS_PER_SAVE + 1
+    assert_same(resumed.base_dir, undisturbed)
+
+
+def test_an_older_checkpoint_can_be_asked_for(data, stopped, undisturbed, tmp_path):
+    resumed = run(configure(data, tmp_path / "b", load_dir=stopped, load_step=STEPS_PER_SAVE))
+    assert (resumed.resumed_from.step, resumed.resumed_from.pin) == (STEPS_PER_SAVE + 1, "step-000000010")
+    assert_same(resumed.base_dir, undisturbed)
+    checkpoint = stopped / "nerfstudio_models" / "step-000000010.ckpt"
+    again = run(configure(data, tmp_path / "c", load_checkpoint=checkpoint, steps=STEPS_PER_SAVE + 2))
+    assert again.pipeline.coordinator.state.step == STEPS_PER_SAVE + 2
+
+
+def test_the_very_folder_can_go_back_to_a_checkpoint(data, stopped, undisturbed):
+    out = stopped.parents[2]
+    resumed = run(configure(data, out, load_dir=stopped, load_step=STEPS_PER_SAVE))
+    assert resumed.base_dir == stopped
+    assert_same(stopped, undisturbed)
+
+
+# Signals
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("event", [StepTaken, LayersDrawn])
+def test_a_signal_commits_and_says_how_to_go_on(
+    data, undisturbed, tmp_path, capsys, monkeypatch, number, event
+):
+    config = configure(data, tmp_path / "signal")
+    monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
+    left = 17
+
+    def interrupt(happened) -> None:
+        nonlocal left
+        left -= isinstance(happened, event)
+        if left == 0 and isinstance(happened, event):
+            signal.raise_signal(number)
+
+    with pytest.raises(SystemExit) as ended:
+        run(config, listener=interrupt)
+    assert ended.value.code == 128 + number
+    said = capsys.readouterr().out
+    assert f"Stopped by {number.name} after step" in said
+    assert "nothing is lost" in said
+    folder = run_folder(tmp_path / "signal")
+    assert f"ns-train abcd --load-dir {folder}/nerfstudio_models --data wall" in said
+    taken = ParameterStore.open(folder / "abcd" / "store", read_only=True).state["step"]
+    assert f"after step {taken} of {STEPS}" in said
+    assert taken == 17 or event is LayersDrawn
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
+    assert resumed.resumed_from.step == taken
+    assert_same(resumed.base_dir, undisturbed)
+
+
+# Disks
+
+
+def test_a_checkpoint_that_does_not_fit_ends_the_run_with_one_line(
+    data, undisturbed, tmp_path, capsys, monkeypatch
+):
+    def full(_, path):
+        Path(path).write_bytes(b"half")
+        raise RuntimeError("PytorchStreamWriter failed writing file: file write failed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("abcd_ns.nerfstudio.trainer.torch.save", full)
+        with pytest.raises(SystemExit) as ended:
+            run(configure(data, tmp_path / "full"))
+    assert ended.value.code == 2
+    said = capsys.readouterr().out
+    assert "step-000000010.ckpt could not be written" in said
+    assert "safe in the store" in said
+    folder = run_folder(tmp_path / "full")
+    assert not list(folder.glob(".*"))
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
+    assert resumed.resumed_from.step == STEPS_PER_SAVE + 1
+    assert_same(resumed.base_dir, undisturbed)
+
+
+def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stopped, undisturbed, tmp_path):
+    (checkpoint,) = (stopped / "nerfstudio_models").iterdir()
+    means = gaussians(stopped)["_model.gauss_params.means"].numpy().tobytes()
+    sound = checkpoint.read_bytes()
+    assert sound.count(means) == 1
+    start, draw = sound.index(means), random.Random(0)
+    for offset in (start, start + len(means) - 1, start + draw.randrange(len(means))):
+        checkpoint.write_bytes(sound[:offset] + bytes([sound[offset] ^ 4]) + sound[offset + 1 :])
+        with pytest.raises((UserError, RuntimeError), match=r"damaged|CRC|corrupt"):
+            eval_setup(stopped / "config.yml")
+    checkpoint.write_bytes(sound[: len(sound) // 2])
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped))
+    assert_same(resumed.base_dir, undisturbed)
+
+
+# What cannot be gone on with
+
+
+def test_a_second_run_in_a_folder_is_refused_until_the_first_is_gone(data, stopped, capsys):
+    out = stopped.parents[2]
+    first = ParameterStore.open(stopped / "abcd" / "store")
+    said = refusal(configure(data, out, load_dir=stopped), capsys)
+    assert "is being written by another run" in said
+    first.close()
+    said = refusal(configure(data, out), capsys)
+    assert f"holds a run already: go on with it by --load-dir {stopped}" in said
+    run(configure(data, out, load_dir=stopped, steps=16))
+
+
+def test_a_damaged_store_is_named(data, stopped, tmp_path, capsys):
+    for path in (stopped / "abcd" / "store").glob("block-*"):
+        content = path.read_bytes()
+        path.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
+    said = refusal(configure(data, tmp_path / "b", load_dir=stopped), capsys)
+    assert "is damaged: its checksum is wrong. Go back to a pinned generation" in said
+
+
+def test_other_options_than_the_stores_are_refused_and_both_are_shown(data, stopped, tmp_path, capsys):
+    config = configure(data, tmp_path / "b", load_dir=stopped)
+    config.pipeline.training.sh_degree = 1
+    said = refusal(config, capsys)
+    assert "it was made for sh degree 3, not 1" in said
+    other = configure(data, tmp_path / "b", load_dir=stopped)
+    other.pipeline.training.exact = True
+    assert "blocks are trained in turn, not jointly" in refusal(other, capsys)
+
+
+def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
+    views, photos = ring_of_views(3), [Path(f"old/{i}.png") for i in range(3)]
+    mine = MadeFor.of(photos, views, TrainingConfig())
+    moved = MadeFor.of([Path("new") / photo.name for photo in photos], views, TrainingConfig())
+    fewer = MadeFor.of(photos[:2], views[:2], TrainingConfig())
+    turned = MadeFor.of(photos, [*views[1:], views[0]], TrainingConfig())
+    with ParameterStore.create(tmp_path / "new", mine.header()) as store:
+        mine.check(store)
+        moved.check(store)
+        with pytest.raises(UserError, match=f"photos {mine.photos}, not {fewer.photos}"):
+            fewer.check(store)
+        with pytest.raises(UserError, match=r"first camera \[3\.0, .*\], not \[-1\.5"):
+            turned.check(store)
+    with ParameterStore.create(tmp_path / "old", {}) as store:
+        mine.check(store)  # nothing was written down
+
+
+@pytest.mark.parametrize("what", ["nothing", "checkpoint alone", "not begun"])
+def test_a_folder_without_a_run_says_so(data, tmp_path, capsys, what):
+    models = tmp_path / "run" / "nerfstudio_models"
+    models.mkdir(parents=True)
+    if what == "checkpoint alone":
+        (models / "step-000000010.ckpt").write_bytes(b"")
+    if what == "not begun":
+        ParameterStore.create(tmp_path / "run" / "abcd" / "store", {}).close()
+    expected = {
+        "nothing": "There is no run of ABCD",
+        "checkpoint alone": "can be viewed but not trained further",
+        "not begun": "was ended before it began: start it anew",
+    }
+    assert expected[what] in refusal(configure(data, tmp_path / "out", load_dir=models), capsys)
+
+
+# RAM
+
+
+@pytest.mark.parametrize("budget", [1, 1 << 20, 16 << 20])
+def test_no_result_depends_on_the_ram_budget_and_none_exceeds_it(data, undisturbed, tmp_path, budget):
+    config = configure(data, tmp_path)
+    config.pipeline.ram_budget_gb = budget / 2**30
+    peaks, largest = [], []
+
+    def measure(trainer) -> None:
+        coordinator = trainer.pipeline.coordinator
+        scene = coordinator.scene
+        blocks = [gaussians.nbytes for gaussians in scene._memory._gaussians.values()]
+        photos = trainer.pipeline.datamanager.train_dataset.photos.cached_bytes
+        peaks.append(photos + coordinator.layer_bytes + scene.cached_bytes)
+        largest.append(max(blocks, default=0))
+
+    trainer = run(config, after_step=measure)
+    layer = 4 * 4 * np.prod(trainer.pipeline.datamanager.train_dataset.photos.size(0))
+    assert max(peaks) <= budget + layer + max(largest)
+    assert max(peaks) > min(budget, layer) / 2
+    assert_same(trainer.base_dir, undisturbed)

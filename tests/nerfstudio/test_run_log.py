@@ -1,0 +1,234 @@
+"""The log that every run writes: what is in it, what a resumed run keeps of it, what it survives."""
+
+import json
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from abcd_ns.engine.events import HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.nerfstudio.run import run_log
+from abcd_ns.nerfstudio.run.run_log import LOG_FILE, Meter, RunLog
+from abcd_ns.nerfstudio.settings import SETTINGS_FILE, flat_options
+from tests.nerfstudio.test_training import STEPS, configure, run
+from tests.reference.colmap_scene import write_scene
+
+
+@dataclass
+class FakeCoordinator:
+    """As much of a coordinator as a log asks for."""
+
+    step: int = 0
+    seconds: float = 0.0
+    visit: int = 0
+    config: object = field(default_factory=lambda: SimpleNamespace(density=SimpleNamespace(limit=None)))
+    scene: object = field(default_factory=lambda: SimpleNamespace(tree=SimpleNamespace(num_blocks=2)))
+
+    @property
+    def state(self):
+        return self
+
+    @property
+    def stopwatch(self):
+        return self
+
+    def count(self) -> int:
+        return 100 + self.step
+
+
+def lines_of(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def take_steps(log: RunLog, coordinator: FakeCoordinator, count: int, seconds: float, psnr: float = 20.0):
+    for _ in range(count):
+        coordinator.step += 1
+        coordinator.seconds += seconds
+        log(StepTaken(coordinator.step, 0, coordinator.step, psnr))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    config = configure(data, tmp_path_factory.mktemp("out"), steps_per_eval_all_images=15)
+    return run(config)
+
+
+def test_a_run_tells_its_visits_its_evaluations_and_its_end(trained):
+    lines = lines_of(trained.base_dir / "abcd" / LOG_FILE)
+    kinds = Counter(line["kind"] for line in lines)
+    assert [lines[0]["kind"], lines[-1]["kind"]] == ["training", "end"]
+    assert kinds["visit"] == kinds["visit end"] == trained.pipeline.coordinator.state.visit
+    assert kinds["held out"] == 2  # after steps 15 and 30
+    assert {line["block"] for line in lines if line["kind"] == "visit end"} == {None, 0, 1, 2}
+    for name in ("step", "seconds"):
+        values = [line[name] for line in lines]
+        assert values == sorted(values)
+    assert lines[-1]["step"] == STEPS
+    assert lines[-1]["gaussians"] == trained.pipeline.coordinator.count()
+    assert all(line["psnr"] > 5 for line in lines if line["kind"] in ("visit end", "held out"))
+    samples = [line for line in lines if line["kind"] == "sample"]
+    assert samples[-1]["rss_bytes"] > 100 << 20
+    assert samples[-1]["held"]["photos"] > 0
+    assert samples[-1]["held"].keys() == lines[0]["budgets"].keys()
+
+
+def test_settings_are_plain_values_of_every_option(trained):
+    settings = json.loads((trained.base_dir / "abcd" / SETTINGS_FILE).read_text())
+    assert settings["method"] == "abcd"
+    assert settings["scene"] == "wall"
+    options = settings["options"]
+    assert options == flat_options(trained.config)
+    assert options["pipeline.blocks"] == 3
+    assert options["pipeline.training.density.strategy"] == "default"
+    assert options["optimizers.means.optimizer.lr"] == pytest.approx(1.6e-4)
+    assert not any("_target" in name for name in options)
+
+
+def test_evaluation_is_no_training_time(data, tmp_path):
+    config = configure(data, tmp_path, steps=13, steps_per_eval_all_images=12)
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    clock, seen = trainer.pipeline.coordinator.stopwatch, []
+
+    def look(event) -> None:
+        if isinstance(event, HeldOutScored):
+            seen.append((clock.seconds, clock.seconds))
+
+    trainer.pipeline.coordinator.announce.subscribe(look)
+    trainer.train()
+    trainer.pipeline.coordinator.scene.store.close()
+    ((first, second),) = seen
+    assert first == second
+
+
+@pytest.mark.parametrize("stop_after", [14, 27])
+def test_a_resumed_run_has_the_past_up_to_where_it_goes_on_and_no_more(data, tmp_path, trained, stop_after):
+    broken = run(configure(data, tmp_path / "broken"), stop_after=stop_after)
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=broken.checkpoint_dir))
+    lines = lines_of(resumed.base_dir / "abcd" / LOG_FILE)
+    went_on = resumed.resumed_from.step
+    assert stop_after // 10 * 10 + 1 <= went_on <= stop_after
+    assert [line["step"] for line in lines if line["kind"] == "training"] == [0, went_on]
+    for name in ("step", "seconds"):
+        values = [line[name] for line in lines]
+        assert values == sorted(values)
+    for kind in ("visit", "visit end"):
+        expected = [line for line in lines_of(trained.base_dir / "abcd" / LOG_FILE) if line["kind"] == kind]
+        found = [line for line in lines if line["kind"] == kind]
+        assert [(v["visit"], v["block"], v["step"]) for v in found] == [
+            (v["visit"], v["block"], v["step"]) for v in expected
+        ]
+    assert sum(line["kind"] == "end" for line in lines) == 1
+
+
+def test_a_torn_or_foreign_past_is_kept_as_far_as_it_can_be_read(tmp_path):
+    past = FakeCoordinator()
+    log = RunLog(past, tmp_path / "old.jsonl")
+    take_steps(log, past, 5, seconds=1.0)
+    log.close()
+    whole = (tmp_path / "old.jsonl").read_bytes()
+    readable = [line for line in lines_of(tmp_path / "old.jsonl") if line["kind"] != "end"]
+    (tmp_path / "old.jsonl").write_bytes(whole[: whole.rindex(b'{"kind": "end"') + 9] + b"\xff")
+    RunLog(FakeCoordinator(step=5, seconds=5.0), tmp_path / "new.jsonl", earlier=tmp_path / "old.jsonl")
+    assert lines_of(tmp_path / "new.jsonl")[:-1] == readable
+    (tmp_path / "old.jsonl").write_bytes(whole[:-9])
+    RunLog(FakeCoordinator(step=5, seconds=5.0), tmp_path / "torn.jsonl", earlier=tmp_path / "old.jsonl")
+    assert lines_of(tmp_path / "torn.jsonl")[:-1] == readable
+    RunLog(FakeCoordinator(step=5), tmp_path / "without.jsonl", earlier=tmp_path / "absent.jsonl")
+    assert [line["step"] for line in lines_of(tmp_path / "without.jsonl")] == [5]
+
+
+def test_a_run_that_goes_on_in_its_own_folder_tells_its_past_once(tmp_path):
+    path, steps = tmp_path / "log.jsonl", 0
+    log = RunLog(FakeCoordinator(), path)
+    for _ in range(3):
+        coordinator = FakeCoordinator(step=steps, seconds=float(steps))
+        if steps:
+            log = RunLog(coordinator, path, earlier=path)
+        take_steps(log, coordinator, 4, seconds=1.0)
+        log.close()
+        steps = coordinator.state.step
+    lines = lines_of(path)
+    assert [line["step"] for line in lines if line["kind"] == "training"] == [0, 4, 8]
+    samples = [line["step"] for line in lines if line["kind"] == "sample"]
+    assert samples == sorted(samples)
+    assert len({json.dumps(line) for line in lines}) == len(lines)
+
+
+def test_a_visit_that_began_after_the_checkpoint_is_not_told_twice(tmp_path):
+    past = FakeCoordinator()
+    log = RunLog(past, tmp_path / "old.jsonl")
+    for visit in (0, 1):
+        log(VisitBegan(visit, 0, visit, steps=10, views=4, gaussians=50))
+    saved = FakeCoordinator(step=0, visit=1)
+    RunLog(saved, tmp_path / "new.jsonl", earlier=tmp_path / "old.jsonl")
+    assert [line["visit"] for line in lines_of(tmp_path / "new.jsonl") if line["kind"] == "visit"] == [0]
+
+
+def test_samples_thin_out_so_that_a_long_run_has_a_short_log(tmp_path):
+    coordinator = FakeCoordinator()
+    log = RunLog(coordinator, tmp_path / "log.jsonl")
+    take_steps(log, coordinator, 4 * 3600, seconds=1.0)
+    log.close()
+    times = [line["seconds"] for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "sample"]
+    gaps = [later - earlier for earlier, later in pairwise(times)]
+    assert gaps[0] == 1.0
+    assert max(gaps) == pytest.approx(4 * 3600 / run_log.SAMPLES, rel=0.05)
+    assert len(times) < 2000
+
+
+def test_samples_hold_the_mean_psnr_since_the_last_and_pass_over_what_is_no_number(tmp_path):
+    coordinator = FakeCoordinator()
+    log = RunLog(coordinator, tmp_path / "log.jsonl", [Meter("photos", lambda: 7, 10)])
+    for psnr in (10.0, math.nan, 20.0, math.inf):
+        take_steps(log, coordinator, 1, seconds=0.3, psnr=psnr)
+    take_steps(log, coordinator, 4, seconds=0.3, psnr=math.nan)
+    log.close()
+    samples = [line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "sample"]
+    assert [line["psnr"] for line in samples] == [15.0, None, None]
+    assert samples[0]["held"] == {"photos": 7}
+
+
+def test_the_psnr_of_a_visit_is_that_of_its_later_half(tmp_path):
+    coordinator = FakeCoordinator()
+    log = RunLog(coordinator, tmp_path / "log.jsonl")
+    log(VisitBegan(0, 0, 1, steps=4, views=4, gaussians=50))
+    for psnr in (10.0, 12.0, 20.0, 22.0):
+        take_steps(log, coordinator, 1, seconds=0.1, psnr=psnr)
+    log(VisitEnded(0, 0, 1, gaussians=50, migrated=2, layer_seconds=0.1, seconds=0.4))
+    log(SweepEnded(0, 4))
+    log.close()
+    (ended,) = (line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "visit end")
+    assert (ended["psnr"], ended["visit_seconds"], ended["migrated"]) == (21.0, 0.4, 2)
+
+
+def test_a_visit_is_on_disk_when_it_has_ended_and_a_long_one_before(tmp_path):
+    coordinator = FakeCoordinator()
+    log = RunLog(coordinator, tmp_path / "log.jsonl")
+    take_steps(log, coordinator, 10, seconds=1.0)
+    assert len(lines_of(tmp_path / "log.jsonl")) == 1
+    log(VisitEnded(0, 0, 1, gaussians=50, migrated=0, layer_seconds=0.1, seconds=0.4))
+    assert lines_of(tmp_path / "log.jsonl")[-1]["kind"] == "visit end"
+    before = len(lines_of(tmp_path / "log.jsonl"))
+    take_steps(log, coordinator, 2 * run_log.LINES_KEPT, seconds=1.0)
+    assert len(lines_of(tmp_path / "log.jsonl")) > before
+
+
+def test_a_disk_that_refuses_the_log_is_named_once_and_training_goes_on(tmp_path, capsys):
+    coordinator = FakeCoordinator()
+    log = RunLog(coordinator, tmp_path / "gone" / "log.jsonl")
+    take_steps(log, coordinator, 200, seconds=1.0)
+    log.close()
+    printed = capsys.readouterr().out
+    assert printed.count("cannot be written") == 1
+    assert "log.jsonl" in printed.replace("\n", "")

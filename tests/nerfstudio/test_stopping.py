@@ -1,0 +1,84 @@
+"""A signal ends a run between two steps, and the line that says how to go on is one that can be typed."""
+
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+
+from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
+
+
+@pytest.fixture(autouse=True)
+def python_handles_interrupts():
+    """Also where the tests run in the background of a shell, which has them ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_acts_at_once_where_nothing_is_held(number):
+    with pytest.raises(Stopped) as stopped, StopSignals():
+        signal.raise_signal(number)
+    assert stopped.value.received == number
+    assert stopped.value.exit_code == 128 + number
+
+
+def test_a_signal_waits_for_the_end_of_a_step():
+    with StopSignals() as signals:
+        signals.check()
+        signals.hold()
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(Stopped):
+            signals.check()
+        with pytest.raises(Stopped):
+            signals.release()
+
+
+def test_a_second_ctrl_c_does_not_wait():
+    with StopSignals() as signals:
+        signals.hold()
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_handlers_are_put_back():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with StopSignals():
+        assert signal.getsignal(signal.SIGTERM) not in before
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_in_another_thread_signals_stay_as_they_are():
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def enter() -> None:
+        with StopSignals():
+            seen.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert seen == [before]
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (
+            "/venv/bin/ns-train abcd --data wall --vis viewer colmap --downscale 2",
+            "ns-train abcd --load-dir 'my run' --data wall --vis viewer colmap --downscale 2",
+        ),
+        (
+            "ns-train abcd --load-dir older --load_step 7 --data wall",
+            "ns-train abcd --load-dir 'my run' --data wall",
+        ),
+        ("ns-train abcd --load-dir=older --data wall", "ns-train abcd --load-dir 'my run' --data wall"),
+        ("/venv/lib/abcd_ns/lab/runs/worker.py job.json", None),
+        ("ns-train abcd-paper --data wall", None),
+    ],
+)
+def test_the_command_to_go_on_keeps_the_options(argv, expected):
+    assert command_to_go_on(argv.split(), "abcd", Path("my run")) == expected

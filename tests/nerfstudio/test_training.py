@@ -1,0 +1,255 @@
+"""ABCD through nerfstudio's own trainer and tools, in this process, on a tiny scene."""
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from nerfstudio.scripts.exporter import ExportGaussianSplat
+from nerfstudio.utils.eval_utils import eval_setup
+from plyfile import PlyData
+
+from abcd_ns import methods
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.nerfstudio.config import AbcdTrainerConfig
+from abcd_ns.nerfstudio.trainer import AbcdTrainer
+from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
+
+STEPS = 36
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+def configure(data: Path, out: Path, method=methods.abcd, *, steps: int = STEPS, blocks: int = 3, **options):
+    config: AbcdTrainerConfig = copy.deepcopy(method.config)
+    config.data = config.pipeline.datamanager.data = data
+    config.output_dir, config.vis, config.max_num_iterations = out, "tensorboard", steps
+    config.steps_per_save, config.timestamp = 10, "run"
+    if config.method_name != "abcd-monolithic":
+        config.pipeline.blocks = blocks
+    config.viewer.quit_on_train_completion = True
+    for name, value in options.items():
+        setattr(config, name, value)
+    return config
+
+
+class BrokenOff(BaseException):
+    """Ends a run without saving, as a kill would."""
+
+
+def run(
+    config: AbcdTrainerConfig, stop_after: int | None = None, after_step=None, listener=None
+) -> AbcdTrainer:
+    """Train as ns-train does; `stop_after` breaks off without saving, as a kill would.
+
+    Args:
+        after_step: called with the trainer after every step.
+        listener: of the coordinator's events.
+    """
+    config.set_timestamp()
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    try:
+        trainer.setup()
+        pipeline = trainer.pipeline
+        end_step = pipeline._after_step
+
+        def watched(who) -> None:
+            end_step(who)
+            if after_step is not None:
+                after_step(trainer)
+            if trainer.step + 1 == stop_after:
+                raise BrokenOff
+
+        pipeline._after_step = watched
+        if listener is not None:
+            pipeline.coordinator.announce.subscribe(listener)
+        if stop_after is None:
+            trainer.train()
+        else:
+            with pytest.raises(BrokenOff):
+                trainer.train()
+    finally:
+        if (coordinator := getattr(trainer.pipeline, "coordinator", None)) is not None:
+            coordinator.scene.store.close()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory) -> AbcdTrainer:
+    return run(configure(data, tmp_path_factory.mktemp("out")))
+
+
+def test_on_the_cpu_layers_and_photos_have_room_under_the_ram_budget_alone(trained):
+    assert trained.pipeline.datamanager.device_photo_bytes == 0
+    assert trained.pipeline.coordinator.layer_limit == trained.pipeline._ram.layers
+
+
+def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):
+    (checkpoint,) = trained.checkpoint_dir.iterdir()
+    assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"
+    state = torch.load(checkpoint, weights_only=True)
+    store = ParameterStore.open(trained.base_dir / "abcd" / "store", read_only=True)
+    tree = BlockTree.from_json(store.header["tree"])
+    scene = StoredScene(tree, store)
+    in_store = torch.cat([scene.at_rest(block).means for block in range(tree.num_blocks)])
+    special = [other for other in store.blocks if other >= tree.num_blocks and other != INBOX]
+    assert all(store.counts(other) == 0 for other in special)
+    assert torch.equal(state["pipeline"]["_model.gauss_params.means"], in_store)
+    assert len(in_store) >= 300
+    assert store.pins == [checkpoint.stem]
+
+
+def test_training_improved_the_held_out_views(trained):
+    _, pipeline, _, step = eval_setup(trained.base_dir / "config.yml")
+    assert step == STEPS - 1
+    metrics = pipeline.get_average_eval_image_metrics()
+    assert len(pipeline.datamanager.fixed_indices_eval_dataloader) == HELD_OUT
+    assert metrics["psnr"] > 14
+    assert 0 < metrics["ssim"] <= 1
+
+
+def test_composited_and_merged_pictures_of_a_checkpoint_agree(trained):
+    _, pipeline, _, _ = eval_setup(trained.base_dir / "config.yml")
+    assert pipeline.model.tree.num_blocks == 3
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    merged = pipeline.model.get_outputs_for_camera(camera)
+    pipeline.model.config.render = "composited"
+    composited = pipeline.model.get_outputs_for_camera(camera)
+    assert set(merged) == {"rgb", "depth", "accumulation", "background"}
+    assert merged["depth"].shape == (HEIGHT, WIDTH, 1)
+    # 1e-4 is what is left of the light where drawing stops.
+    assert float((merged["rgb"] - composited["rgb"]).abs().max()) < 5e-4
+
+
+def test_the_exported_ply_is_the_merged_scene(trained, tmp_path):
+    ExportGaussianSplat(load_config=trained.base_dir / "config.yml", output_dir=tmp_path).main()
+    vertices = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+    state = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)["pipeline"]
+    means = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    assert np.array_equal(means, state["_model.gauss_params.means"].numpy())
+    assert np.array_equal(vertices["opacity"], state["_model.gauss_params.opacities"][:, 0].numpy())
+    assert np.array_equal(vertices["f_dc_1"], state["_model.gauss_params.features_dc"][:, 1].numpy())
+
+
+@pytest.mark.parametrize("stop_after", [14, 27])
+def test_a_run_that_is_broken_off_and_resumed_is_the_run_that_was_not(data, tmp_path, trained, stop_after):
+    broken = run(configure(data, tmp_path / "broken"), stop_after=stop_after)
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=broken.checkpoint_dir))
+    expected = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)["pipeline"]
+    (checkpoint,) = resumed.checkpoint_dir.iterdir()
+    assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"
+    found = torch.load(checkpoint, weights_only=True)["pipeline"]
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert value == found[name] if isinstance(value, dict) else torch.equal(value, found[name]), name
+
+
+def test_resuming_a_finished_run_trains_no_further(data, tmp_path, trained):
+    again = run(configure(data, tmp_path, load_dir=trained.checkpoint_dir))
+    assert again.pipeline.coordinator.state.step == STEPS
+    assert [p.name for p in again.checkpoint_dir.iterdir()] == [f"step-{STEPS - 1:09d}.ckpt"]
+
+
+def test_more_steps_go_on_from_where_a_run_ended(data, tmp_path, trained):
+    longer = run(configure(data, tmp_path, load_dir=trained.checkpoint_dir, steps=STEPS + 8))
+    assert longer.pipeline.coordinator.state.step == STEPS + 8
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        methods.abcd_ablated,
+        methods.abcd_monolithic,
+        methods.abcd_partition,
+        methods.abcd_exact,
+        methods.abcd_paper,
+    ],
+    ids=lambda method: method.config.method_name,
+)
+def test_the_other_methods_train_and_load(data, tmp_path, method):
+    trainer = run(configure(data, tmp_path, method, steps=12))
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    # A grid has at least as many cells as asked for: here 2 x 2.
+    blocks = {"abcd-monolithic": 1, "abcd-paper": 4}
+    assert pipeline.model.tree.num_blocks == blocks.get(method.config.method_name, 3)
+    assert np.isfinite(pipeline.get_average_eval_image_metrics()["psnr"])
+
+
+def test_while_training_only_the_live_block_is_registered(data, tmp_path):
+    config = configure(data, tmp_path, steps=3)
+    trainer = run(config)
+    assert trainer.pipeline.coordinator.count() == 300
+    config = configure(data, tmp_path / "b")
+    config.pipeline.training.warmup = 0.0
+    stopped = run(config, stop_after=2)
+    live = [p.shape[0] for n, p in stopped.pipeline.model.named_parameters() if n.endswith("means")]
+    assert 0 < sum(live) < 300
+
+
+@pytest.mark.parametrize(
+    "method", [methods.abcd, methods.abcd_monolithic], ids=lambda m: m.config.method_name
+)
+def test_a_limit_below_the_number_of_points_is_kept_from_the_start(data, tmp_path, method, capsys):
+    config = configure(data, tmp_path, method, steps=8)
+    config.pipeline.training.density.max_gaussians = 100
+    trainer = run(config)
+    assert trainer.pipeline.coordinator.count() == 100
+    assert "Training begins with 100 of 300 points" in capsys.readouterr().out
+
+
+def test_seconds_end_a_run(data, tmp_path):
+    config = configure(data, tmp_path, steps=100_000)
+    config.pipeline.max_seconds = 2.0
+    trainer = run(config)
+    assert trainer.pipeline.coordinator.finished
+    assert trainer.pipeline.coordinator.state.step < 100_000
+    assert trainer.pipeline.coordinator.state.active is None
+
+
+def test_the_saved_config_is_the_config(trained):
+    loaded = yaml.load((trained.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
+    assert isinstance(loaded, AbcdTrainerConfig)
+    assert loaded.pipeline.training == trained.config.pipeline.training
+    assert loaded.machine.device_type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (lambda c: setattr(c.pipeline.model, "warmup_length", 7), "--pipeline.model.warmup-length"),
+        (lambda c: setattr(c.pipeline.model, "sh_degree", 1), "--pipeline.training.sh-degree"),
+        (lambda c: setattr(c.machine, "num_devices", 2), "one device"),
+        (lambda c: setattr(c, "mixed_precision", True), "float32"),
+        (lambda c: setattr(c.pipeline, "blocks", -1), "--pipeline.blocks"),
+        (lambda c: setattr(c, "vis", "viewer_legacy"), "viewer_legacy"),
+        (lambda c: setattr(c.pipeline, "near_plane", -1.0), "--pipeline.near-plane"),
+        (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
+        (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),
+        (lambda c: setattr(c.pipeline.training, "scaffold_passes", -1), "training.scaffold-passes"),
+        (lambda c: setattr(c.pipeline.training, "scaffold_gaussians", -1), "training.scaffold-gaussians"),
+        (lambda c: setattr(c.pipeline.training, "batch_power", float("nan")), "training.batch-power"),
+        (lambda c: setattr(c.pipeline.training, "influence_share", 0.0), "training.influence-share"),
+        (lambda c: setattr(c.pipeline.training, "window_weight", 1.0), "training.window-weight"),
+        (lambda c: setattr(c.pipeline.training, "overlap", 0.2), "--pipeline.training.overlap"),
+        (lambda c: setattr(c.pipeline.training, "overlap", -0.2), "--pipeline.training.overlap"),
+        (lambda c: setattr(c.pipeline.datamanager, "data", Path("nowhere")), "nowhere"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_is_written(data, tmp_path, capsys, spoil, expected):
+    config = configure(data, tmp_path)
+    spoil(config)
+    config.set_timestamp()
+    with pytest.raises(SystemExit) as stopped:
+        config.save_config()
+    assert stopped.value.code == 2
+    assert expected in capsys.readouterr().out
+    assert not any(tmp_path.iterdir())

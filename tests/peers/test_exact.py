@@ -1,0 +1,181 @@
+"""Exact joint training over blocks: gradients and steps are those of one drawing of everything."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from abcd_ns.engine.layers.compositing import composite
+from abcd_ns.engine.store.special_blocks import LIVE
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.peers.exact import ExactCoordinator
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+STILL = DensityConfig(strategy="off")
+GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
+
+
+def exact(folder, start, views, **options) -> ExactCoordinator:
+    folder.mkdir(exist_ok=True)
+    return make_coordinator(folder, start, views, kind=ExactCoordinator, **{"density": STILL, **options})
+
+
+def scene(dtype) -> Gaussians:
+    """So thin that no pixel reaches T <= 1e-4, where drawing stops; that layers do by themselves."""
+    gaussians = random_gaussians(150, seed=1, size=0.12, dtype=dtype)
+    gaussians.opacities[:] -= 2.5
+    return gaussians
+
+
+def by_rotation(gaussians: Gaussians) -> Gaussians:
+    """In an order that does not depend on blocks; rotations are all different and hardly change."""
+    return gaussians[gaussians.quats[:, 0].argsort()]
+
+
+@pytest.mark.parametrize("blocks", [1, 5])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-5)])
+def test_gradients_are_those_of_the_merged_picture(tmp_path, blocks, dtype, tolerance):
+    views, start = ring_of_views(3, dtype=dtype), scene(dtype)
+    photos = Photos(random_gaussians(150, seed=7, size=0.12, dtype=dtype), views)
+    coordinator = exact(tmp_path, start, views, blocks=blocks, batch=2, sh_ramp=0.0)
+    batch = coordinator.next_batch()
+    wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
+    coordinator.loss(batch, coordinator.render(batch).pictures, wanted).backward()
+    found = coordinator.gradients()
+
+    leaves = whole_scene(coordinator)
+    leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in leaves.items()})
+    pictures, infos = [], []
+    for sample in batch.samples:
+        raster = coordinator._rasterizer(leaves, sample.view, sh_degree=1)
+        raster.info["means2d"].retain_grad()
+        infos.append(raster.info)
+        pictures.append(composite(raster.layer, sample.background).clamp(0, 1))
+    coordinator.loss(batch, pictures, wanted).backward()
+    order = coordinator.scene.tree.assign(coordinator._all.gaussians.means).argsort(stable=True)
+    for name, leaf in leaves.items():
+        worst = float((found.params[name][order] - leaf.grad).abs().max())
+        assert worst <= tolerance * float(leaf.grad.abs().max()), name
+    for place, info in enumerate(infos):
+        assert torch.equal(found.radii[place][order], info["radii"][0])
+
+
+def test_what_density_control_judges_by_adds_up_over_cells(tmp_path, views, photos):
+    found = []
+    for blocks in (1, 5):
+        coordinator = exact(
+            tmp_path / str(blocks), scene(torch.float32), views, blocks=blocks, density=GROWING
+        )
+        batch = coordinator.next_batch()
+        wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
+        coordinator.loss(batch, coordinator.render(batch).pictures, wanted).backward()
+        gradients, order = coordinator.gradients(), coordinator._all.gaussians.quats[:, 0].argsort()
+        found.append((gradients.means2d[:, order], gradients.absolute[:, order]))
+    for one, several in zip(*found, strict=True):
+        assert float((one - several).abs().max()) <= 1e-5 * float(one.abs().max())
+        assert float(one.abs().max()) > 0
+
+
+def test_several_steps_are_those_of_a_plain_loop_over_everything(tmp_path, views, photos):
+    start = scene(torch.float32)
+    blocks = exact(tmp_path / "blocks", start, views, blocks=5, steps=12)
+    params = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
+    rates = {name: adam.param_groups[0]["lr"] for name, adam in blocks.optimizers.items()}
+    adam = {n: torch.optim.Adam([p], lr=rates[n], eps=1e-15, fused=True) for n, p in params.items()}
+    for step in range(12):
+        batch = blocks.next_batch()
+        (sample,) = batch.samples
+        adam["means"].param_groups[0]["lr"] = rates["means"] * blocks.config.means_lr_decay ** (step / 12)
+        raster = blocks._rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.sh_degree)
+        picture = composite(raster.layer, sample.background).clamp(0, 1)
+        for optimizer in adam.values():
+            optimizer.zero_grad()
+        blocks.loss(batch, [picture], [photos(sample.view.index, sample.crop)]).backward()
+        for optimizer in adam.values():
+            optimizer.step()
+        train_step(blocks, photos)
+    found = by_rotation(whole_scene(blocks))
+    expected = by_rotation(Gaussians(**{name: value.detach() for name, value in params.items()}))
+    before = by_rotation(start)
+    for name, value in expected.items():
+        moved = float((value - getattr(before, name)).abs().max())
+        # Adam divides by gradients' sizes: what rounding makes of the tiniest ones is a part of a step.
+        assert float((getattr(found, name) - value).abs().mean()) < 1e-3 * moved, name
+
+
+def test_blocks_do_not_matter_with_densification_either(tmp_path, views, photos):
+    counts = []
+    for blocks in (1, 4):
+        coordinator = exact(
+            tmp_path / str(blocks), scene(torch.float32), views, blocks=blocks, steps=14, density=GROWING
+        )
+        train(coordinator, photos)
+        counts.append(coordinator.count())
+        assert coordinator.finished
+    assert counts[0] > 150
+    assert abs(counts[1] - counts[0]) <= 0.05 * counts[0]
+
+
+def test_by_means_the_picture_is_drawn_block_after_block(tmp_path, views, photos):
+    coordinator = exact(tmp_path, scene(torch.float32), views, blocks=4, ownership="means", steps=6)
+    before = whole_scene(coordinator)
+    train(coordinator, photos)
+    after = whole_scene(coordinator)
+    assert len(after) == len(before)
+    assert not torch.equal(by_rotation(after).means, by_rotation(before).means)
+
+
+def test_the_device_holds_nothing_between_steps_and_the_store_all_at_the_end(tmp_path, views, photos):
+    coordinator = exact(tmp_path, scene(torch.float32), views, blocks=4, steps=4)
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        assert all(len(parameter) == 0 for parameter in coordinator.params.values())
+    store, tree = coordinator.scene.store, coordinator.scene.tree
+    assert sum(store.counts(block) for block in range(4)) == coordinator.count() == 150
+    for block in range(4):
+        assert bool((tree.assign(store.load(block)[0]["means"]) == block).all())
+
+
+def test_a_run_that_stops_goes_on(tmp_path, views, photos):
+    whole = exact(tmp_path / "whole", scene(torch.float32), views, steps=10)
+    train(whole, photos)
+    stopped = exact(tmp_path / "stopped", scene(torch.float32), views, steps=10)
+    train(stopped, photos, steps=6)
+    stopped.save()
+    stopped.scene.store.close()
+    again = exact(tmp_path / "stopped", scene(torch.float32), views, steps=10, resume=True)
+    assert again.state.step == 6
+    train(again, photos)
+    found, expected = by_rotation(whole_scene(again)), by_rotation(whole_scene(whole))
+    for name, value in expected.items():
+        assert torch.allclose(getattr(found, name), value, rtol=1e-4, atol=1e-4), name
+
+
+def test_every_block_sees_every_step_and_so_refines_as_one(tmp_path, views, start):
+    for blocks in (1, 4):
+        coordinator = exact(tmp_path / str(blocks), start, views, blocks=blocks)
+        assert coordinator.density.config.refine_every == 100
+
+
+def test_views_of_a_step_may_differ_in_size(tmp_path):
+    """What density control counts is what it counts in one drawing of the whole batch."""
+    views = [*ring_of_views(2), *ring_of_views(2, width=90)]
+    views = [replace(view, index=index) for index, view in enumerate(views)]
+    photos, start = Photos(random_gaussians(150, seed=7, size=0.12), views), scene(torch.float32)
+    counted = []
+    for kind in (ExactCoordinator, Coordinator):
+        folder = tmp_path / kind.__name__
+        folder.mkdir()
+        options = {"blocks": 1, "batch": 4, "steps": 4, "density": GROWING, "background": "black"}
+        coordinator = make_coordinator(folder, start, views, kind=kind, **options)
+        train_step(coordinator, photos)
+        coordinator.save()
+        state = coordinator.scene.state(0 if kind is ExactCoordinator else LIVE)
+        counted.append(state.growth)
+    exactly, jointly = counted
+    assert torch.equal(exactly["count"], jointly["count"])
+    assert torch.allclose(exactly["grad2d"], jointly["grad2d"], rtol=1e-4)
+    assert float(jointly["grad2d"].max()) > 0

@@ -1,0 +1,185 @@
+"""Partition, train, merge: what a block sees, what it keeps, and that nobody else matters to it."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from abcd_ns.engine.events import VisitBegan, VisitEnded
+from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.peers.independent import (
+    IndependentCoordinator,
+    Surfaces,
+    enlarged,
+    independent_at_rest,
+)
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, whole_scene
+
+STILL = DensityConfig(strategy="off")
+GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
+
+
+def independent(folder, start, views, **options) -> IndependentCoordinator:
+    options = {"overlap": 0.2, "layers": False, "blocks": 4, **options}
+    return make_coordinator(
+        folder, start, views, kind=IndependentCoordinator, content=independent_at_rest, **options
+    )
+
+
+def visits(coordinator) -> list[VisitBegan]:
+    begun = []
+    coordinator.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
+    return begun
+
+
+def test_a_cell_is_enlarged_by_a_share_of_its_extent():
+    infinity = float("inf")
+    cell = Box(
+        torch.tensor([0.0, -infinity, -infinity]).double(), torch.tensor([2.0, 1.0, infinity]).double()
+    )
+    means = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([2.0, 10.0, 1.0])
+    found = enlarged(cell, means, 0.5)
+    assert found.lower.tolist() == [-1.0, -infinity, -infinity]
+    assert found.upper[0] == 3.0
+    assert 5.0 < found.upper[1] < 6.0
+    assert found.upper[2] == infinity
+
+
+def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(tmp_path, views, photos, start):
+    coordinator = independent(tmp_path, start, views, steps=30, density=STILL, batch=1)
+    begun, ended = visits(coordinator), []
+    coordinator.announce.subscribe(
+        lambda e: ended.append(coordinator.state.step) if isinstance(e, VisitEnded) else None
+    )
+    train(coordinator, photos)
+    assert sorted(event.block for event in begun) == [0, 1, 2, 3]
+    assert coordinator.state.step == 30
+    taken = [b - a for a, b in zip([0, *ended[:-1]], ended, strict=True)]
+    seen = [event.views for event in begun]
+    for steps, count in zip(taken, seen, strict=True):
+        assert abs(steps - 30 * count / sum(seen)) <= 2
+
+
+def test_a_block_begins_with_its_overlap_and_keeps_its_cell(tmp_path, views, photos, start):
+    coordinator = independent(tmp_path, start, views, steps=12, density=STILL)
+    begun, ended = visits(coordinator), []
+    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    tree = coordinator.scene.tree
+    initial = [coordinator.scene.gaussians(b) for b in range(4)]
+    train(coordinator, photos)
+    for event in begun:
+        box = enlarged(tree.cell(event.block), initial[event.block].means, 0.2)
+        assert event.gaussians == int(box.contains(start.means).sum()) > len(initial[event.block])
+    for event in ended:
+        means = coordinator.scene.gaussians(event.block).means
+        assert event.gaussians == len(means)
+        assert bool((tree.assign(means) == event.block).all())
+
+
+def test_what_others_became_is_nothing_to_a_block(tmp_path, views, photos, start):
+    """The block visited last ends up the same, whether or not the others were trained to nonsense."""
+    results = []
+    for name in ("plain", "spoilt"):
+        (tmp_path / name).mkdir()
+        coordinator = independent(tmp_path / name, start, views, steps=16, density=STILL, background="black")
+        begun = visits(coordinator)
+        while not coordinator.finished:
+            train_step(coordinator, photos)
+            if name == "spoilt" and len(begun) < 4:
+                with torch.no_grad():
+                    coordinator.params["features_dc"].add_(1.0)
+        results.append((begun[-1].block, coordinator.scene.gaussians(begun[-1].block)))
+    (block, plain), (same, spoilt) = results
+    assert block == same
+    assert all(torch.equal(value, getattr(spoilt, name)) for name, value in plain.items())
+
+
+def test_every_pixel_is_some_blocks_and_without_overlap_just_ones(tmp_path, views, start):
+    coordinator = independent(tmp_path, start, views)
+    scene = coordinator.scene
+    surfaces = Surfaces(scene, views, coordinator._rasterizer, torch.device("cpu"))
+    for overlap in (0.0, 0.2):
+        for view in views:
+            owners = torch.zeros(view.height, view.width, dtype=torch.int64)
+            for block in range(4):
+                box = enlarged(scene.tree.cell(block), scene.gaussians(block).means, overlap)
+                region = surfaces.region(view.index, box)
+                owners += region.own
+                assert not bool((region.own & region.clear).any())
+            assert int(owners.min()) == 1
+            assert (int(owners.max()) == 1) == (overlap == 0)
+
+
+def test_own_pixels_pull_to_the_photo_clear_ones_to_the_background_and_hidden_ones_nowhere(
+    tmp_path, views, photos, start
+):
+    coordinator = independent(
+        tmp_path, start, views, density=STILL, ssim_lambda=0.0, pixel_loss="l2", batch=len(views)
+    )
+    batch = coordinator.next_batch()
+    rendered = coordinator.render(batch)
+    pictures = [picture.detach().requires_grad_() for picture in rendered.pictures]
+    wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
+    coordinator.loss(batch, pictures, wanted).backward()
+    kinds = torch.zeros(3, dtype=torch.int64)
+    for sample, picture, photo in zip(batch.samples, pictures, wanted, strict=True):
+        region = coordinator._regions[sample.view.index]
+        hidden = ~region.own & ~region.clear
+        kinds += torch.stack([region.own.sum(), region.clear.sum(), hidden.sum()])
+        scale = 2 / (3 * sample.view.width * sample.view.height * len(batch.samples))
+        apart = {"own": picture - photo, "clear": picture - sample.background, "hidden": 0 * picture}
+        for (name, difference), mask in zip(apart.items(), (region.own, region.clear, hidden), strict=True):
+            assert torch.allclose(picture.grad[mask], scale * difference[mask], atol=1e-9), name
+    assert bool((kinds > 0).all())
+
+
+def test_training_improves_every_photo_of_a_scene_with_surfaces(tmp_path, views):
+    truth = random_gaussians(300, seed=7, size=0.15)
+    truth.opacities[:] = 4.0
+    photos = Photos(truth, views)
+    start = dataclasses.replace(truth, features_dc=torch.zeros_like(truth.features_dc))
+    # Gentle steps: by themselves, blocks of so small a scene overshoot where photos say little.
+    coordinator = independent(tmp_path, start, views, steps=80, density=STILL, batch_power=0.75)
+
+    def errors() -> list[float]:
+        scene = whole_scene(coordinator)
+        with torch.no_grad():
+            rasters = [coordinator._rasterizer(scene, view, sh_degree=1) for view in views]
+        pairs = [(r.color.clamp(0, 1), photos.images[v.index]) for r, v in zip(rasters, views, strict=True)]
+        return [float((picture - photo).square().mean()) for picture, photo in pairs]
+
+    before = errors()
+    train(coordinator, photos)
+    assert all(new < 0.9 * old for old, new in zip(before, errors(), strict=True)), (before, errors())
+
+
+@pytest.mark.parametrize("stop", [3, 14])
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop):
+    runs = {}
+    for name in ("whole", "stopped"):
+        (tmp_path / name).mkdir()
+        runs[name] = independent(tmp_path / name, start, views, steps=20, density=GROWING)
+    train(runs["whole"], photos)
+    train(runs["stopped"], photos, steps=stop)
+    runs["stopped"].save()
+    runs["stopped"].scene.store.close()
+    again = independent(tmp_path / "stopped", start, views, steps=20, density=GROWING, resume=True)
+    train(again, photos)
+    found, expected = whole_scene(again), whole_scene(runs["whole"])
+    assert all(torch.equal(value, getattr(found, name)) for name, value in expected.items())
+
+
+def test_a_limit_on_gaussians_is_shared_out(tmp_path, views, photos, start):
+    limit = len(start) + 20
+    density = dataclasses.replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0)
+    coordinator = independent(tmp_path, start, views, steps=80, density=density, batch=1)
+    began = visits(coordinator)
+    most: dict[int, int] = {}
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        most[began[-1].block] = max(most.get(began[-1].block, 0), len(coordinator.params["means"]))
+    for event in began:
+        assert most[event.block] <= max(limit * event.gaussians / len(start), event.gaussians)
+    assert any(most[event.block] > event.gaussians for event in began)
