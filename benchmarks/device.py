@@ -128,20 +128,20 @@ class Watch:
     def take_step(self, coordinator: Coordinator, photos: Photos) -> None:
         """A step of training; whatever a visit's beginning or end adds to it is that visit's."""
         edges: list[Counts] = []
-        originals = coordinator._begin_visit, coordinator._end_visit
+        originals = coordinator.begin_visit, coordinator.end_visit
 
         def apart(method: Callable[[], None]) -> None:
             before = self._counts.copy()
             method()
             edges.append(self._counts.since(before))
 
-        coordinator._begin_visit, coordinator._end_visit = (
+        coordinator.begin_visit, coordinator.end_visit = (
             lambda: apart(originals[0]),
             lambda: apart(originals[1]),
         )
         before, self._refined = self._counts.copy(), False
         train_step(coordinator, photos)
-        coordinator._begin_visit, coordinator._end_visit = originals
+        coordinator.begin_visit, coordinator.end_visit = originals
         taken = self._counts.since(before)
         for edge in edges:
             taken = taken.since(edge)

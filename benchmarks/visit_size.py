@@ -33,6 +33,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import passes_for_layers
 from abcd_ns.engine.train.training_loop import train_step
@@ -82,7 +83,7 @@ def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], 
         density=DensityConfig(strategy="off"),
     )
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    coordinator = Coordinator(
+    run = Run(
         config,
         Budget(steps=1_000_000),
         StoredScene(tree, store, 16 << 30),
@@ -91,7 +92,7 @@ def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], 
         *nothing_live(3, device),
         device=device,
     )
-    return coordinator, lambda _, crop: noise[crop.slices]
+    return Coordinator(run), lambda _, crop: noise[crop.slices]
 
 
 def timed(seconds: Counter, stage: str, method: Callable[..., Any]) -> Callable[..., Any]:
@@ -116,20 +117,20 @@ def measure(args: Args, folder: Path) -> tuple[Counter, dict[str, float]]:
     coordinator.announce.subscribe(
         lambda event: events.append(event) if isinstance(event, VisitBegan) else None
     )
-    coordinator._planner.next_visit = timed(seconds, "survey", coordinator._planner.next_visit)
-    coordinator._draw_layers = timed(seconds, "layers", coordinator._draw_layers)
-    coordinator._attach = timed(seconds, "attach", coordinator._attach)
-    coordinator._end_visit = timed(seconds, "end", coordinator._end_visit)
+    coordinator.visits.begin = timed(seconds, "survey", coordinator.visits.begin)
+    coordinator.source.draw = timed(seconds, "layers", coordinator.source.draw)
+    coordinator.begin_visit = timed(seconds, "attach", coordinator.begin_visit)
+    coordinator.end_visit = timed(seconds, "end", coordinator.end_visit)
     whole = timed(seconds, "steps", train_step)
     layers = 0
     while coordinator.state.visit < 2 or coordinator.state.active is not None:
         if coordinator.state.visit == 1 and coordinator.state.active is None:
             seconds.clear()
         whole(coordinator, photo)
-        if coordinator._layers is not None:
-            layers = coordinator._layers.nbytes
-    seconds["steps"] -= seconds["survey"] + seconds["attach"] + seconds["end"]
-    seconds["attach"] -= seconds["layers"]
+        if coordinator.steps.layers is not None:
+            layers = coordinator.layer_bytes
+    seconds["steps"] -= seconds["attach"] + seconds["end"]
+    seconds["attach"] -= seconds["survey"] + seconds["layers"]
     state, drawn = coordinator.state, coordinator.batch * args.steps
     known = {"views": events[-1].views, "drawn": drawn, "layer_bytes": layers}
     known |= {"passes": passes_for_layers(state.trained, state.frozen)}

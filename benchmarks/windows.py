@@ -26,8 +26,8 @@ from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cpu.binning import bin_splats
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.store.scene import MemoryScene
-from abcd_ns.engine.train.batch import Sample
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.nerfstudio.machine import describe_machine, describe_versions

@@ -9,7 +9,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
 from abcd_ns.data.dataset import AbcdDataset
-from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
 
@@ -32,7 +32,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     there for each step. Of no use on the CPU."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self._coordinator: Coordinator | None = None
+        self._coordinator: Trainer | None = None
         self._on_device: dict[tuple[str, int], torch.Tensor] = {}
         super().__init__(*args, **kwargs)
         self._eval_order = random.Random(0)
@@ -52,7 +52,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
         return AbcdDataset(outputs, budget_bytes=0)
 
-    def follow(self, coordinator: Coordinator) -> None:
+    def follow(self, coordinator: Trainer) -> None:
         """Serve what this coordinator asks for from now on."""
         self._coordinator = coordinator
 

@@ -22,8 +22,9 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import BlockScene, MemoryScene, StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.coordinator import Batch, Coordinator
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
+from abcd_ns.engine.train.step.batch import Batch
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
@@ -66,12 +67,12 @@ class AbcdModel(SplatfactoModel):
             torch.tensor(VIEWER_BACKGROUND) if random else get_color(self.config.background_color)
         )
         self.choice = Choice()
-        self._coordinator: Coordinator | None = None
+        self._coordinator: Trainer | None = None
         self._rasterizer: Rasterizer | None = None
         self._loaded_is_too_large = False
         self._parted: tuple[Parameter, BlockTree, MemoryScene] | None = None
 
-    def follow(self, coordinator: Coordinator) -> None:
+    def follow(self, coordinator: Trainer) -> None:
         """From now on the scene is the coordinator's, and the registered parameters its live block."""
         self._coordinator, self._parted = coordinator, None
 

@@ -18,13 +18,15 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.train.batch import Sample
-from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
+from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.splitting import cut_at_rest
-from abcd_ns.engine.train.workers.share import Target
+from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.nerfstudio.model import AbcdModel
@@ -35,8 +37,8 @@ from abcd_ns.nerfstudio.run.run_folder import STATE, MadeFor, new_store, take_ov
 from abcd_ns.nerfstudio.run.run_folder import STORE as STORE
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import views_of
-from abcd_ns.peers.exact import ExactCoordinator
-from abcd_ns.peers.independent import IndependentCoordinator, independent_at_rest
+from abcd_ns.peers.exact import ExactTrainer
+from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
 
@@ -60,11 +62,11 @@ class AbcdPipeline(VanillaPipeline):
         # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
         guard.install()
         super().__init__(config, *args, **kwargs)
-        self._coordinator: Coordinator | None = None
+        self._coordinator: Trainer | None = None
         self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
 
     @property
-    def coordinator(self) -> Coordinator | None:
+    def coordinator(self) -> Trainer | None:
         """Drives the training, once it has begun."""
         return self._coordinator
 
@@ -128,7 +130,7 @@ class AbcdPipeline(VanillaPipeline):
 
     # -- set-up --------------------------------------------------------------------------------------
 
-    def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Coordinator:
+    def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Trainer:
         config, folder = self.config, trainer.base_dir / STATE
         views = self._views()
         self.datamanager.device_photo_bytes = 0 if self._on_cpu else int(PHOTO_SHARE * self._budget)
@@ -139,7 +141,7 @@ class AbcdPipeline(VanillaPipeline):
         if resumed:
             state = RunState.from_json(store.state)
             cut_at_rest(scene, state, training.block_limit, training.sole_limit)
-        coordinator = coordinator_for(training)(
+        run = Run(
             training,
             Budget(trainer.total_steps, config.max_seconds),
             scene,
@@ -148,12 +150,20 @@ class AbcdPipeline(VanillaPipeline):
             self.model.gauss_params,
             {name: optimizers[name] for name in self.model.gauss_params},
             device=self.device,
-            **self._room_for_layers(),
-            target=self._target,
         )
+        coordinator = self._trainer_of(run)
         if resumed:
             coordinator.restore()
         return coordinator
+
+    def _trainer_of(self, run: Run) -> Trainer:
+        """Who trains by the run's options."""
+        if run.config.exact:
+            return ExactTrainer(run)
+        if run.config.overlap > 0:
+            return independent_trainer(run)
+        source = LayerSource(run, self._room_for_layers())
+        return Coordinator(run, source=source, target=self._target)
 
     @property
     def _on_cpu(self) -> bool:
@@ -164,11 +174,11 @@ class AbcdPipeline(VanillaPipeline):
         """Bytes of the device that training may take, of what is free when it begins."""
         return device_budget(self.config.device_budget_gb, self.device)
 
-    def _room_for_layers(self) -> dict[str, int]:
-        """Bytes of the device and of RAM; on the CPU these are one."""
+    def _room_for_layers(self) -> LayerRoom:
+        """Of the device and of RAM; on the CPU these are one."""
         if self._on_cpu:
-            return {"layer_bytes": self._ram.layers}
-        return {"layer_bytes": int(LAYER_SHARE * self._budget), "layer_ram_bytes": self._ram.layers}
+            return LayerRoom(self._ram.layers)
+        return LayerRoom(int(LAYER_SHARE * self._budget), self._ram.layers)
 
     def _processes(self) -> int:
         """As asked for; where RAM is short, one, since each reads blocks for itself."""
@@ -252,13 +262,6 @@ class AbcdPipeline(VanillaPipeline):
         keep = scaffold_size(replace(training, **fitted), largest, self._pixels) if warms_up else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
-
-
-def coordinator_for(training: TrainingConfig) -> type[Coordinator]:
-    """Who runs a training by these options."""
-    if training.exact:
-        return ExactCoordinator
-    return IndependentCoordinator if training.overlap > 0 else Coordinator
 
 
 def cut_space(gaussians: Gaussians, blocks: int, partition: str) -> BlockTree:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from abcd_ns.engine.events import StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import attach, detach
+from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold
 from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.image_size import image_size
@@ -34,10 +34,11 @@ from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.visibility import reaches
 from abcd_ns.engine.store.scaffold import join, part
-from abcd_ns.engine.train.batch import Batch, Rendered, Sample, background, part_to_draw
-from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.control import DensityClock, DensityControl, for_blocks
+from abcd_ns.engine.train.density.control import DensityClock
+from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
+from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, background, part_to_draw
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer
 
 
@@ -71,16 +72,18 @@ class Gradients:
         self.radii[view, rows] = raster.info["radii"][0].to(self.radii)
 
 
-class ExactCoordinator(Coordinator):
-    """Every step trains all blocks; options as for `Coordinator`.
+class ExactTrainer(Trainer):
+    """Every step trains all blocks.
 
     `render` gives pictures whose gradient the caller's backward takes; `after_step` hands it on to blocks.
     Between steps no Gaussians are live, so that the caller's optimizers have nothing to step.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._optics = Optics(list(self.views.values()), self._rasterizer.window_side)
+    def __init__(self, run: Run) -> None:
+        super().__init__(run)
+        run.fit_density(1)  # every block sees every step
+        self._optics = Optics(list(self.views.values()), run.rasterizer.window_side)
+        self._pace = Pace(run.optimizers, run.config.batch_power)
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []
@@ -91,10 +94,6 @@ class ExactCoordinator(Coordinator):
     def batch(self) -> int:
         """Views in a step."""
         return views_per_step(self.config.batch, 1)
-
-    def _density_control(self) -> DensityControl:
-        # Every block sees every step.
-        return DensityControl(for_blocks(self.config.density, 1))
 
     def next_batch(self) -> Batch:
         """Set the learning rate and say what to train on next: whole views, or random parts."""
@@ -126,6 +125,16 @@ class ExactCoordinator(Coordinator):
         clamped = tuple(picture.clamp(0, 1) for picture in self._pictures)
         return Rendered(clamped, tuple(whole.transmittance for whole in wholes), ())
 
+    def loss(
+        self,
+        batch: Batch,
+        pictures: Sequence[Float[Tensor, "_h _w 3"]],
+        photos: Sequence[Float[Tensor, "_h _w 3"]],
+    ) -> Float[Tensor, ""]:
+        """Photometric, the mean of the samples'; what the density strategy asks for is added by block."""
+        losses = batch.losses(pictures, photos, self.config)
+        return sum(losses[1:], start=losses[0]) / len(losses)
+
     def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
         """Pass 2, and a step of every block's optimizers."""
         gradients, taken = self.gradients(), len(rendered.pictures)
@@ -145,7 +154,7 @@ class ExactCoordinator(Coordinator):
         if self.finished:
             self.save()
         elif self.scene.is_due(self.config.commit_seconds):
-            self._rest_amid_visit(self.config.commit_seconds)
+            self.rest(self.config.commit_seconds)
 
     def gradients(self) -> Gradients:
         """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given.
@@ -174,15 +183,15 @@ class ExactCoordinator(Coordinator):
         """Gaussians in the whole scene."""
         return len(self._all)
 
-    def _rest_amid_visit(self, within: float) -> None:
+    def rest(self, within: float) -> None:
         """Put every block to rest; there are no visits."""
         held, nobody = part(self._all, self._owner_of_all()), self._all.nobody
         blocks = range(self.scene.tree.num_blocks)
-        self._rest(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
+        self.run.rest(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
 
     def restore(self) -> None:
         """Go on from what the store holds: where `save` was called, the order of the Gaussians aside."""
-        super().restore()
+        self.run.restore()
         self._take()
 
     # -- blocks --------------------------------------------------------------------------------------
@@ -215,11 +224,11 @@ class ExactCoordinator(Coordinator):
         sample = self._batch.samples[place]
         window = None
         if self.config.ownership == "fragments":
-            grid = self._rasterizer.window_grid(sample.crop)
+            grid = self.run.rasterizer.window_grid(sample.crop)
             window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
         options = {"antialiased": self.config.antialiased, "absgrad": self.density.absgrad}
-        return self._rasterizer.draw(gaussians, [shot], sh_degree=self._degree, **options)[0]
+        return self.run.rasterizer.draw(gaussians, [shot], sh_degree=self._degree, **options)[0]
 
     def _in_order(self, place: int) -> list[Layer]:
         """The view's layers, front to back."""

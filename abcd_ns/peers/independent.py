@@ -17,7 +17,7 @@ schedule runs over that visit. The store also holds each block as it began, unde
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,12 +35,12 @@ from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store.scaffold import blocks_at_rest, join
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import initial_of
-from abcd_ns.engine.train.batch import Batch, Rendered
-from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.control import DensityClock
+from abcd_ns.engine.train.planner import NothingSeenError
+from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
-from abcd_ns.engine.train.schedule import exponential_decay, plan_sweep, sh_degree_at
+from abcd_ns.engine.train.schedule import plan_sweep
+from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 SURFACE_OPACITY = 0.9
@@ -129,39 +129,63 @@ class Surfaces:
         return torch.where(alpha > 0.5, shown, BEYOND).float().cpu()
 
 
-class IndependentCoordinator(Coordinator):
-    """Trains each block in one visit, alone; options as for `Coordinator`, with `training.overlap` > 0."""
+class BlocksAlone:
+    """Visits each block once, in its enlarged cell, for its share of the budget; see `Visits`."""
 
-    def __init__(self, config: TrainingConfig, *args: Any, **kwargs: Any) -> None:
-        super().__init__(replace(config, migrate=False), *args, **kwargs)
+    def __init__(self, run: Run) -> None:
+        self._run, self._scene = run, run.scene
         self._surfaces: Surfaces | None = None
         self._regions: dict[int, Region] = {}
         self._crops: dict[int, Crop] = {}
         self._part = 1.0
 
-    @property
-    def sh_degree(self) -> int:
-        """The degree of spherical harmonics in use: by the share of the visit that is done."""
-        return sh_degree_at(self.share, self.config.sh_ramp, self.config.sh_degree)
+    def begin(self) -> ActiveVisit:
+        """The next block's one visit; the block is put to rest as it begins, with what lies around it."""
+        run, state = self._run, self._run.state
+        began, since = run.stopwatch.seconds, run.progress
+        if not state.views:
+            self._plan()
+        plans = state.queue
+        share = plans[0].steps / sum(plan.steps for plan in plans)
+        block = plans.pop(0).block
+        self._look(block)
+        state.active = ActiveVisit(
+            number=state.visit,
+            geometry=VisitGeometry(block, self._crops),
+            sh_degree=0,
+            steps=UNLIMITED,
+            views=tuple(sorted(self._crops)),
+            began=began,
+            since=since,
+            until=since + (1 - since) * share if plans else 1.0,
+        )
+        state.visit += 1
+        run.rest(self._scene.tree, {block: self._joined(block)}, run.config.commit_seconds)
+        return state.active
 
-    @property
-    def share(self) -> float:
-        """Share of the visit that is done, 0..1; every schedule runs over it."""
-        active = self.state.active
-        if active is None:
-            return 0.0
-        return min(max((self.progress - active.since) / (active.until - active.since), 0.0), 1.0)
+    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:
+        """Others see the block as it will be merged."""
+        block = active.geometry.block
+        self._look(block)
+        begun = sum(self._scene.rows(initial_of(b)) for b in self._blocks)
+        self._part = len(self._joined(block)) / begun
+        cell = self._scene.tree.cell(block)
 
-    def next_batch(self) -> Batch:
-        """As Coordinator's, with the visit's own learning rate and degree."""
-        batch = super().next_batch()
-        self._active.sh_degree = self.sh_degree
-        decay = exponential_decay(self.share, 1.0, self.config.means_lr_decay)
-        self._pace.set(self.batch, means_decay=decay)
-        return batch
+        def inside() -> Gaussians:
+            live = live_gaussians(self._run.params)
+            return live[cell.contains(live.means)]
 
-    def loss(self, batch: Batch, pictures: Any, photos: Any) -> Float[Tensor, ""]:
-        """As Coordinator's, of the pixels that say something about the block."""
+        return inside
+
+    def room(self) -> int | None:
+        """The block's part of the scene's limit."""
+        limit = self._run.config.density.limit
+        return None if limit is None else int(limit * self._part) - len(self._run.params["means"])
+
+    def compared(
+        self, batch: Batch, pictures: Sequence[Tensor], photos: Sequence[Tensor]
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """The pixels that say something about the block; the background where it must stay clear."""
         shown, wanted = [], []
         for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
             index = sample.view.index
@@ -171,100 +195,51 @@ class IndependentCoordinator(Coordinator):
             target = torch.where(clear, sample.background.to(photo), photo)
             shown.append(picture * counts)
             wanted.append(target * counts)
-        return super().loss(batch, shown, wanted)
-
-    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
-        """As Coordinator's; the visit ends when its share of the budget is used up."""
-        super().after_step(rendered, psnrs)
-        if self.state.active is not None and self.progress >= self._active.until:
-            self._end_visit()
-
-    def _order_of(self, active: ActiveVisit, member: int = 0) -> tuple[int, ...]:  # noqa: ARG002
-        return ()  # nobody knows how many steps there will be
-
-    def _density_clock(self, taken: int) -> DensityClock:
-        """On the visit's share, with room for the block's part of the scene's limit."""
-        clock, limit = super()._density_clock(taken), self.config.density.limit
-        if limit is not None:
-            limit = int(limit * self._part) - len(self.params["means"])
-        return replace(clock, progress=self.share, room=limit)
-
-    # -- visits --------------------------------------------------------------------------------------
+        return shown, wanted
 
     @property
     def _blocks(self) -> range:
-        return range(self.scene.tree.num_blocks)
-
-    def _begin_visit(self) -> None:
-        began, since = self.stopwatch.seconds, self.progress
-        if not self.state.views:
-            self._plan()
-        plans = self.state.queue
-        share = plans[0].steps / sum(plan.steps for plan in plans)
-        block = plans.pop(0).block
-        self._look(block)
-        crops = self._crops
-        self.state.active = ActiveVisit(
-            number=self.state.visit,
-            geometry=VisitGeometry(block, crops),
-            sh_degree=0,
-            steps=UNLIMITED,
-            views=tuple(sorted(crops)),
-            began=began,
-            since=since,
-            until=since + (1 - since) * share if plans else 1.0,
-        )
-        self.state.visit += 1
-        self._rest(self.scene.tree, {block: self._joined(block)}, self.config.commit_seconds)
-        self._attach(self.state.active)
+        return range(self._scene.tree.num_blocks)
 
     def _plan(self) -> None:
         """One visit to every block that owns a pixel, weighed by the views that say something about it."""
+        state = self._run.state
         for block in self._blocks:
             self._look(block)
             owns = any(bool(region.own.any()) for region in self._regions.values())
-            self.state.views[block] = len(self._regions) if owns else 0
-        self.state.queue = list(plan_sweep(0, self.state.views, 1, None, self.config.seed))
-        if not self.state.queue:
-            raise RuntimeError("no training view sees any Gaussian: check the poses and the points")
-
-    def _attach(self, active: ActiveVisit) -> None:
-        block = active.geometry.block
-        self._look(block)
-        super()._attach(active)
-        begun = sum(self.scene.rows(initial_of(b)) for b in self._blocks)
-        self._part = len(self._joined(block)) / begun
-        # What looks at the scene meanwhile sees the block as it will be merged.
-        cell = self.scene.tree.cell(block)
-
-        def inside() -> Gaussians:
-            live = live_gaussians(self.params)
-            return live[cell.contains(live.means)]
-
-        self.scene.lay_over(block, inside)
+            state.views[block] = len(self._regions) if owns else 0
+        state.queue = list(plan_sweep(0, state.views, 1, None, self._run.config.seed))
+        if not state.queue:
+            raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
 
     def _look(self, block: int) -> None:
         """Find out what pixels are to the block, and let go of the last block's."""
+        run = self._run
         if self._surfaces is None:
-            views = list(self.views.values())
-            self._surfaces = Surfaces(self.scene, views, self._rasterizer, self.device)
+            self._surfaces = Surfaces(self._scene, list(run.views.values()), run.rasterizer, run.device)
         box, self._regions, self._crops = self._box(block), {}, {}
-        begun = self._joined(block).gaussians.to(self.device)
-        crops = survey(begun, block, self.views.values(), self._rasterizer).crops
+        begun = self._joined(block).gaussians.to(run.device)
+        crops = survey(begun, block, run.views.values(), run.rasterizer).crops
         for view, crop in crops.items():
-            region = self._surfaces.region(view, box)[crop].to(self.device)
+            region = self._surfaces.region(view, box)[crop].to(run.device)
             if bool((region.own | region.clear).any()):
                 self._regions[view], self._crops[view] = region, crop
 
     def _box(self, block: int) -> Box:
-        means = initial_gaussians(self.scene, block).means
-        return enlarged(self.scene.tree.cell(block), means, self.config.overlap)
+        means = initial_gaussians(self._scene, block).means
+        return enlarged(self._scene.tree.cell(block), means, self._run.config.overlap)
 
     def _joined(self, block: int) -> BlockState:
         """The block as it begins, with what of the others lies in its enlarged cell."""
         box, others = self._box(block), [b for b in self._blocks if b != block]
-        own, *around = [initial_gaussians(self.scene, b) for b in [block, *others]]
+        own, *around = [initial_gaussians(self._scene, b) for b in [block, *others]]
         return join([BlockState.fresh(g) for g in [own, *(g[box.contains(g.means)] for g in around)]])
+
+
+def independent_trainer(run: Run) -> Coordinator:
+    """Trains each block in one visit, alone; `training.overlap` is above 0. No Gaussian migrates."""
+    run.config = replace(run.config, migrate=False)
+    return Coordinator(run, BlocksAlone(run))
 
 
 def initial_gaussians(scene: StoredScene, block: int) -> Gaussians:

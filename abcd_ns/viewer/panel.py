@@ -15,8 +15,8 @@ from abcd_ns.engine.events import Event, LayersDrawn, SweepEnded, VisitBegan, Vi
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import BlockScene
-from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
 from abcd_ns.viewer.board import BlockRow, Board, Status, seconds_left, sweep_share
 from abcd_ns.viewer.boxes import boxes_of, bulk
@@ -59,7 +59,7 @@ class AbcdPanel(ViewerControl):
 
     def __init__(self, model: Drawn, views: Callable[[], list[View]]) -> None:
         self._model, self._views = model, views
-        self._coordinator: Coordinator | None = None
+        self._coordinator: Trainer | None = None
         self._board = Board()
         self._controls: Controls | None = None
         self._scenery: Scenery | None = None
@@ -87,7 +87,7 @@ class AbcdPanel(ViewerControl):
             self._lay_out()
             self._update()
 
-    def follow(self, coordinator: Coordinator) -> None:
+    def follow(self, coordinator: Trainer) -> None:
         """From now on show how this run goes."""
         self._coordinator = coordinator
         self._board = Board.resumed(coordinator.state, coordinator.stopwatch.seconds)
@@ -142,7 +142,7 @@ class AbcdPanel(ViewerControl):
         if self._coordinator is not None:
             self._report(self._coordinator)
 
-    def _report(self, coordinator: Coordinator) -> None:
+    def _report(self, coordinator: Trainer) -> None:
         board, state, seconds = self._board, coordinator.state, self._seconds
         share, sweep = sweep_share(board, state), ""
         if board.sweep is not None and not coordinator.finished:

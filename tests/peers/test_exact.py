@@ -11,16 +11,16 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.peers.exact import ExactCoordinator
+from abcd_ns.peers.exact import ExactTrainer
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
 
 
-def exact(folder, start, views, **options) -> ExactCoordinator:
+def exact(folder, start, views, **options) -> ExactTrainer:
     folder.mkdir(exist_ok=True)
-    return make_coordinator(folder, start, views, kind=ExactCoordinator, **{"density": STILL, **options})
+    return make_coordinator(folder, start, views, kind=ExactTrainer, **{"density": STILL, **options})
 
 
 def scene(dtype) -> Gaussians:
@@ -50,7 +50,7 @@ def test_gradients_are_those_of_the_merged_picture(tmp_path, blocks, dtype, tole
     leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in leaves.items()})
     pictures, infos = [], []
     for sample in batch.samples:
-        raster = coordinator._rasterizer(leaves, sample.view, sh_degree=1)
+        raster = coordinator.run.rasterizer(leaves, sample.view, sh_degree=1)
         raster.info["means2d"].retain_grad()
         infos.append(raster.info)
         pictures.append(composite(raster.layer, sample.background).clamp(0, 1))
@@ -166,14 +166,14 @@ def test_views_of_a_step_may_differ_in_size(tmp_path):
     views = [replace(view, index=index) for index, view in enumerate(views)]
     photos, start = Photos(random_gaussians(150, seed=7, size=0.12), views), scene(torch.float32)
     counted = []
-    for kind in (ExactCoordinator, Coordinator):
+    for kind in (ExactTrainer, Coordinator):
         folder = tmp_path / kind.__name__
         folder.mkdir()
         options = {"blocks": 1, "batch": 4, "steps": 4, "density": GROWING, "background": "black"}
         coordinator = make_coordinator(folder, start, views, kind=kind, **options)
         train_step(coordinator, photos)
         coordinator.save()
-        state = coordinator.scene.state(0 if kind is ExactCoordinator else LIVE)
+        state = coordinator.scene.state(0 if kind is ExactTrainer else LIVE)
         counted.append(state.growth)
     exactly, jointly = counted
     assert torch.equal(exactly["count"], jointly["count"])

@@ -10,10 +10,10 @@ from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.peers.independent import (
-    IndependentCoordinator,
     Surfaces,
     enlarged,
     independent_at_rest,
+    independent_trainer,
 )
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, whole_scene
 
@@ -21,10 +21,10 @@ STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
 
 
-def independent(folder, start, views, **options) -> IndependentCoordinator:
+def independent(folder, start, views, **options) -> independent_trainer:
     options = {"overlap": 0.2, "layers": False, "blocks": 4, **options}
     return make_coordinator(
-        folder, start, views, kind=IndependentCoordinator, content=independent_at_rest, **options
+        folder, start, views, kind=independent_trainer, content=independent_at_rest, **options
     )
 
 
@@ -99,7 +99,7 @@ def test_what_others_became_is_nothing_to_a_block(tmp_path, views, photos, start
 def test_every_pixel_is_some_blocks_and_without_overlap_just_ones(tmp_path, views, start):
     coordinator = independent(tmp_path, start, views)
     scene = coordinator.scene
-    surfaces = Surfaces(scene, views, coordinator._rasterizer, torch.device("cpu"))
+    surfaces = Surfaces(scene, views, coordinator.run.rasterizer, torch.device("cpu"))
     for overlap in (0.0, 0.2):
         for view in views:
             owners = torch.zeros(view.height, view.width, dtype=torch.int64)
@@ -125,7 +125,7 @@ def test_own_pixels_pull_to_the_photo_clear_ones_to_the_background_and_hidden_on
     coordinator.loss(batch, pictures, wanted).backward()
     kinds = torch.zeros(3, dtype=torch.int64)
     for sample, picture, photo in zip(batch.samples, pictures, wanted, strict=True):
-        region = coordinator._regions[sample.view.index]
+        region = coordinator.visits._regions[sample.view.index]
         hidden = ~region.own & ~region.clear
         kinds += torch.stack([region.own.sum(), region.clear.sum(), hidden.sum()])
         scale = 2 / (3 * sample.view.width * sample.view.height * len(batch.samples))
@@ -146,7 +146,7 @@ def test_training_improves_every_photo_of_a_scene_with_surfaces(tmp_path, views)
     def errors() -> list[float]:
         scene = whole_scene(coordinator)
         with torch.no_grad():
-            rasters = [coordinator._rasterizer(scene, view, sh_degree=1) for view in views]
+            rasters = [coordinator.run.rasterizer(scene, view, sh_degree=1) for view in views]
         pairs = [(r.color.clamp(0, 1), photos.images[v.index]) for r, v in zip(rasters, views, strict=True)]
         return [float((picture - photo).square().mean()) for picture, photo in pairs]
 

@@ -17,7 +17,10 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 
@@ -90,7 +93,7 @@ def make_coordinator(
     tree: BlockTree | None = None,
     resume: bool = False,
     scaffold: int | None = None,
-    kind: type[Coordinator] = Coordinator,
+    kind: Callable[[Run], Trainer] | None = None,
     content: Callable = blocks_at_rest,
     ram_bytes: int = 2 << 30,
     layer_bytes: int = LAYER_BYTES,
@@ -99,8 +102,12 @@ def make_coordinator(
     rasterizer: Rasterizer | None = None,
     device: torch.device | str = "cpu",
     **training,
-) -> Coordinator:
-    """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is."""
+) -> Trainer:
+    """A coordinator over a store in `folder`, made from `gaussians` or, with `resume`, opened as it is.
+
+    Args:
+        kind: makes another trainer of the run.
+    """
     if resume:
         store = ParameterStore.open(folder / "store")
         tree = BlockTree.from_json(store.header["tree"])
@@ -109,7 +116,7 @@ def make_coordinator(
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
         store.commit(content(tree, gaussians, *([] if scaffold is None else [scaffold])))
     config = TrainingConfig(sh_degree=gaussians.sh_degree, **training)
-    coordinator = kind(
+    run = Run(
         config,
         Budget(steps=steps),
         StoredScene(tree, store, ram_bytes),
@@ -117,10 +124,9 @@ def make_coordinator(
         rasterizer or TorchRasterizer(compile="never"),
         *nothing_live(gaussians.sh_degree, device),
         device=device,
-        layer_bytes=layer_bytes,
-        layer_ram_bytes=layer_ram_bytes,
-        target=target,
     )
+    source = LayerSource(run, LayerRoom(layer_bytes, layer_ram_bytes))
+    coordinator = kind(run) if kind else Coordinator(run, source=source, target=target)
     if resume:
         coordinator.restore()
     return coordinator

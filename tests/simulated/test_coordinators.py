@@ -12,8 +12,8 @@ from abcd_ns.engine.render import TorchRasterizer, make_rasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.peers.exact import ExactCoordinator
-from abcd_ns.peers.independent import IndependentCoordinator, independent_at_rest
+from abcd_ns.peers.exact import ExactTrainer
+from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from tests.reference.scenes import make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 
@@ -163,7 +163,7 @@ def test_a_run_that_was_shared_by_a_crew_is_gone_on_with(tmp_path, start, views,
     train(first, photos, steps=1)
     assert first.state.active.crew == 2
     first.save()
-    first._crew.dismiss()
+    first.steps._crew.dismiss()
     first.scene.store.close()
     second = on_device(tmp_path, start, views, resume=True, target=target, **options)
     train(second, photos, steps=2)
@@ -173,7 +173,7 @@ def test_a_run_that_was_shared_by_a_crew_is_gone_on_with(tmp_path, start, views,
 
 @pytest.mark.parametrize("density", [GROWING, MCMC], ids=["default", "mcmc"])
 def test_blocks_are_trained_jointly(tmp_path, start, views, photos, density):
-    coordinator = on_device(tmp_path, start, views, blocks=3, steps=4, density=density, kind=ExactCoordinator)
+    coordinator = on_device(tmp_path, start, views, blocks=3, steps=4, density=density, kind=ExactTrainer)
     before = losses_of(start, views, photos)
     train(coordinator, photos)
     assert losses_of(whole_scene(coordinator), views, photos) < before
@@ -181,7 +181,7 @@ def test_blocks_are_trained_jointly(tmp_path, start, views, photos, density):
 
 def test_blocks_are_trained_apart(tmp_path, start, views, photos):
     options = {
-        "kind": IndependentCoordinator,
+        "kind": independent_trainer,
         "content": independent_at_rest,
         "layers": False,
         "overlap": 0.25,
@@ -195,7 +195,7 @@ def test_blocks_are_trained_apart(tmp_path, start, views, photos):
 @pytest.mark.parametrize("ownership", ["means", "fragments"])
 def test_a_picture_is_composited(tmp_path, start, views, ownership, rasterizer):
     coordinator = on_device(tmp_path, start, views, rasterizer, blocks=4)
-    draws = coordinator._rasterizer
+    draws = coordinator.run.rasterizer
     painter = Painter(coordinator.scene, views, draws, ownership=ownership, pass_gaussians=0, device=DEVICE)
     layer = painter.picture(views[0], PaintSettings(1, False))
     assert layer.color.device == DEVICE

@@ -9,9 +9,9 @@ from torch import Tensor
 from abcd_ns.engine.render import Shot, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.train.batch import part_to_draw
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds
+from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.room import Room
 

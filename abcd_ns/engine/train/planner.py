@@ -1,18 +1,19 @@
 """Which block is trained next, on which views, and for how many steps."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
-import torch
+from torch import Tensor
 
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
-from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import worth_training
-from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.settle import has_scaffold
 from abcd_ns.engine.store.special_blocks import WHOLE
-from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, Budget, RunState
+from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
     VisitPlan,
     passes_for_layers,
@@ -23,7 +24,8 @@ from abcd_ns.engine.train.schedule import (
     views_per_warm_up_step,
     visit_views,
 )
-from abcd_ns.engine.types import View
+from abcd_ns.engine.train.step.batch import Batch
+from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 
 LOOK_AGAIN = 4
@@ -34,30 +36,71 @@ class NothingSeenError(UserError, RuntimeError):
     """There is nothing to train: no view sees any Gaussian, or none is left."""
 
 
+class Visits(Protocol):
+    """Decides which block is trained when, and on what terms."""
+
+    def begin(self) -> ActiveVisit:
+        """The next visit, which from now on is the run's active one.
+
+        Raises:
+            NothingSeenError: no view sees any block.
+        """
+
+    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:
+        """Its block is live, at the visit's beginning or after a resume; what others see of it meanwhile."""
+
+    def room(self) -> int | None:
+        """Gaussians that may be added to the block; None for any number."""
+
+    def compared(
+        self, batch: Batch, pictures: Sequence[Tensor], photos: Sequence[Tensor]
+    ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """What the loss compares: pictures and photos, as far as they say something about the block."""
+
+
 class Planner:
-    """Plans the visits of a run; all that it remembers is in the run's state.
+    """ABCD's visits: sweeps over all blocks that any view sees, after a warm-up; all that it remembers is in
+    the run's state."""
 
-    Args:
-        views: the training views, by index.
-    """
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._config, self._budget, self._scene = run.config, run.budget, run.scene
+        self._views = run.views
+        side = run.rasterizer.window_side
+        self._frusta = Frusta(((view, view.full) for view in self._views.values()), side)
+        self._optics = Optics(list(self._views.values()), side)
 
-    def __init__(
+    def begin(self) -> ActiveVisit:
+        """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
+        passed over, and most of the time those that no picture showed when they were last visited."""
+        run, state = self._run, self._run.state
+        began = run.stopwatch.seconds
+        if state.visit == 0 and has_scaffold(self._scene) and run.progress < self._config.warmup:
+            state.active = self._warm_up(run.sh_degree, began)
+        else:
+            state.active = self._next_visit(state, run.sh_degree, began)
+        state.visit += 1
+        return state.active
+
+    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:  # noqa: ARG002 - all alike
+        """Others see the live block as it is."""
+        return lambda: live_gaussians(self._run.params)
+
+    def room(self) -> int | None:
+        """What the limits of scene and block leave."""
+        live, blocks = len(self._run.params["means"]), self._scene.tree.num_blocks
+        return self._config.room(self._run.count(), live, blocks)
+
+    def compared(
         self,
-        config: TrainingConfig,
-        budget: Budget,
-        scene: StoredScene,
-        views: Mapping[int, View],
-        rasterizer: Rasterizer,
-        *,
-        device: torch.device,
-    ) -> None:
-        self._config, self._budget, self._scene = config, budget, scene
-        self._views, self._rasterizer, self._device = views, rasterizer, device
-        side = rasterizer.window_side
-        self._frusta = Frusta(((view, view.full) for view in views.values()), side)
-        self._optics = Optics(list(views.values()), side)
+        batch: Batch,  # noqa: ARG002 - all alike
+        pictures: Sequence[Tensor],
+        photos: Sequence[Tensor],
+    ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """Everything: pictures show the whole scene."""
+        return pictures, photos
 
-    def warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
+    def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the scaffold of all blocks is trained."""
         crops = {index: view.full for index, view in self._views.items()}
         geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
@@ -68,13 +111,7 @@ class Planner:
             taken = min(taken, math.ceil(uses / views))
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
-    def next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
-        """A visit to the next block that some view sees; blocks that none sees any more are passed over, and
-        most of the time those that no picture showed when they were last visited.
-
-        Raises:
-            NothingSeenError: no view sees any block.
-        """
+    def _next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
         while True:
             plan = self._next_plan(state)
             if self._is_hidden(state, plan.block) and state.sweep % LOOK_AGAIN:
@@ -170,4 +207,4 @@ class Planner:
             return VisitGeometry(block, {})
         (shows,) = self._frusta.may_show([self._optics.drawn_within(bounds)]).tolist()
         near = [view for view, may in zip(self._views.values(), shows, strict=True) if may]
-        return survey(self._scene.at_rest(block).to(self._device), block, near, self._rasterizer)
+        return survey(self._scene.at_rest(block).to(self._run.device), block, near, self._run.rasterizer)

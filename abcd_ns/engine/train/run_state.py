@@ -76,8 +76,16 @@ class ActiveVisit:
 
     @property
     def is_alone(self) -> bool:
-        """Whether what is trained has nothing around it, and may go on for as long as the run."""
-        return self.is_whole or self.sole
+        """Whether what is trained has nothing around it, and may go on for as long as it likes."""
+        return self.is_whole or self.sole or self.steps >= UNLIMITED
+
+    def share(self, progress: float) -> float:
+        """Share of the visit's part of the run that is done, 0..1; that part is mostly all of it.
+
+        Args:
+            progress: share of the run.
+        """
+        return min(max((progress - self.since) / (self.until - self.since), 0.0), 1.0)
 
 
 @dataclass

@@ -17,6 +17,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
@@ -139,7 +140,7 @@ def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, dev
         # As large blocks have it. Small ones may draw more at once, for speed, which small lands do not have.
         pass_gaussians=2 * job.gaussians_per_tile,
     )
-    return Coordinator(
+    run = Run(
         config,
         Budget(steps=10**9),
         StoredScene(tree, store, ram_bytes=job.ram_budget_bytes),
@@ -148,6 +149,7 @@ def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, dev
         *nothing_live(3, device),
         device=device,
     )
+    return Coordinator(run)
 
 
 class _Watch:

@@ -10,7 +10,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.lab.stability.captures import table
 from abcd_ns.lab.stability.lab import BUDGET, STILL, Lab, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, Scenario, db
-from abcd_ns.lab.stability.stale import StaleCoordinator
+from abcd_ns.lab.stability.stale import stale_coordinator
 from abcd_ns.lab.stability.world import ring
 
 BLOCKS = (1, 2, 4, 8, 27)
@@ -55,7 +55,7 @@ def train_stale(
         heal=heal,
         first_passes=2,
         last_passes=2,
-        kind=partial(StaleCoordinator, every=every, damping=damping),
+        kind=partial(stale_coordinator, every=every, damping=damping),
     )
     rising = share_rising(objectives(lab, stage, coordinator))
     return rising, lab.score(coordinator, stage.held_out, stage.truth)

@@ -26,6 +26,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import scaffold_size
+from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import views_per_step, views_per_warm_up_step
 from abcd_ns.engine.train.training_loop import train_step
@@ -148,7 +149,7 @@ class Lab:
         budget: int,
         blocks: int = BLOCKS,
         tree: BlockTree | None = None,
-        kind: type[Coordinator] = Coordinator,
+        kind: Callable[[Run], Coordinator] = Coordinator,
         optimizers: tuple[dict[str, Parameter], Optimizers] | None = None,
         **training,
     ) -> Coordinator:
@@ -156,6 +157,7 @@ class Lab:
 
         Args:
             budget: views drawn in the whole run; every method gets as many, in steps of as many as it takes.
+            kind: makes it of a run.
             optimizers: parameters and their optimizers; new ones if left out.
             training: options of TrainingConfig.
         """
@@ -174,7 +176,7 @@ class Lab:
         params, adam = optimizers or nothing_live(start.sh_degree)
         scene = StoredScene(tree, store)
         steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views)))
-        return kind(config, steps, scene, views, self.rasterizer, params, adam)
+        return kind(Run(config, steps, scene, views, self.rasterizer, params, adam))
 
     def train(
         self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options

@@ -1,7 +1,5 @@
 """Training against old pictures of the other blocks, which the engine refuses: to see what that does."""
 
-from typing import Any
-
 import torch
 
 from abcd_ns.engine.gaussians.block_state import BlockState
@@ -9,6 +7,9 @@ from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.layer_source import LayerSource
+from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.types import Gaussians
 
 
@@ -35,7 +36,44 @@ class Snapshot(BlockScene):
         return bounds_of(self._blocks[block])
 
 
-class StaleCoordinator(Coordinator):
+class OldNeighbours:
+    """The other blocks as they were some visits ago, as a source of layers asks for them.
+
+    Args:
+        every: visits between two looks at the scene; 1 is always fresh.
+    """
+
+    def __init__(self, run: Run, every: int) -> None:
+        self._run, self._every = run, every
+        self._seen: Snapshot | None = None
+        self._taken_at = 0
+
+    def __call__(self) -> BlockScene:
+        visit = self._run.state.visit
+        if self._seen is None or visit - self._taken_at >= self._every:
+            self._seen, self._taken_at = Snapshot(self._run.scene, visit), visit
+        return self._seen
+
+
+class DampedBlock(LiveBlock):
+    """Keeps a share of what a visit did."""
+
+    def __init__(self, run: Run, damping: float) -> None:
+        super().__init__(run)
+        self._share = damping
+
+    def detached(self) -> BlockState:
+        state, active = super().detached(), self._run.state.active
+        if active is None or active.is_whole:
+            return state
+        before = self._run.scene.at_rest(active.geometry.block)
+        mixed = {n: torch.lerp(getattr(before, n), v, self._share) for n, v in state.gaussians.items()}
+        return BlockState(
+            Gaussians(**mixed), state.exp_avg, state.exp_avg_sq, state.growth, state.clocks
+        )  # moments are of the path, not of where it ends
+
+
+def stale_coordinator(run: Run, every: int, damping: float = 1.0) -> Coordinator:
     """Shows blocks to each other as they were some visits ago.
 
     The number of Gaussians must stay (strategy "off", `migrate` off is not needed).
@@ -44,25 +82,5 @@ class StaleCoordinator(Coordinator):
         every: visits between two looks at the scene; 1 is always fresh.
         damping: what a visit did is kept to this share; 1 keeps all.
     """
-
-    def __init__(self, *args: Any, every: int = 1, damping: float = 1.0, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._every, self._damping = every, damping
-        self._seen: Snapshot | None = None
-        self._taken_at = 0
-
-    def _surroundings(self) -> BlockScene:
-        if self._seen is None or self.state.visit - self._taken_at >= self._every:
-            self._seen, self._taken_at = Snapshot(self.scene, self.state.visit), self.state.visit
-        return self._seen
-
-    def _detached(self) -> BlockState:
-        state = super()._detached()
-        active = self.state.active
-        if self._damping == 1.0 or active is None or active.is_whole:
-            return state
-        before = self.scene.at_rest(active.geometry.block)
-        mixed = {n: torch.lerp(getattr(before, n), v, self._damping) for n, v in state.gaussians.items()}
-        return BlockState(
-            Gaussians(**mixed), state.exp_avg, state.exp_avg_sq, state.growth, state.clocks
-        )  # moments are of the path, not of where it ends
+    live = None if damping == 1.0 else DampedBlock(run, damping)
+    return Coordinator(run, source=LayerSource(run, around=OldNeighbours(run, every)), live=live)

@@ -19,9 +19,9 @@ from abcd_ns.engine.events import (
     VisitEnded,
     VisitUndone,
 )
-from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.health_record import MENDED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
+from abcd_ns.engine.train.trainer import Trainer
 
 SECONDS_BETWEEN_LINES = 10.0
 """Where the output is no terminal (a log file, say), a line is printed this often."""
@@ -35,7 +35,7 @@ ALARMING = ("gradients", "moments", "values")
 class ProgressReport:
     """Listens to a coordinator. On a terminal one live line; elsewhere a line every few seconds."""
 
-    def __init__(self, coordinator: Coordinator) -> None:
+    def __init__(self, coordinator: Trainer) -> None:
         self._coordinator = coordinator
         self._psnr: float | None = None
         self._sweep = 0

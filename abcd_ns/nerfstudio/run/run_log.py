@@ -14,7 +14,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
-from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.machine import peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import (
     KIND_OF,
@@ -65,7 +65,7 @@ class RunLog:
     """
 
     def __init__(
-        self, coordinator: Coordinator, path: Path, meters: Sequence[Meter] = (), earlier: Path | None = None
+        self, coordinator: Trainer, path: Path, meters: Sequence[Meter] = (), earlier: Path | None = None
     ) -> None:
         self._coordinator, self._meters = coordinator, tuple(meters)
         self._path: Path | None = path
@@ -169,7 +169,7 @@ class RunLog:
             self._path = None
 
 
-def past_of(coordinator: Coordinator, log: Path) -> list[str]:
+def past_of(coordinator: Trainer, log: Path) -> list[str]:
     """The lines of an earlier run's log that are the past of a run that was resumed from it.
 
     What it did after its checkpoint is cut. A line that cannot be read ends the past.
@@ -187,7 +187,7 @@ def past_of(coordinator: Coordinator, log: Path) -> list[str]:
     return kept
 
 
-def keep_log(trainer: "AbcdTrainer", coordinator: Coordinator) -> RunLog:
+def keep_log(trainer: "AbcdTrainer", coordinator: Trainer) -> RunLog:
     """Begin the log of a run, and write its settings beside it."""
     folder, photos = trainer.base_dir / STATE, trainer.pipeline.datamanager.train_dataset.photos
     write_settings(trainer.config, folder)

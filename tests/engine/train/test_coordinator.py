@@ -104,7 +104,7 @@ def _gradient_of_whole_picture(coordinator, sample, weights, block, ownership) -
     draw, tree = TorchRasterizer(compile="never"), coordinator.scene.tree
     blocks = {b: coordinator.scene.gaussians(b) for b in range(tree.num_blocks)}
     active = Gaussians(**{n: v.clone().requires_grad_() for n, v in blocks[block].items()})
-    degree = coordinator._active.sh_degree
+    degree = coordinator.run.active.sh_degree
     if ownership == "fragments":
         others = Gaussians.cat([g for b, g in blocks.items() if b != block])
         layer = draw(active, sample.view, sh_degree=degree, crop=sample.crop, frozen=others).layer
@@ -153,9 +153,9 @@ def test_migrants_take_their_moments_along(tmp_path, views, photos, start):
     coordinator = make_coordinator(
         tmp_path, start, views, blocks=2, steps=30, density=DensityConfig(strategy="off"), batch=2
     )
-    while coordinator.state.active is None or coordinator._active.done < coordinator._active.steps - 1:
+    while coordinator.state.active is None or coordinator.run.active.done < coordinator.run.active.steps - 1:
         train_step(coordinator, photos)
-    block = coordinator._active.geometry.block
+    block = coordinator.run.active.geometry.block
     with torch.no_grad():
         coordinator.params["means"][0] = coordinator.scene.gaussians(1 - block).means[0]
     moments = coordinator.optimizers["scales"].state[coordinator.params["scales"]]["exp_avg"]
@@ -309,7 +309,7 @@ def test_a_giant_is_trained_where_it_reaches_out_of_its_cell(tmp_path, views, st
                 merged = layer.color + layer.transmittance[..., None] * sample.background
                 assert float((picture - merged.clamp(0, 1)).abs().mean()) < 1e-3
                 seen += 1
-        coordinator._end_visit()
+        coordinator.end_visit()
     assert seen > 0
 
 
@@ -337,9 +337,9 @@ def test_layers_show_what_earlier_visits_made_of_the_other_blocks(tmp_path, view
     def compared(batch):
         nonlocal begun
         rendered = render(batch)
-        if coordinator._active.done > 0:
+        if coordinator.run.active.done > 0:
             return rendered
-        begun, scene, degree = begun + 1, whole_scene(coordinator).detach(), coordinator._active.sh_degree
+        begun, scene, degree = begun + 1, whole_scene(coordinator).detach(), coordinator.run.active.sh_degree
         for sample, picture in zip(batch.samples, rendered.pictures, strict=True):
             layer = draw(scene, sample.view, sh_degree=degree, crop=sample.crop).layer
             expected = composite(layer, sample.background).clamp(0, 1)

@@ -12,10 +12,10 @@ import torch
 
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.schedule import size_of_crew, view_order, views_of_member
+from abcd_ns.engine.train.step.workers import crew as crew_module
+from abcd_ns.engine.train.step.workers.helper_process import can_fork
+from abcd_ns.engine.train.step.workers.shared_memory import SharedRows
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.engine.train.workers import crew as crew_module
-from abcd_ns.engine.train.workers.helper_process import can_fork
-from abcd_ns.engine.train.workers.shared_memory import SharedRows
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
@@ -67,14 +67,14 @@ def test_a_step_is_the_one_that_a_single_process_takes(make, photos):
     """The same views, the same weights: gradients equal those of all views drawn at once."""
     shared, alone = make("shared", batch=4, density=DensityConfig("off")), make("alone", 1, batch=4)
     batch = shared.next_batch()
-    crew = shared._crew
+    crew = shared.steps._crew
     assert len(batch.samples) == 2
     assert len(crew.pids) == 1
     rendered = shared.render(batch)
     loss = shared.loss(batch, rendered.pictures, [photos(s.view.index, s.crop) for s in batch.samples])
     loss.backward()
-    order = shared._order_of(shared.state.active, 1)
-    helped = [shared._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
+    order = shared.steps._order_of(shared.state.active, 1)
+    helped = [shared.steps._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
     alone.next_batch()
     every = type(batch)(0, (*batch.samples, *helped))
     drawn = alone.render(every)
@@ -91,14 +91,14 @@ def test_what_density_control_counts_is_that_of_all_views(make, photos):
     """Sums over the views of all members are those of the same views drawn in one process."""
     shared, alone = make("shared", batch=4), make("alone", 1, batch=4)
     batch = shared.next_batch()
-    crew, order = shared._crew, shared._order_of(shared.state.active, 1)
+    crew, order = shared.steps._crew, shared.steps._order_of(shared.state.active, 1)
     rendered = shared.render(batch)
     shared.loss(batch, rendered.pictures, [photos(s.view.index, s.crop) for s in batch.samples]).backward()
     (part,) = crew.parts()
     own = shared.density.count(shared.params["means"], rendered.infos)
     found = {name: own[name] + part.counts[name] for name in own}
     alone.next_batch()
-    helped = [shared._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
+    helped = [shared.steps._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
     every = type(batch)(0, (*batch.samples, *helped))
     drawn = alone.render(every)
     alone.loss(every, drawn.pictures, [photos(s.view.index, s.crop) for s in every.samples]).backward()
@@ -127,12 +127,12 @@ def test_a_step_of_the_warm_up_is_the_one_that_a_single_process_takes(make, phot
         drawn.append([s.view.index for s in batch.samples])
     (own,), both = drawn
     assert shared.state.active.crew == 2
-    assert both == [own, *shared._views_of_step(shared.state.active, (), 3, member=1)]
+    assert both == [own, *shared.steps._views_of_step(shared.state.active, (), 3, member=1)]
     assert len(set(both)) == 2
     for name in PARAM_NAMES:
         found, expected = shared.params[name].grad, alone.params[name].grad
         assert torch.allclose(found, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max())), name
-    shared._crew.dismiss()
+    shared.steps._crew.dismiss()
 
 
 @pytest.mark.parametrize("options", [{}, WARM], ids=["blocks", "warm-up"])
@@ -145,7 +145,7 @@ def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch, o
         if lost.state.step % 4 == 0 and lost._crew is not None:
             for pid in lost._crew.pids:
                 os.kill(pid, signal.SIGKILL)
-    monkeypatch.setattr("abcd_ns.engine.train.step_drawing.can_fork", lambda _: False)
+    monkeypatch.setattr("abcd_ns.engine.train.step.drawing.can_fork", lambda _: False)
     train(never, photos)
     assert len(whole_scene(helped)) > 60  # blocks grew
     assert equal(whole_scene(helped), whole_scene(lost))
@@ -194,8 +194,8 @@ def test_helpers_end_with_their_visit(make, photos):
     threads = torch.get_num_threads()
     while not coordinator.finished:
         train_step(coordinator, photos)
-        if coordinator._crew is not None:
-            seen |= set(coordinator._crew.pids)
+        if coordinator.steps._crew is not None:
+            seen |= set(coordinator.steps._crew.pids)
     assert len(seen) >= 2
     assert not any(is_alive(pid) for pid in seen)
     assert torch.get_num_threads() == threads
@@ -225,7 +225,7 @@ coordinator = make_coordinator(
     Path({str(tmp_path)!r}), random_gaussians(60, seed=2), views, blocks=2, steps=30, processes=2,
     target=lambda s: (photos(s.view.index, s.crop), None))
 coordinator.next_batch()
-print(*coordinator._crew.pids, flush=True)
+print(*coordinator.steps._crew.pids, flush=True)
 time.sleep(600)
 """
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
@@ -269,11 +269,11 @@ def test_a_run_goes_on_where_there_can_be_no_processes(make, photos, monkeypatch
     train(straight, photos, steps=3 + left)
     stopped.save()
     stopped.scene.store.close()
-    monkeypatch.setattr("abcd_ns.engine.train.step_drawing.can_fork", lambda _: False)
+    monkeypatch.setattr("abcd_ns.engine.train.step.drawing.can_fork", lambda _: False)
     resumed = make("stopped", processes=1, resume=True, **options)
     for _ in range(left):
         train_step(resumed, photos)
-        assert resumed._crew is None or resumed._crew.pids == ()
+        assert resumed.steps._crew is None or resumed.steps._crew.pids == ()
     assert equal(whole_scene(straight), whole_scene(resumed))
     train(resumed, photos)
     assert resumed.finished

@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
-from abcd_ns.engine.train.batch import Sample, part_to_draw
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.cutouts import ALIGN, random_part
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.step.batch import Sample, part_to_draw
+from abcd_ns.engine.train.step.cutouts import ALIGN, random_part
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Crop, Layer
-from abcd_ns.peers.exact import ExactCoordinator
-from abcd_ns.peers.independent import IndependentCoordinator, independent_at_rest
+from abcd_ns.peers.exact import ExactTrainer
+from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from tests.reference.scenes import make_coordinator, ring_of_views, whole_scene
 
 CROPS = st.builds(Crop, st.integers(0, 200), st.integers(0, 200), st.integers(1, 2000), st.integers(1, 2000))
@@ -148,14 +148,14 @@ def test_a_part_of_a_batch_shows_what_the_whole_shows_there(tmp_path, views, sta
 
 EACH_ALONE = {
     "blocks": 2,
-    "kind": IndependentCoordinator,
+    "kind": independent_trainer,
     "content": independent_at_rest,
     "layers": False,
     "overlap": 0.3,
 }
 
 
-@pytest.mark.parametrize("options", [{"blocks": 4}, EACH_ALONE, {"blocks": 2, "kind": ExactCoordinator}])
+@pytest.mark.parametrize("options", [{"blocks": 4}, EACH_ALONE, {"blocks": 2, "kind": ExactTrainer}])
 def test_a_run_on_parts_that_stops_and_goes_on_is_the_run_that_did_not(
     tmp_path, views, photos, start, options
 ):

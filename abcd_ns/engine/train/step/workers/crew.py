@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.train.workers.helper_process import HelperProcess, Room
-from abcd_ns.engine.train.workers.share import Drawn, DrawShare, Part, Share, Task
-from abcd_ns.engine.train.workers.shared_memory import SharedRows
+from abcd_ns.engine.train.step.workers.helper_process import HelperProcess, Room
+from abcd_ns.engine.train.step.workers.share import Drawn, DrawShare, Part, Share, Task
+from abcd_ns.engine.train.step.workers.shared_memory import SharedRows
 from abcd_ns.engine.types import Gaussians
 
 GROWTH, SPARE = 4, 4096

@@ -1,6 +1,7 @@
 """What one step of training is given, and what it draws."""
 
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.cutouts import random_part
+from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, View
 
@@ -70,6 +71,16 @@ class Batch:
 
     step: int
     samples: tuple[Sample, ...]
+
+    def losses(
+        self,
+        pictures: Sequence[Float[Tensor, "_h _w 3"]],
+        photos: Sequence[Float[Tensor, "_h _w 3"]],
+        config: TrainingConfig,
+    ) -> list[Float[Tensor, ""]]:
+        """Of each sample."""
+        triples = zip(self.samples, pictures, photos, strict=True)
+        return [sample.loss(picture, photo, config) for sample, picture, photo in triples]
 
 
 @dataclass(frozen=True)

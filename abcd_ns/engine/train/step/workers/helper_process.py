@@ -18,8 +18,8 @@ from typing import Any, NoReturn
 import torch
 
 from abcd_ns.engine.train.density.control import COUNTED
-from abcd_ns.engine.train.workers.share import DrawShare, Part, Task
-from abcd_ns.engine.train.workers.shared_memory import SharedRows
+from abcd_ns.engine.train.step.workers.share import DrawShare, Part, Task
+from abcd_ns.engine.train.step.workers.shared_memory import SharedRows
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
 PATIENCE = 600.0

@@ -1,0 +1,67 @@
+"""Where a visit's layers come from: the frozen blocks, drawn around the one that is to be trained."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from abcd_ns.engine.events import LayersDrawn
+from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
+from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.visit_layers import VisitLayers
+from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run_state import ActiveVisit
+
+
+@dataclass(frozen=True)
+class LayerRoom:
+    """Bytes that a visit may keep of layers."""
+
+    device: int = LAYER_BYTES
+    ram: int = 0
+    """For those that have no room on the device; see LayerStore."""
+
+    @property
+    def total(self) -> int:
+        """Both."""
+        return self.device + self.ram
+
+
+class LayerSource:
+    """Draws what is frozen around a block.
+
+    Args:
+        around: gives the scene that neighbours are drawn from; None for the run's own, as it is by then.
+    """
+
+    def __init__(
+        self, run: Run, room: LayerRoom | None = None, around: Callable[[], BlockScene] | None = None
+    ) -> None:
+        self._run, self.room = run, room or LayerRoom()
+        self._around = around or (lambda: run.scene)
+
+    def draw(self, active: ActiveVisit, views: Iterable[int]) -> VisitLayers | None:
+        """F and B of these views, or None where nothing is around the block; listeners hear of each."""
+        run, config = self._run, self._run.config
+        if active.is_alone or run.scene.tree.num_blocks == 1 or not config.layers:
+            return None
+        painter = Painter(
+            self._around(),
+            list(run.views.values()),
+            run.rasterizer,
+            ownership=config.ownership,
+            pass_gaussians=config.pass_gaussians or default_pass(run.scene),
+            device=run.device,
+        )
+        layers = VisitLayers(
+            painter,
+            LayerStore(run.device, self.room.device // active.crew, self.room.ram // active.crew),
+            active.geometry,
+            run.scene.at_rest(active.geometry.block),
+            run.views,
+            PaintSettings(active.sh_degree, config.antialiased),
+            window_weight=config.window_weight,
+        )
+        wanted = dict.fromkeys(views)
+        for done, _ in enumerate(layers.draw(wanted), start=1):
+            run.announce(LayersDrawn(active.number, done, len(wanted)))
+        return layers

@@ -1,0 +1,103 @@
+"""What all parts of a training share: options, the scene at rest, live parameters, where the run stands."""
+
+import torch
+
+from abcd_ns.engine.events import Announcer
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
+from abcd_ns.engine.render import Rasterizer
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density.control import DensityControl, for_blocks
+from abcd_ns.engine.train.health.health import Health
+from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
+from abcd_ns.engine.train.schedule import sh_degree_at
+from abcd_ns.engine.types import View
+
+
+class Run:
+    """One training run over a scene at rest, through the caller's live parameters and optimizers.
+
+    Args:
+        views: the training views; `View.index` names them.
+        params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
+            learning rates; that of the means is the one to decay from.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        budget: Budget,
+        scene: StoredScene,
+        views: list[View],
+        rasterizer: Rasterizer,
+        params: Params,
+        optimizers: Optimizers,
+        *,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.config, self.budget, self.scene = config, budget, scene
+        self.params, self.optimizers = params, optimizers
+        self.views = {view.index: view for view in views}  # on the CPU, whatever the device
+        self.rasterizer = rasterizer
+        self.device = torch.device(device)
+        self.announce = Announcer()
+        self.stopwatch = Stopwatch()
+        self.state = RunState()
+        heals = {"may_act": config.heal and config.layers, "may_drop": config.density.strategy == "default"}
+        self.health = Health(scene, params, optimizers, self.announce, **heals)
+        self.fit_density(scene.tree.num_blocks)
+
+    def fit_density(self, blocks: int) -> None:
+        """Density control for a scene of so many blocks."""
+        self.density = DensityControl(for_blocks(self.config.density, blocks))
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0..1."""
+        return self.budget.progress(self.state.step, self.stopwatch.seconds)
+
+    @property
+    def share(self) -> float:
+        """Share that is done, 0..1, of what schedules run over: the run, or a visit's own part of it."""
+        active = self.state.active
+        return self.progress if active is None else active.share(self.progress)
+
+    @property
+    def share_of_blocks(self) -> float:
+        """The same, the run's warm-up left out."""
+        return max(self.share - self.state.warm, 0.0) / (1 - self.state.warm)
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree of spherical harmonics in use."""
+        active = self.state.active
+        restarts = self.config.sh_restart and active is not None and not active.sole
+        share = active.done / active.steps if restarts else self.share
+        return sh_degree_at(share, self.config.sh_ramp, self.config.sh_degree)
+
+    @property
+    def active(self) -> ActiveVisit:
+        """The visit that is under way.
+
+        Raises:
+            RuntimeError: none is.
+        """
+        if self.state.active is None:
+            raise RuntimeError("no visit is under way: call next_batch first")
+        return self.state.active
+
+    def count(self) -> int:
+        """Gaussians in the whole scene, the live block included."""
+        return sum(self.scene.count(block) for block in range(self.scene.tree.num_blocks))
+
+    def rest(self, tree: BlockTree, updates: dict[int, BlockState], within: float) -> None:
+        """Put blocks and the run's state to rest, as one moment; on disk within so many seconds."""
+        self.state.seconds = self.stopwatch.seconds
+        self.scene.rest(tree, updates, self.state.to_json(), within)
+
+    def restore(self) -> None:
+        """Stand where the store's newest generation stands."""
+        self.state = RunState.from_json(self.scene.store.state)
+        self.stopwatch = Stopwatch(self.state.seconds)

@@ -1,0 +1,121 @@
+"""The block that is being trained: its way in and out of the optimizers, its growth, and its clocks."""
+
+import random
+from collections.abc import Sequence
+from dataclasses import replace
+
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.param_swap import attach, detach
+from abcd_ns.engine.store.settle import at_rest, count_at_rest
+from abcd_ns.engine.train.density.control import DensityClock, Infos, added
+from abcd_ns.engine.train.memory import check_room
+from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.splitting import is_full
+from abcd_ns.engine.train.step.workers.share import Part
+
+
+class LiveBlock:
+    """What is live in a run's parameters, with what density control has gathered of it."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self.growth: dict[str, Tensor] = {}
+        self.clocks = Clocks()
+
+    def __len__(self) -> int:
+        return len(self._run.params["means"])
+
+    def attach(self, active: ActiveVisit, batch: int) -> None:
+        """Make the block of a visit live, as it is at rest.
+
+        Args:
+            batch: views in a step.
+
+        Raises:
+            OutOfRoomError: it does not fit on the device.
+        """
+        run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
+        check_room(count_at_rest(*which), run.config.sh_degree, run.device)
+        rest = at_rest(*which).to(run.device)
+        if active.done == 0 and not run.config.keep_moments:
+            rest = rest.forgetful()
+        attach(rest, run.params, run.optimizers, batch=batch)
+        run.health.begin_visit(active, run.state.health)
+        self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
+        if active.done == 0 and not active.is_whole:
+            self._hold_back_giants()
+
+    def detached(self) -> BlockState:
+        """The live block, on the CPU; it stays live."""
+        return detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
+
+    def count_step(self, views: int, taken: int) -> None:
+        """The optimizers have stepped.
+
+        Args:
+            views: that the step was made for.
+            taken: that count for density control, which leaves the warm-up alone.
+        """
+        clocks = self.clocks
+        self.clocks = replace(clocks, adam_views=clocks.adam_views + views, steps=clocks.steps + taken)
+
+    def count_visit(self) -> None:
+        """A visit has ended."""
+        self.clocks = replace(self.clocks, visits=self.clocks.visits + 1)
+
+    def refine(self, infos: Infos, clock: DensityClock, parts: Sequence[Part] = ()) -> None:
+        """Grow and prune, where it is time for that.
+
+        Args:
+            infos: of the step's drawings; none where its gradients were no numbers.
+            parts: what helpers have counted.
+        """
+        run = self._run
+        for part in parts:
+            self.growth = added(self.growth, part.counts)
+        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock)
+        if run.density.resets(clock):
+            self.clocks = replace(self.clocks, resets=clock.steps // run.config.density.reset_every)
+        if run.density.refines(clock, infos):
+            self.clocks = replace(self.clocks, refined=clock.steps)
+            self._hold_back_giants()
+
+    def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
+        """All that decides whether to refine after a step.
+
+        Args:
+            taken: the step's views.
+            batch: views in each step.
+            room: Gaussians that may be added.
+        """
+        run, active = self._run, self._run.active
+        views = run.state.views.get(active.geometry.block, len(active.geometry.views))
+        blocks = run.scene.tree.num_blocks
+        among_others = blocks > 1 and run.config.overlap == 0
+        if blocks > 1:
+            views = min(views, active.steps * batch)  # once a visit, even with thousands of photos
+        return DensityClock(
+            progress=run.share_of_blocks,
+            steps=self.clocks.steps,
+            taken=taken,
+            views=views,
+            room=room,
+            seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
+            refined=self.clocks.refined if among_others else None,
+            resets=self.clocks.resets if among_others else None,
+            spent=active.done / active.steps if among_others else 0.0,
+        )
+
+    @property
+    def has_outgrown(self) -> bool:
+        """Whether the one block of the scene has just grown to where it must be cut."""
+        limits = self._run.config.block_limit, self._run.config.sole_limit
+        grown = self._run.active.sole and self.clocks.refined == self.clocks.steps
+        return grown and is_full(len(self), 1, *limits)
+
+    def _hold_back_giants(self) -> None:
+        if self._run.health.acts:
+            self._run.health.hold_back_giants(self._run.views.values())

@@ -1,0 +1,128 @@
+"""What the caller of a training deals with, however blocks are trained.
+
+The optimisation loop belongs to the caller (nerfstudio's trainer, or `training_loop`): it asks for a batch,
+renders it, takes the gradient of its loss, steps its optimizers, and reports back.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.train.density.control import DensityControl
+from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run_state import RunState, Stopwatch
+from abcd_ns.engine.train.step.batch import Batch, Rendered
+
+
+class Trainer(ABC):
+    """Trains a scene step by step, and tells its listeners what happens."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self.config, self.scene, self.views = run.config, run.scene, run.views
+        self.params, self.optimizers, self.device = run.params, run.optimizers, run.device
+        self.announce, self.health = run.announce, run.health
+
+    # -- a step --------------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def batch(self) -> int:
+        """Views in a step, as things stand."""
+
+    @abstractmethod
+    def next_batch(self) -> Batch:
+        """Set the learning rates, and say what to train on next."""
+
+    @abstractmethod
+    def render(self, batch: Batch) -> Rendered:
+        """The pictures of a batch, with gradients."""
+
+    @abstractmethod
+    def loss(
+        self,
+        batch: Batch,
+        pictures: Sequence[Float[Tensor, "_h _w 3"]],
+        photos: Sequence[Float[Tensor, "_h _w 3"]],
+    ) -> Float[Tensor, ""]:
+        """The loss of a step."""
+
+    @abstractmethod
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+        """Call after the optimizers stepped.
+
+        Args:
+            psnrs: of each picture, dB; listeners are told their mean.
+        """
+
+    # -- where it stands -----------------------------------------------------------------------------
+
+    @property
+    def state(self) -> RunState:
+        """All that is known of the run besides the blocks."""
+        return self.run.state
+
+    @property
+    def stopwatch(self) -> Stopwatch:
+        """Seconds of training."""
+        return self.run.stopwatch
+
+    @property
+    def density(self) -> DensityControl:
+        """What grows and prunes."""
+        return self.run.density
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0..1."""
+        return self.run.progress
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is used up."""
+        return self.progress >= 1.0
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree of spherical harmonics in use."""
+        return self.run.sh_degree
+
+    @property
+    def layer_limit(self) -> int:
+        """Bytes that layers may take, on the device and in RAM."""
+        return 0
+
+    @property
+    def layer_bytes(self) -> int:
+        """Bytes that layers take."""
+        return 0
+
+    def count(self) -> int:
+        """Gaussians in the whole scene, what is live included."""
+        return self.run.count()
+
+    # -- at rest -------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def rest(self, within: float) -> None:
+        """Put what is live to rest, and the run's state; on disk within so many seconds."""
+
+    def save(self, pin: str | None = None) -> None:
+        """Commit everything, what is live included.
+
+        Args:
+            pin: keep this state under a name until it is unpinned.
+        """
+        self.rest(0.0)
+        if pin is not None:
+            self.scene.store.pin(pin)
+
+    @abstractmethod
+    def restore(self) -> None:
+        """Go on from the store's newest generation: where `save` was called, or something was put to rest."""
+
+    def close(self) -> None:
+        """Write what waits to be written, and let go of the store, as `StoredScene.close`."""
+        self.scene.close()
