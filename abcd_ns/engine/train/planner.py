@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -36,6 +36,7 @@ class NothingSeenError(UserError, RuntimeError):
     """There is nothing to train: no view sees any Gaussian, or none is left."""
 
 
+@runtime_checkable
 class Visits(Protocol):
     """Decides which block is trained when, and on what terms."""
 
