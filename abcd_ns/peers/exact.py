@@ -205,7 +205,7 @@ class ExactCoordinator(Coordinator):
         owner, slack = self._owner_of_all(), self._optics.slack(everything.means)
         for block in range(tree.num_blocks):
             inside = owner == block
-            if self.config.ownership == "fragments":
+            if self.config.recipe.ownership == "fragments":
                 inside = inside | reaches(everything, tree.cell(block), slack, self._optics.slant)
             rows = inside.nonzero()[:, 0]
             if len(rows):
@@ -214,7 +214,7 @@ class ExactCoordinator(Coordinator):
     def _draw(self, block: int, gaussians: Gaussians, place: int) -> Raster:
         sample = self._batch.samples[place]
         window = None
-        if self.config.ownership == "fragments":
+        if self.config.recipe.ownership == "fragments":
             grid = self._rasterizer.window_grid(sample.crop)
             window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)

@@ -130,10 +130,10 @@ class Surfaces:
 
 
 class IndependentCoordinator(Coordinator):
-    """Trains each block in one visit, alone; options as for `Coordinator`, with `training.overlap` > 0."""
+    """Trains each block in one visit, alone; options as for `Coordinator`, with `recipe.overlap` > 0."""
 
     def __init__(self, config: TrainingConfig, *args: Any, **kwargs: Any) -> None:
-        super().__init__(replace(config, migrate=False), *args, **kwargs)
+        super().__init__(replace(config, recipe=replace(config.recipe, migrate=False)), *args, **kwargs)
         self._surfaces: Surfaces | None = None
         self._regions: dict[int, Region] = {}
         self._crops: dict[int, Crop] = {}
@@ -142,7 +142,7 @@ class IndependentCoordinator(Coordinator):
     @property
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use: by the share of the visit that is done."""
-        return sh_degree_at(self.share, self.config.sh_ramp, self.config.sh_degree)
+        return sh_degree_at(self.share, self.config.recipe.sh_ramp, self.config.sh_degree)
 
     @property
     def share(self) -> float:
@@ -258,7 +258,7 @@ class IndependentCoordinator(Coordinator):
 
     def _box(self, block: int) -> Box:
         means = initial_gaussians(self.scene, block).means
-        return enlarged(self.scene.tree.cell(block), means, self.config.overlap)
+        return enlarged(self.scene.tree.cell(block), means, self.config.recipe.overlap)
 
     def _joined(self, block: int) -> BlockState:
         """The block as it begins, with what of the others lies in its enlarged cell."""

@@ -37,7 +37,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
     with ParameterStore.open(stopped.base_dir / "abcd/store", read_only=True) as store:
         assert {name: store.header[name] for name in ROOM.options} == ROOM.options
     resumed = run(configure(data, tmp_path / "again", blocks=0, steps=STEPS, load_dir=stopped.base_dir))
-    assert resumed.pipeline.coordinator.config.crop_pixels == 600
+    assert resumed.pipeline.coordinator.config.limits.crop_pixels == 600
     assert resumed.pipeline.coordinator.batch == 2
     assert len(crops) > STEPS
     assert max(crop.pixels for crop in crops) <= 600
@@ -47,6 +47,6 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
 
 def test_an_explicit_crop_is_kept_where_blocks_are_given(data, tmp_path):
     config = configure(data, tmp_path, steps=4)
-    config.pipeline.training.crop_pixels, config.pipeline.training.batch = 700, 1
+    config.pipeline.training.limits.crop_pixels, config.pipeline.training.batch = 700, 1
     coordinator = run(config).pipeline.coordinator
-    assert (coordinator.config.crop_pixels, coordinator.batch) == (700, 1)
+    assert (coordinator.config.limits.crop_pixels, coordinator.batch) == (700, 1)

@@ -25,7 +25,7 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module", params=["fragments", "means"])
 def trained(request, data, tmp_path_factory) -> AbcdTrainer:
     config = configure(data, tmp_path_factory.mktemp("out"), steps=12)
-    config.pipeline.training.ownership = config.pipeline.model.ownership = request.param
+    config.pipeline.training.recipe.ownership = config.pipeline.model.ownership = request.param
     return run(config)
 
 

@@ -225,7 +225,7 @@ def test_other_options_than_the_stores_are_refused_and_both_are_shown(data, stop
     said = refusal(config, capsys)
     assert "it was made for sh degree 3, not 1" in said
     other = configure(data, tmp_path / "b", load_dir=stopped)
-    other.pipeline.training.exact = True
+    other.pipeline.training.recipe.exact = True
     assert "blocks are trained in turn, not jointly" in refusal(other, capsys)
 
 

@@ -94,9 +94,9 @@ class Coordinator(StepDrawing):
         self._layer_room = layer_bytes, layer_ram_bytes
         self._rasterizer = rasterizer
         self._planner = Planner(config, budget, scene, self.views, rasterizer, device=self.device)
-        self._pace = Pace(optimizers, config.batch_power)
-        heals = {"may_act": config.heal and config.layers, "may_drop": config.density.strategy == "default"}
-        self.health = Health(scene, params, optimizers, self.announce, **heals)
+        self._pace = Pace(optimizers, config.recipe.batch_power)
+        acts, drops = config.heal and config.recipe.layers, config.density.strategy == "default"
+        self.health = Health(scene, params, optimizers, self.announce, may_act=acts, may_drop=drops)
         self._backgrounds = Backgrounds(config, self.device)
         self._growth: dict[str, Tensor] = {}
         self._clocks = Clocks()
@@ -109,8 +109,8 @@ class Coordinator(StepDrawing):
     def batch(self) -> int:
         """Views in a step of the visit that is under way."""
         if self.state.active is not None and self.state.active.is_whole:
-            return views_per_warm_up_step(self.config.batch, self.config.batch_limit)
-        return views_per_step(self.config.batch, self.scene.tree.num_blocks, self.config.batch_limit)
+            return views_per_warm_up_step(self.config.batch, self.config.limits.batch_limit)
+        return views_per_step(self.config.batch, self.scene.tree.num_blocks, self.config.limits.batch_limit)
 
     def _density_control(self) -> DensityControl:
         return DensityControl(for_blocks(self.config.density, self.scene.tree.num_blocks))
@@ -178,7 +178,7 @@ class Coordinator(StepDrawing):
 
     def _has_outgrown(self, active: ActiveVisit) -> bool:
         """Whether the one block of the scene has just grown to where it must be cut."""
-        limits = self.config.block_limit, self.config.sole_limit
+        limits = self.config.limits.block_limit, self.config.limits.sole_limit
         grown = active.sole and self._clocks.refined == self._clocks.steps
         return grown and is_full(len(self.params["means"]), 1, *limits)
 
@@ -207,7 +207,7 @@ class Coordinator(StepDrawing):
         active = self._active
         views = self.state.views.get(active.geometry.block, len(active.geometry.views))
         blocks = self.scene.tree.num_blocks
-        among_others = blocks > 1 and self.config.overlap == 0
+        among_others = blocks > 1 and self.config.recipe.overlap == 0
         if blocks > 1:
             views = min(views, active.steps * self.batch)  # once a visit, even with thousands of photos
         return DensityClock(
@@ -242,9 +242,9 @@ class Coordinator(StepDrawing):
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use."""
         active = self.state.active
-        restarts = self.config.sh_restart and active is not None and not active.sole
+        restarts = self.config.recipe.sh_restart and active is not None and not active.sole
         share = active.done / active.steps if restarts else self.progress
-        return sh_degree_at(share, self.config.sh_ramp, self.config.sh_degree)
+        return sh_degree_at(share, self.config.recipe.sh_ramp, self.config.sh_degree)
 
     def save(self, pin: str | None = None) -> None:
         """Commit everything, the live block in the middle of its visit included.
@@ -300,7 +300,7 @@ class Coordinator(StepDrawing):
         which = (self.scene, active.geometry.block, active.saved)
         check_room(count_at_rest(*which), self.config.sh_degree, self.device)
         rest = at_rest(*which).to(self.device)
-        if active.done == 0 and not self.config.keep_moments:
+        if active.done == 0 and not self.config.recipe.keep_moments:
             rest = rest.forgetful()
         attach(rest, self.params, self.optimizers, batch=self.batch)
         self.health.begin_visit(active, self.state.health)
@@ -331,14 +331,14 @@ class Coordinator(StepDrawing):
         return self.scene
 
     def _draw_layers(self, active: ActiveVisit, order: tuple[int, ...]) -> VisitLayers | None:
-        if active.is_alone or self.scene.tree.num_blocks == 1 or not self.config.layers:
+        if active.is_alone or self.scene.tree.num_blocks == 1 or not self.config.recipe.layers:
             return None
         painter = Painter(
             self._surroundings(),
             list(self.views.values()),
             self._rasterizer,
-            ownership=self.config.ownership,
-            pass_gaussians=self.config.pass_gaussians or default_pass(self.scene),
+            ownership=self.config.recipe.ownership,
+            pass_gaussians=self.config.limits.pass_gaussians or default_pass(self.scene),
             device=self.device,
         )
         layers = VisitLayers(
@@ -366,8 +366,8 @@ class Coordinator(StepDrawing):
             live, views = live_gaussians(self.params).detach(), self.views.values()
             owner, options = self.scene.tree.assign(live.means), {"antialiased": self.config.antialiased}
             self.state.influence = influence(live, owner, views, self._rasterizer, **options)
-        updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
-        limits = self.config.block_limit, self.config.sole_limit
+        updates = settle(self.scene, active.geometry.block, state, self.config.recipe.migrate)
+        limits = self.config.limits.block_limit, self.config.limits.sole_limit
         tree, updates = cut_full(self.scene, updates, self.state, *limits, self.announce)
         split = tree is not self.scene.tree
         if active.saved:

@@ -108,7 +108,7 @@ class StepDrawing(ABC):
     @property
     def _degree_drawn(self) -> int:
         """The degree of spherical harmonics in this step."""
-        changes = self._active.is_alone or self.config.sh_restart
+        changes = self._active.is_alone or self.config.recipe.sh_restart
         return self.sh_degree if changes else self._active.sh_degree
 
     def render(self, batch: Batch) -> Rendered:
@@ -162,7 +162,7 @@ class StepDrawing(ABC):
     # -- helpers -------------------------------------------------------------------------------------
 
     def _size_of_crew(self, active: ActiveVisit) -> int:
-        if self._target is None or self.config.overlap > 0:  # there each pixel counts in a way of its own
+        if self._target is None or self.config.recipe.overlap > 0:  # there pixels count in their own way
             return 1
         threads = torch.get_num_threads() if can_fork(self.device) else 1
         return size_of_crew(self.config.processes or threads, self.batch, len(active.views))
