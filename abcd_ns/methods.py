@@ -5,21 +5,24 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.config import AbcdPipelineConfig, AbcdTrainerConfig, FusedAdamConfig
 from abcd_ns.viewer.rules import THIS_MACHINE
 
 PAPER = TrainingConfig(
-    ownership="means",
+    recipe=Recipe(
+        ownership="means",
+        visit_steps=5000,
+        keep_moments=False,
+        sh_restart=True,
+        migrate=False,
+        pixel_loss="l2",
+    ),
     warmup=0.0,
     batch=1,
     visit_views=10**6,
-    visit_steps=5000,
-    keep_moments=False,
-    sh_restart=True,
-    migrate=False,
     heal=False,
     ssim_lambda=0.0,
-    pixel_loss="l2",
 )
 """What Shiu and Subr 2026 did, as far as it is published; docs/method.md says where it is not."""
 
@@ -58,7 +61,9 @@ abcd = MethodSpecification(
     description="ABCD: Gaussian Splatting block by block, each within alpha-composited frozen layers.",
 )
 abcd_ablated = MethodSpecification(
-    config=_quiet(_trainer("abcd-ablated", blocks=PEER_BLOCKS, training=TrainingConfig(layers=False))),
+    config=_quiet(
+        _trainer("abcd-ablated", blocks=PEER_BLOCKS, training=TrainingConfig(recipe=Recipe(layers=False)))
+    ),
     description="ABCD without its layers: each block alone against the photos (the paper's ablation).",
 )
 abcd_partition = MethodSpecification(
@@ -66,14 +71,16 @@ abcd_partition = MethodSpecification(
         _trainer(
             "abcd-partition",
             blocks=PEER_BLOCKS,
-            training=TrainingConfig(layers=False, warmup=0.0, overlap=0.2),
+            training=TrainingConfig(recipe=Recipe(layers=False, overlap=0.2), warmup=0.0),
         )
     ),
     description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
 )
 abcd_exact = MethodSpecification(
     config=_quiet(
-        _trainer("abcd-exact", blocks=PEER_BLOCKS, training=TrainingConfig(exact=True, warmup=0.0))
+        _trainer(
+            "abcd-exact", blocks=PEER_BLOCKS, training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0)
+        )
     ),
     description="Exact joint training over blocks, one on the device at a time: slow, the reference.",
 )

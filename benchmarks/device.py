@@ -45,9 +45,7 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 from tests.reference.simulated_device import DEVICE, simulated_device
 
 ROOT = Path(__file__).resolve().parent.parent
-GROWS = DensityConfig(
-    refine_start=0.0, refine_stop=1.0, warmup_passes=1, refine_every=4, densify_grad_thresh=2e-4
-)
+GROWS = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=4, densify_grad_thresh=2e-4)
 """Refines often, so that steps that do are among those counted."""
 MOST_PLACES = 12
 
@@ -192,7 +190,7 @@ def run(args: Args, blocks: int, folder: Path) -> dict[str, Any]:
         visits = max(coordinator.state.visit, 1)
         found = summary(watch, visits)
         found |= {"gaussians": coordinator.count(), "views_in_a_step": coordinator.batch}
-        found |= {"peak_bytes": counts.peak_bytes, "ownership": coordinator.config.ownership}
+        found |= {"peak_bytes": counts.peak_bytes, "ownership": coordinator.config.recipe.ownership}
         coordinator.close()
     return {"blocks": blocks, **found, "host_seconds": round(time.perf_counter() - began, 1)}
 

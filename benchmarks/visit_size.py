@@ -33,6 +33,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import passes_for_layers
@@ -74,10 +75,9 @@ def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], 
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     store.commit(blocks_at_rest(tree, gaussians))
     config = TrainingConfig(
+        recipe=Recipe(sh_ramp=0.0, visit_steps=args.steps),
         warmup=0.0,
         processes=1,
-        sh_ramp=0.0,
-        visit_steps=args.steps,
         visit_views=args.views,
         commit_seconds=0.0 if args.commits else 1e9,
         density=DensityConfig(strategy="off"),

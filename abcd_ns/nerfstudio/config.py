@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -17,6 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser, AbcdDataParserConfig
@@ -30,6 +32,9 @@ MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
 """Splatfacto's model options that nerfstudio's tools read; `AbcdModelConfig.mirror` sets them."""
 HONOURED = {"random_init", "num_random", "random_scale", "loss_coefficients", "prompt", "enable_collider"}
 """Those that ABCD obeys as they are."""
+# What makes a method and what memory decides stand in config.yml, and are no flags of `ns-train`.
+for _not_offered in (Recipe, Limits):
+    tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
 
 
 @dataclass
@@ -53,8 +58,8 @@ class AbcdModelConfig(SplatfactoModelConfig):
     render: Literal["merged", "composited"] = "merged"
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 
-    ownership: Literal["fragments", "means"] = "fragments"
-    """What a layer holds in composited pictures; taken over from the training options."""
+    ownership: tyro.conf.Fixed[Literal["fragments", "means"]] = "fragments"
+    """What a layer holds in composited pictures; taken over from the method's recipe."""
 
     def mirror(self, training: TrainingConfig) -> None:
         """Take over what nerfstudio's tools read from the model's options.
@@ -77,52 +82,13 @@ class AbcdModelConfig(SplatfactoModelConfig):
             "ssim_lambda": ("ssim_lambda", training.ssim_lambda),
             "rasterize_mode": ("antialiased", "antialiased" if training.antialiased else "classic"),
             "background_color": ("background", training.background),
-            "ownership": ("ownership", training.ownership),
+            "ownership": ("recipe.ownership", training.recipe.ownership),
         }
         for name, (source, value) in mirrored.items():
             if getattr(self, name) not in (value, getattr(type(self)(), name)):
                 flags = (f"--pipeline.model.{name}".replace("_", "-"), source.replace("_", "-"))
                 raise UserError(f"{flags[0]} has no effect here; set --pipeline.training.{flags[1]} instead.")
             setattr(self, name, value)
-
-
-def check_training(training: TrainingConfig) -> None:
-    """Look for options that contradict each other.
-
-    Raises:
-        UserError: two do, or one is out of range.
-    """
-    if not 0 <= training.warmup < 1:
-        raise UserError(f"--pipeline.training.warmup must be from 0 to below 1, not {training.warmup}.")
-    if training.scaffold_passes < 0:
-        raise UserError(
-            f"--pipeline.training.scaffold-passes must be 0 or more, not {training.scaffold_passes}."
-        )
-    if training.scaffold_gaussians < 0:
-        raise UserError(
-            f"--pipeline.training.scaffold-gaussians must be 0 or more, not {training.scaffold_gaussians}."
-        )
-    if training.crop_pixels < 0:
-        raise UserError(f"--pipeline.training.crop-pixels must be 0 or more, not {training.crop_pixels}.")
-    if not 0 <= training.batch_power <= 1:
-        raise UserError(f"--pipeline.training.batch-power must be from 0 to 1, not {training.batch_power}.")
-    if not training.influence_share > 0:
-        raise UserError(
-            f"--pipeline.training.influence-share must be above 0, not {training.influence_share}."
-        )
-    if not 0 <= training.window_weight < 1:
-        raise UserError(
-            f"--pipeline.training.window-weight must be from 0 to below 1, not {training.window_weight}."
-        )
-    if training.overlap < 0:
-        raise UserError(f"--pipeline.training.overlap must be 0 or more, not {training.overlap}.")
-    if training.overlap > 0 and training.exact:
-        raise UserError("--pipeline.training.overlap and exact exclude each other: choose one.")
-    if training.overlap > 0 and training.layers:
-        raise UserError(
-            "--pipeline.training.overlap is for blocks that are trained without layers: set "
-            "--pipeline.training.layers False."
-        )
 
 
 @dataclass
@@ -222,7 +188,7 @@ class AbcdTrainerConfig(TrainerConfig):
                 )
             if self.is_viewer_legacy_enabled():
                 raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
-            check_training(self.pipeline.training)
+            self.pipeline.training.check()
             if self.mixed_precision:
                 raise UserError("ABCD trains in float32; leave out --mixed-precision.")
             self.pipeline.model.mirror(self.pipeline.training)

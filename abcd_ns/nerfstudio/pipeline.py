@@ -137,10 +137,11 @@ class AbcdPipeline(VanillaPipeline):
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(folder / STORE, trainer, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
-        training = replace(config.training, **self._fitted(store, resumed), processes=self._processes())
+        limits = replace(config.training.limits, **self._fitted(store, resumed))
+        training = replace(config.training, limits=limits, processes=self._processes())
         if resumed:
             state = RunState.from_json(store.state)
-            cut_at_rest(scene, state, training.block_limit, training.sole_limit)
+            cut_at_rest(scene, state, training.limits.block_limit, training.limits.sole_limit)
         run = Run(
             training,
             Budget(trainer.total_steps, config.max_seconds),
@@ -158,9 +159,9 @@ class AbcdPipeline(VanillaPipeline):
 
     def _trainer_of(self, run: Run) -> Trainer:
         """Who trains by the run's options."""
-        if run.config.exact:
+        if run.config.recipe.exact:
             return ExactTrainer(run)
-        if run.config.overlap > 0:
+        if run.config.recipe.overlap > 0:
             return independent_trainer(run)
         source = LayerSource(run, self._room_for_layers())
         return Coordinator(run, source=source, target=self._target)
@@ -192,11 +193,11 @@ class AbcdPipeline(VanillaPipeline):
         return photo, self.datamanager.mask(*shot)
 
     def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
-        """The options that were fitted to the device: as the run began, unless it goes on with a budget of
+        """The limits that were fitted to the device: as the run began, unless it goes on with a budget of
         its own."""
         if resumed and self.config.blocks == 0 and self.config.device_budget_gb > 0:
             blocks = BlockTree.from_json(store.header["tree"]).num_blocks
-            return self._room(sum(map(store.counts, range(blocks))), blocks).options
+            return self._room(sum(map(store.counts, range(blocks))), blocks).limits
         return {name: store.header.get(name, 0) for name in FITTED}
 
     def _room(self, points: int, blocks: int = 1) -> Room:
@@ -220,12 +221,12 @@ class AbcdPipeline(VanillaPipeline):
         return int((cameras.width * cameras.height).max())
 
     def _first_cut(self, points: int) -> tuple[int, dict[str, int]]:
-        """The number of blocks to begin with, and the options that are fitted to the device, by name."""
+        """The number of blocks to begin with, and the limits that are fitted to the device, by name."""
         if self.config.blocks > 0:
-            return self.config.blocks, {name: getattr(self.config.training, name) for name in FITTED}
+            return self.config.blocks, {name: getattr(self.config.training.limits, name) for name in FITTED}
         room = self._room(points)
         CONSOLE.print(room.in_words(), highlight=False, soft_wrap=True)
-        return room.blocks, room.options
+        return room.blocks, room.limits
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""
@@ -254,12 +255,13 @@ class AbcdPipeline(VanillaPipeline):
         blocks, fitted = self._first_cut(len(gaussians))
         tree = cut_space(gaussians, blocks, self.config.partition)
         store = new_store(folder, {"tree": tree.to_json(), **fitted, **made_for.header()})
-        if training.overlap > 0:
+        if training.recipe.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))
             return store, False
-        warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.exact
+        warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.recipe.exact
         largest = fitted["block_limit"] or -(-len(gaussians) // tree.num_blocks)
-        keep = scaffold_size(replace(training, **fitted), largest, self._pixels) if warms_up else None
+        training = replace(training, limits=replace(training.limits, **fitted))
+        keep = scaffold_size(training, largest, self._pixels) if warms_up else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
 

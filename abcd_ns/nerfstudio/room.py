@@ -27,7 +27,7 @@ PICTURE_SHARE = 0.75
 LEAST_CROP = 250_000
 """Pixels: smaller parts of a view are mostly border."""
 FITTED = ("block_limit", "sole_limit", "batch_limit", "crop_pixels")
-"""The options of TrainingConfig that follow from the device's memory; a run keeps them."""
+"""The limits that follow from the device's memory; a run keeps them."""
 BUDGET_FLAG = "--pipeline.device-budget-gb"
 MOST_DOWNSCALE = 64
 """No larger factor is proposed."""
@@ -60,7 +60,7 @@ class Room:
         return max(self.blocks, _fewest(self.gaussians, self.limit, self.sole))
 
     @property
-    def options(self) -> dict[str, int]:
+    def limits(self) -> dict[str, int]:
         """What of it a run keeps to: FITTED, by name."""
         return dict(zip(FITTED, (self.limit, self.sole, self.batch, self.crop_pixels), strict=True))
 
@@ -165,15 +165,15 @@ def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
     """As many views in a step, and as much of them, as leave room for Gaussians."""
     training, left = demand.training, _needs(demand, 1, 0, levels_of(2)).left(budget)
     room = PICTURE_SHARE * left
-    views = list(_fewer(views_per_step(training.batch, 2, training.batch_limit)))
+    views = list(_fewer(views_per_step(training.batch, 2, training.limits.batch_limit)))
     if training.batch:
         views = views[:1]
     for batch in views:
-        if _needs(demand, batch, training.crop_pixels, levels=0).step_bytes <= room:
-            return batch, training.crop_pixels
+        if _needs(demand, batch, training.limits.crop_pixels, levels=0).step_bytes <= room:
+            return batch, training.limits.crop_pixels
     batch = views[-1]
     of_a_pixel = DeviceNeeds(1, batch).step_bytes
-    return batch, training.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
+    return batch, training.limits.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
 
 
 def _fewer(views: int) -> Iterator[int]:

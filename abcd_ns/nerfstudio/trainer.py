@@ -90,7 +90,7 @@ class AbcdTrainer(Trainer):
             raise
 
     def _memory_is_full(self) -> str:
-        limit = self.pipeline.coordinator.config.block_limit
+        limit = self.pipeline.coordinator.config.limits.block_limit
         room = f"blocks of {limit:,} Gaussians" if limit else f"{self.config.pipeline.blocks} blocks"
         return (
             f"The device's memory does not hold {room}. Nothing that a visit has finished is lost: go on "

@@ -83,7 +83,7 @@ class ExactTrainer(Trainer):
         super().__init__(run)
         run.fit_density(1)  # every block sees every step
         self._optics = Optics(list(self.views.values()), run.rasterizer.window_side)
-        self._pace = Pace(run.optimizers, run.config.batch_power)
+        self._pace = Pace(run.optimizers, run.config.recipe.batch_power)
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []
@@ -214,7 +214,7 @@ class ExactTrainer(Trainer):
         owner, slack = self._owner_of_all(), self._optics.slack(everything.means)
         for block in range(tree.num_blocks):
             inside = owner == block
-            if self.config.ownership == "fragments":
+            if self.config.recipe.ownership == "fragments":
                 inside = inside | reaches(everything, tree.cell(block), slack, self._optics.slant)
             rows = inside.nonzero()[:, 0]
             if len(rows):
@@ -223,7 +223,7 @@ class ExactTrainer(Trainer):
     def _draw(self, block: int, gaussians: Gaussians, place: int) -> Raster:
         sample = self._batch.samples[place]
         window = None
-        if self.config.ownership == "fragments":
+        if self.config.recipe.ownership == "fragments":
             grid = self.run.rasterizer.window_grid(sample.crop)
             window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)

@@ -227,7 +227,7 @@ class BlocksAlone:
 
     def _box(self, block: int) -> Box:
         means = initial_gaussians(self._scene, block).means
-        return enlarged(self._scene.tree.cell(block), means, self._run.config.overlap)
+        return enlarged(self._scene.tree.cell(block), means, self._run.config.recipe.overlap)
 
     def _joined(self, block: int) -> BlockState:
         """The block as it begins, with what of the others lies in its enlarged cell."""
@@ -238,7 +238,7 @@ class BlocksAlone:
 
 def independent_trainer(run: Run) -> Coordinator:
     """Trains each block in one visit, alone; `training.overlap` is above 0. No Gaussian migrates."""
-    run.config = replace(run.config, migrate=False)
+    run.config = replace(run.config, recipe=replace(run.config.recipe, migrate=False))
     return Coordinator(run, BlocksAlone(run))
 
 

@@ -158,7 +158,7 @@ class AbcdPanel(ViewerControl):
 
     def _where(self, active: ActiveVisit | None) -> str:
         if active is None:
-            return "All blocks at once" if self._coordinator.config.exact else "Between visits"
+            return "All blocks at once" if self._coordinator.config.recipe.exact else "Between visits"
         steps = f" of {active.steps}" if 0 < active.steps < UNLIMITED else ""
         step = self._layers or f"step {active.done}{steps}"
         if active.is_whole:
@@ -170,7 +170,7 @@ class AbcdPanel(ViewerControl):
         if self._coordinator is None:
             state = (Status.UNTRAINED, Status.DONE)
             return [BlockRow(b, state[scene.count(b) > 0], scene.count(b), None, None) for b in blocks]
-        if self._coordinator.config.exact:
+        if self._coordinator.config.recipe.exact:
             return [BlockRow(b, Status.ACTIVE, None, None, None) for b in blocks]
         active = self._coordinator.state.active
         whole = active is not None and active.is_whole

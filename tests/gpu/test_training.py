@@ -17,7 +17,7 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 
 pytestmark = pytest.mark.gpu
 STEPS = 20
-GROWING = {"refine_start": 0.0, "warmup_passes": 1, "refine_every": 5, "densify_grad_thresh": 2e-4}
+GROWING = {"refine_start": 0.0, "refine_every": 5, "densify_grad_thresh": 2e-4}
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.nerfstudio.room import GB, Room
 from tests.nerfstudio.crash_training import gaussians
@@ -35,9 +36,9 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
         stopped = run(configure(data, tmp_path / "stopped", blocks=0, steps=STEPS), stop_after=9)
     assert "a step draws 0.0006 megapixels of 2 views" in capsys.readouterr().out
     with ParameterStore.open(stopped.base_dir / "abcd/store", read_only=True) as store:
-        assert {name: store.header[name] for name in ROOM.options} == ROOM.options
+        assert {name: store.header[name] for name in ROOM.limits} == ROOM.limits
     resumed = run(configure(data, tmp_path / "again", blocks=0, steps=STEPS, load_dir=stopped.base_dir))
-    assert resumed.pipeline.coordinator.config.crop_pixels == 600
+    assert resumed.pipeline.coordinator.config.limits.crop_pixels == 600
     assert resumed.pipeline.coordinator.batch == 2
     assert len(crops) > STEPS
     assert max(crop.pixels for crop in crops) <= 600
@@ -47,6 +48,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
 
 def test_an_explicit_crop_is_kept_where_blocks_are_given(data, tmp_path):
     config = configure(data, tmp_path, steps=4)
-    config.pipeline.training.crop_pixels, config.pipeline.training.batch = 700, 1
+    training = config.pipeline.training
+    training.limits, training.batch = Limits(crop_pixels=700), 1
     coordinator = run(config).pipeline.coordinator
-    assert (coordinator.config.crop_pixels, coordinator.batch) == (700, 1)
+    assert (coordinator.config.limits.crop_pixels, coordinator.batch) == (700, 1)

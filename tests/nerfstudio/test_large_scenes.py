@@ -8,6 +8,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from abcd_ns import methods
 from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.trainer import AbcdTrainer
 from tests.nerfstudio.test_training import configure, run
@@ -25,7 +26,8 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module", params=["fragments", "means"])
 def trained(request, data, tmp_path_factory) -> AbcdTrainer:
     config = configure(data, tmp_path_factory.mktemp("out"), steps=12)
-    config.pipeline.training.ownership = config.pipeline.model.ownership = request.param
+    config.pipeline.training.recipe = Recipe(ownership=request.param)
+    config.pipeline.model.ownership = request.param
     return run(config)
 
 

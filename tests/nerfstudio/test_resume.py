@@ -12,6 +12,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from abcd_ns.engine.events import LayersDrawn, StepTaken
 from abcd_ns.engine.store import ParameterStore, crash_points
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run.run_folder import MadeFor
 from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
@@ -225,7 +226,7 @@ def test_other_options_than_the_stores_are_refused_and_both_are_shown(data, stop
     said = refusal(config, capsys)
     assert "it was made for sh degree 3, not 1" in said
     other = configure(data, tmp_path / "b", load_dir=stopped)
-    other.pipeline.training.exact = True
+    other.pipeline.training.recipe = Recipe(exact=True)
     assert "blocks are trained in turn, not jointly" in refusal(other, capsys)
 
 

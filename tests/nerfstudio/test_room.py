@@ -11,6 +11,7 @@ from abcd_ns.engine.train.schedule import WARM_UP_BATCH
 from abcd_ns.engine.train.splitting import FULL
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.room import FITTED, GB, LEAST_BLOCK, Demand, Room, device_budget, find_room
+from tests.reference.scenes import training_config
 
 TRAINING = TrainingConfig()
 PIXELS = 1297 * 840
@@ -21,7 +22,7 @@ POINTS = 140_000
 
 
 def room_for(gb: float, pixels: int, points: int = POINTS, most: int | None = None, **training) -> Room:
-    return find_room(int(gb * GB), Demand(pixels, points, TrainingConfig(**training), most=most))
+    return find_room(int(gb * GB), Demand(pixels, points, training_config(**training), most=most))
 
 
 def needs_of(room: Room, pixels: int, blocks: int) -> DeviceNeeds:
@@ -116,10 +117,10 @@ def test_what_is_set_is_kept():
     assert room_for(80, 2 * MP, batch_limit=2).batch == 2
 
 
-def test_what_a_run_keeps_are_options_of_training():
-    options = room_for(4, 12 * MP).options
-    assert tuple(options) == FITTED
-    fitted = dataclasses.replace(TRAINING, **options)
+def test_what_a_run_keeps_are_limits_of_training():
+    limits = room_for(4, 12 * MP).limits
+    assert tuple(limits) == FITTED
+    fitted = dataclasses.replace(TRAINING.limits, **limits)
     assert fitted.crop_pixels > 0
     assert fitted.batch_limit == 1
 
@@ -149,12 +150,12 @@ def test_the_warm_up_is_larger_than_a_block_and_smaller_than_a_sole_one():
 
 
 def test_the_warm_up_has_the_size_that_is_asked_for():
-    assert scaffold_size(TrainingConfig(scaffold_gaussians=500), 3_333, PIXELS) == 500
+    assert scaffold_size(training_config(scaffold_gaussians=500), 3_333, PIXELS) == 500
 
 
 @pytest.mark.parametrize("fitted", [{"batch": 1}, {"batch_limit": 1}, {"batch_limit": 1, "crop_pixels": 900}])
 def test_with_one_view_in_a_step_the_warm_up_is_no_larger_than_a_block(fitted):
-    assert scaffold_size(TrainingConfig(**fitted), 3_333, PIXELS) == 3_333
+    assert scaffold_size(training_config(**fitted), 3_333, PIXELS) == 3_333
 
 
 def test_a_scene_that_fits_is_one_block():

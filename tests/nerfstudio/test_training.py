@@ -16,6 +16,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.config import AbcdTrainerConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainer
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
@@ -234,13 +235,10 @@ def test_the_saved_config_is_the_config(trained):
         (lambda c: setattr(c.pipeline, "near_plane", -1.0), "--pipeline.near-plane"),
         (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
         (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),
-        (lambda c: setattr(c.pipeline.training, "scaffold_passes", -1), "training.scaffold-passes"),
-        (lambda c: setattr(c.pipeline.training, "scaffold_gaussians", -1), "training.scaffold-gaussians"),
-        (lambda c: setattr(c.pipeline.training, "batch_power", float("nan")), "training.batch-power"),
         (lambda c: setattr(c.pipeline.training, "influence_share", 0.0), "training.influence-share"),
         (lambda c: setattr(c.pipeline.training, "window_weight", 1.0), "training.window-weight"),
-        (lambda c: setattr(c.pipeline.training, "overlap", 0.2), "--pipeline.training.overlap"),
-        (lambda c: setattr(c.pipeline.training, "overlap", -0.2), "--pipeline.training.overlap"),
+        (lambda c: setattr(c.pipeline.training, "recipe", Recipe(overlap=0.2)), "recipe.overlap is 0.2"),
+        (lambda c: setattr(c.pipeline.training, "warmup", float("nan")), "--pipeline.training.warmup"),
         (lambda c: setattr(c.pipeline.datamanager, "data", Path("nowhere")), "nowhere"),
     ],
 )

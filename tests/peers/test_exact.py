@@ -15,7 +15,7 @@ from abcd_ns.peers.exact import ExactTrainer
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
 STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
 
 
 def exact(folder, start, views, **options) -> ExactTrainer:

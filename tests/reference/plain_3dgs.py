@@ -59,5 +59,5 @@ def train_plain(
 def _rows(views: list[View], steps: int, config: TrainingConfig):
     """(view, degree) of each step."""
     for taken in range(steps):
-        degree = sh_degree_at(taken / steps, config.sh_ramp, config.sh_degree)
+        degree = sh_degree_at(taken / steps, config.recipe.sh_ramp, config.sh_degree)
         yield endless_order(tuple(range(len(views))), taken, config.seed), degree

@@ -1,5 +1,6 @@
 """Small scenes for tests: Gaussians in a box, cameras around it, photos drawn from a known truth."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -18,6 +19,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.trainer import Trainer
@@ -107,6 +109,7 @@ def make_coordinator(
 
     Args:
         kind: makes another trainer of the run.
+        training: options of TrainingConfig, and of its recipe and limits, each by its own name.
     """
     if resume:
         store = ParameterStore.open(folder / "store")
@@ -115,7 +118,7 @@ def make_coordinator(
         tree = tree or build_kd(gaussians.means, blocks)
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
         store.commit(content(tree, gaussians, *([] if scaffold is None else [scaffold])))
-    config = TrainingConfig(sh_degree=gaussians.sh_degree, **training)
+    config = training_config(sh_degree=gaussians.sh_degree, **training)
     run = Run(
         config,
         Budget(steps=steps),
@@ -130,6 +133,15 @@ def make_coordinator(
     if resume:
         coordinator.restore()
     return coordinator
+
+
+def training_config(**options) -> TrainingConfig:
+    """Options of TrainingConfig, and of its recipe and limits, each by its own name."""
+    parts = {}
+    for name, kind in (("recipe", Recipe), ("limits", Limits)):
+        fields = {field.name for field in dataclasses.fields(kind)} & set(options)
+        parts[name] = kind(**{field: options.pop(field) for field in fields})
+    return TrainingConfig(**parts, **options)
 
 
 def whole_scene(coordinator: Coordinator) -> Gaussians:

@@ -17,7 +17,7 @@ from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from tests.reference.scenes import make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 
-OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "warmup_passes": 1, "refine_every": 3}
+OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "refine_every": 3}
 GROWING = DensityConfig(**OFTEN, densify_grad_thresh=2e-4, reset_every=6)
 MCMC = DensityConfig(**OFTEN, strategy="mcmc", max_gaussians=160)
 

@@ -17,7 +17,7 @@ from tests.simulated.test_coordinators import on_device
 
 LAVISH = 4.0
 STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_stop=1.0, warmup_passes=0, refine_every=2)
+GROWING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=2)
 
 
 def run_on(folder, *, gaussians: int, width: int, size: float = 0.02, **options):

@@ -24,6 +24,8 @@ ABOUT_THE_PLACE = {
 """Options that say where a run was made and kept, not how it was trained."""
 TAKEN_OVER = {f"pipeline.model.{name}" for name in (*MIRRORED, "ownership")}
 """Options that follow others."""
+NO_FLAGS = ("pipeline.training.recipe.", "pipeline.training.limits.")
+"""What these begin is no option of `ns-train`; the method sets it, or the device's memory."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ def changed_options(settings: Settings) -> list[Changed]:
 def training_command(settings: Settings) -> str:
     """The command line that trains the run again, an option a line."""
     words = [["ns-train", settings.method, "--data", settings.data]]
-    words += [changed.words for changed in changed_options(settings)]
+    words += [c.words for c in changed_options(settings) if not c.name.startswith(NO_FLAGS)]
     return " \\\n  ".join(map(shlex.join, words))
 
 

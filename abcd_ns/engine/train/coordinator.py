@@ -51,7 +51,7 @@ class Coordinator(Trainer):
         self.visits, self.source = visits or Planner(run), source or LayerSource(run)
         self.steps = StepDrawing(run, self.source, target)
         self.live = live or LiveBlock(run)
-        self._pace = Pace(run.optimizers, run.config.batch_power)
+        self._pace = Pace(run.optimizers, run.config.recipe.batch_power)
 
     # -- a step --------------------------------------------------------------------------------------
 
@@ -144,8 +144,8 @@ class Coordinator(Trainer):
         state = self.health.end_visit(active, self.live.detached)
         if active.is_whole:
             self._end_warm_up()
-        updates = settle(self.scene, active.geometry.block, state, self.config.migrate)
-        limits = self.config.block_limit, self.config.sole_limit
+        updates = settle(self.scene, active.geometry.block, state, self.config.recipe.migrate)
+        limits = self.config.limits.block_limit, self.config.limits.sole_limit
         tree, updates = cut_full(self.scene, updates, self.state, *limits, self.announce)
         if active.saved:
             updates[LIVE] = state.nobody

@@ -42,14 +42,14 @@ class LayerSource:
     def draw(self, active: ActiveVisit, views: Iterable[int]) -> VisitLayers | None:
         """F and B of these views, or None where nothing is around the block; listeners hear of each."""
         run, config = self._run, self._run.config
-        if active.is_alone or run.scene.tree.num_blocks == 1 or not config.layers:
+        if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
             return None
         painter = Painter(
             self._around(),
             list(run.views.values()),
             run.rasterizer,
-            ownership=config.ownership,
-            pass_gaussians=config.pass_gaussians or default_pass(run.scene),
+            ownership=config.recipe.ownership,
+            pass_gaussians=config.limits.pass_gaussians or default_pass(run.scene),
             device=run.device,
         )
         layers = VisitLayers(

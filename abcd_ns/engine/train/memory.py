@@ -117,13 +117,13 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
         pixels: of the largest image.
     """
     batches = (
-        views_per_step(config.batch, 2, config.batch_limit),
-        views_per_warm_up_step(config.batch, config.batch_limit),
+        views_per_step(config.batch, 2, config.limits.batch_limit),
+        views_per_warm_up_step(config.batch, config.limits.batch_limit),
     )
-    visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, config.crop_pixels) for n in batches)
+    visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, config.limits.crop_pixels) for n in batches)
     # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
     room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
-    return config.scaffold_gaussians or room // warm_up.gaussian_bytes
+    return config.limits.scaffold_gaussians or room // warm_up.gaussian_bytes
 
 
 def levels_of(blocks: int) -> int:

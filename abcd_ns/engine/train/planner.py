@@ -15,6 +15,7 @@ from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
+    SCAFFOLD_PASSES,
     VisitPlan,
     passes_for_layers,
     passes_of_sweep,
@@ -106,10 +107,8 @@ class Planner:
         crops = {index: view.full for index, view in self._views.items()}
         geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
-        if self._config.scaffold_passes:
-            uses = self._config.scaffold_passes * len(crops)
-            views = views_per_warm_up_step(self._config.batch, self._config.batch_limit)
-            taken = min(taken, math.ceil(uses / views))
+        views = views_per_warm_up_step(self._config.batch, self._config.limits.batch_limit)
+        taken = min(taken, math.ceil(SCAFFOLD_PASSES * len(crops) / views))
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
     def _next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
@@ -145,7 +144,7 @@ class Planner:
         return ActiveVisit(
             number=state.visit,
             geometry=geometry,
-            sh_degree=self._config.sh_degree if self._config.sh_restart else sh_degree,
+            sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
             steps=plan.steps,
             views=(*visit_views(kept, used, earlier, seed), *looked_at),
             looked_at=looked_at,
@@ -182,8 +181,8 @@ class Planner:
             state.trained = state.frozen = 0
             passes = passes_of_sweep(state.sweep, config.first_passes, last)
             used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
-            batch = views_per_step(config.batch, self._scene.tree.num_blocks, config.batch_limit)
-            steps = (passes / batch, remaining, config.seed, config.visit_steps)
+            batch = views_per_step(config.batch, self._scene.tree.num_blocks, config.limits.batch_limit)
+            steps = (passes / batch, remaining, config.seed, config.recipe.visit_steps)
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
                 raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")

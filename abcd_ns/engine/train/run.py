@@ -45,7 +45,10 @@ class Run:
         self.announce = Announcer()
         self.stopwatch = Stopwatch()
         self.state = RunState()
-        heals = {"may_act": config.heal and config.layers, "may_drop": config.density.strategy == "default"}
+        heals = {
+            "may_act": config.heal and config.recipe.layers,
+            "may_drop": config.density.strategy == "default",
+        }
         self.health = Health(scene, params, optimizers, self.announce, **heals)
         self.fit_density(scene.tree.num_blocks)
 
@@ -73,9 +76,9 @@ class Run:
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use."""
         active = self.state.active
-        restarts = self.config.sh_restart and active is not None and not active.sole
+        restarts = self.config.recipe.sh_restart and active is not None and not active.sole
         share = active.done / active.steps if restarts else self.share
-        return sh_degree_at(share, self.config.sh_ramp, self.config.sh_degree)
+        return sh_degree_at(share, self.config.recipe.sh_ramp, self.config.sh_degree)
 
     @property
     def active(self) -> ActiveVisit:

@@ -17,6 +17,8 @@ DEFAULT_BATCH = 4
 WARM_UP_BATCH = 2
 """Views in a step of the warm-up, at most: as many as the processors of a small machine, for more of them
 leave less room for Gaussians."""
+SCAFFOLD_PASSES = 24
+"""Uses of each view in the warm-up, at most: so few Gaussians soon are as good as they can be."""
 
 LAYER_SHARE = 0.1
 """Of a visit's time, for its layers, where visits are as long as they should be."""
@@ -89,7 +91,7 @@ def views_per_step(batch: int, blocks: int, limit: int = 0) -> int:
     """`TrainingConfig.batch`, its 0 resolved.
 
     Args:
-        limit: `TrainingConfig.batch_limit`.
+        limit: `Limits.batch_limit`.
     """
     return batch or (1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH))
 

@@ -1,6 +1,7 @@
 """nerfstudio's configuration of one job: as `ns-train` would have it, without viewer and evaluation."""
 
 import copy
+import dataclasses
 from pathlib import Path
 
 from nerfstudio.data.datamanagers.full_images_datamanager import (
@@ -91,7 +92,8 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
         pipeline.blocks = settings.blocks
     if job.method == "abcd-paper":
         # One visit to each cell; cells that no view sees leave their steps to the others.
-        pipeline.training.visit_steps = -(-settings.steps // settings.blocks)
+        training, steps = pipeline.training, -(-settings.steps // settings.blocks)
+        training.recipe = dataclasses.replace(training.recipe, visit_steps=steps)
     pipeline.max_seconds = settings.seconds
     pipeline.training.seed = job.seed
     pipeline.training.density.max_gaussians = settings.max_gaussians

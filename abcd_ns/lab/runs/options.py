@@ -120,7 +120,11 @@ _NOT_OF_TYPE = object()
 
 def _set(config: Any, path: str, value: Any) -> None:
     way, _, last = path.rpartition(".")
-    setattr(value_of(config, way) if way else config, last, value)
+    owner = value_of(config, way) if way else config
+    if type(owner).__dataclass_params__.frozen:
+        _set(config, way, dataclasses.replace(owner, **{last: value}))
+    else:
+        setattr(owner, last, value)
 
 
 def _leads_somewhere(config: Any, path: str) -> bool:

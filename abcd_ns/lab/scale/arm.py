@@ -17,6 +17,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import train_step
@@ -132,13 +133,13 @@ def make_store(land: Land, monolithic: bool, folder: Path) -> ParameterStore:
 def _coordinator(job: ArmJob, land: Land, store: ParameterStore, rasterizer, device) -> Coordinator:
     tree = build_kd(torch.zeros(0, 3), 1) if job.monolithic else land.tree()
     config = TrainingConfig(
+        recipe=Recipe(sh_ramp=0.0),
+        # As large blocks have it. Small ones may draw more at once, for speed, which small lands do not have.
+        limits=Limits(pass_gaussians=2 * job.gaussians_per_tile),
         seed=job.seed,
         warmup=0.0,
-        sh_ramp=0.0,
         background="black",
         density=DensityConfig(strategy="off"),  # or blocks would not be equal
-        # As large blocks have it. Small ones may draw more at once, for speed, which small lands do not have.
-        pass_gaussians=2 * job.gaussians_per_tile,
     )
     run = Run(
         config,

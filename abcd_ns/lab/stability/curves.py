@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.lab.stability.captures import PAIR, table, with_gains, with_noisy_poses
 from abcd_ns.lab.stability.freshness import BLOCKS, train_stale
 from abcd_ns.lab.stability.lab import Lab, Method, Stage
@@ -90,7 +91,7 @@ def _call(stage: Stage, method: Method, **options) -> Train:
 
 def _of_training(stage: Stage, one_block: Train) -> tuple[Study, ...]:
     blocks = [(m, k, _call(stage, m, blocks=k)) for m in WITH_BLOCKS for k in BLOCKS if k > 1]
-    visits = [("abcd", n, _call(stage, "abcd", visit_steps=n)) for n in VISIT_STEPS]
+    visits = [("abcd", n, _call(stage, "abcd", recipe=Recipe(visit_steps=n))) for n in VISIT_STEPS]
     damped = (("abcd", 1.0), ("abcd, damped by 1/2", 0.5))
     ages = [
         (name, age, partial(_stale, stage=stage, every=age, damping=share))

@@ -6,6 +6,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.health_record import standing
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.stability.lab import STILL, Lab, Stage, make_stage, merged
@@ -31,7 +32,13 @@ def nobody_left(lab: Lab) -> Finding:
     tree = build_kd(stage.start().means, 3)
     tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]]))), 2, 8.0)
     coordinator = lab.coordinator(
-        stage.start(), stage.views, budget=240, tree=tree, warmup=0.0, visit_steps=VISIT, batch=4
+        stage.start(),
+        stage.views,
+        budget=240,
+        tree=tree,
+        warmup=0.0,
+        recipe=Recipe(visit_steps=VISIT),
+        batch=4,
     )
     empty = int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]])))
     lab.finish(coordinator, stage, steps=VISIT)

@@ -26,9 +26,10 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import scaffold_size
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
-from abcd_ns.engine.train.schedule import views_per_step, views_per_warm_up_step
+from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step, views_per_warm_up_step
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.stability.world import TABLE, World, ring
@@ -161,7 +162,8 @@ class Lab:
             optimizers: parameters and their optimizers; new ones if left out.
             training: options of TrainingConfig.
         """
-        usual = {"sh_degree": start.sh_degree, "layers": method != "abcd-ablated", "seed": self.seed}
+        recipe = Recipe(layers=method != "abcd-ablated")
+        usual = {"recipe": recipe, "sh_degree": start.sh_degree, "seed": self.seed}
         options = {**usual, **training}
         tree = tree or build_kd(start.means, blocks)
         if method == "abcd-monolithic":
@@ -236,13 +238,15 @@ class Lab:
         return float(torch.stack(errors).mean())
 
 
-def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int) -> int:
-    """Steps that draw about so many views of `views`, in the warm-up and after it."""
+def steps_for(
+    drawn: int, config: TrainingConfig, blocks: int, views: int, passes: int = SCAFFOLD_PASSES
+) -> int:
+    """Steps that draw about so many views of `views`, in the warm-up, of `passes` at most, and after it."""
     batch, batch_warm = views_per_step(config.batch, blocks), views_per_warm_up_step(config.batch)
     warmup = config.warmup if blocks > 1 else 0.0
     steps = drawn / (warmup * batch_warm + (1 - warmup) * batch)
-    longest = config.scaffold_passes * views / batch_warm
-    if 0 < longest < warmup * steps:
+    longest = passes * views / batch_warm
+    if longest < warmup * steps:
         steps = longest + (drawn - longest * batch_warm) / batch
     return max(round(steps), 1)
 

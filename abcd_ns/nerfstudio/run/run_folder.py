@@ -52,7 +52,8 @@ class MadeFor:
         for photo, view in zip(photos, views, strict=True):
             digest.update(f"{photo.name} {view.width} {view.height}\n".encode("utf-8", "surrogateescape"))
         x, y, z = (round(value, 3) for value in views[0].center.tolist())
-        how = "jointly" if training.exact else "each alone" if training.overlap > 0 else "in turn"
+        recipe = training.recipe
+        how = "jointly" if recipe.exact else "each alone" if recipe.overlap > 0 else "in turn"
         return MadeFor(digest.hexdigest(), (x, y, z), how, training.sh_degree)
 
     def check(self, store: ParameterStore) -> None:

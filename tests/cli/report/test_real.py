@@ -66,7 +66,7 @@ def test_the_model_that_is_drawn_is_the_one_that_was_trained(trained):
     assert torch.equal(pipeline.model.merged().means, saved["_model.gauss_params.means"])
     assert pipeline.config.blocks == 3
     options = opened.settings.options
-    assert options["pipeline.training.layers"] is True
+    assert options["pipeline.training.recipe.layers"] is True
     assert options["pipeline.max_seconds"] is None
     assert (options["pipeline.blocks"], type(options["pipeline.blocks"])) == (3, int)
     assert mean_psnr(pipeline) > 14

@@ -160,11 +160,12 @@ def test_density_controls_clock_starts_when_the_warm_up_is_over(tmp_path, views,
     assert found == pytest.approx([(step + 1) / 20 for step in range(20)])
 
 
-@pytest.mark.parametrize(("passes", "expected"), [(1, 3), (2, 5), (0, 25)])
+@pytest.mark.parametrize(("passes", "expected"), [(1, 3), (2, 5), (24, 25)])
 def test_the_warm_up_ends_when_each_view_was_used_often_enough(
-    tmp_path, views, photos, start, passes, expected
+    tmp_path, views, photos, start, monkeypatch, passes, expected
 ):
     """Growing begins then, and not only when the share of the run is over that it might have taken."""
+    monkeypatch.setattr("abcd_ns.engine.train.planner.SCAFFOLD_PASSES", passes)
     coordinator = make_coordinator(
         tmp_path,
         start,
@@ -173,7 +174,6 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
         steps=10 * len(views),
         scaffold=30,
         warmup=0.5,
-        scaffold_passes=passes,
         density=STILL,
     )
     ended = []

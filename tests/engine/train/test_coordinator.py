@@ -19,7 +19,7 @@ from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views, whole_scene
 
-GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=2e-4)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
 
 
 def equal(a: Gaussians, b: Gaussians) -> bool:

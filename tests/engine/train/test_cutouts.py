@@ -17,7 +17,7 @@ from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Crop, Layer
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
-from tests.reference.scenes import make_coordinator, ring_of_views, whole_scene
+from tests.reference.scenes import make_coordinator, ring_of_views, training_config, whole_scene
 
 CROPS = st.builds(Crop, st.integers(0, 200), st.integers(0, 200), st.integers(1, 2000), st.integers(1, 2000))
 
@@ -84,7 +84,7 @@ def test_every_pixel_counts_alike_on_average(crop, most):
 @pytest.mark.parametrize("pixel_loss", ["l1", "l2"])
 def test_the_loss_of_parts_is_on_average_that_of_the_whole(background, pixel_loss):
     crop, view = Crop(8, 5, 40, 28), ring_of_views(1)[0]
-    config = TrainingConfig(ssim_lambda=0.0, pixel_loss=pixel_loss)
+    config = training_config(ssim_lambda=0.0, pixel_loss=pixel_loss)
     generator = torch.Generator().manual_seed(0)
     picture = torch.rand(28, 40, 3, generator=generator, dtype=torch.float64)
     photo = torch.full_like(picture, background)
@@ -114,12 +114,12 @@ def test_a_line_between_columns_crosses_an_ssim_window_one_time_in_five_at_most(
 
 def test_a_part_depends_on_seed_step_and_place_alone():
     crop = Crop(0, 0, 640, 480)
-    config = TrainingConfig(crop_pixels=40_000)
+    config = training_config(crop_pixels=40_000)
     drawn = [part_to_draw(config, crop, step, place) for step in range(20) for place in range(4)]
     again = [part_to_draw(config, crop, step, place) for step in range(20) for place in range(4)]
     assert drawn == again
     assert len(set(drawn)) > 20
-    assert part_to_draw(TrainingConfig(crop_pixels=40_000, seed=1), crop, 0, 0) != drawn[0]
+    assert part_to_draw(training_config(crop_pixels=40_000, seed=1), crop, 0, 0) != drawn[0]
     assert part_to_draw(TrainingConfig(), crop, 0, 0) == crop
 
 

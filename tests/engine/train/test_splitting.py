@@ -14,7 +14,7 @@ from abcd_ns.engine.train.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
 
-GROWING = DensityConfig(refine_start=0.0, warmup_passes=1, refine_every=5, densify_grad_thresh=1e-5)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=1e-5)
 
 
 def rows(state: BlockState) -> set[tuple[float, ...]]:

@@ -48,9 +48,9 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
     training = config.pipeline.training
     assert config.method_name == method
     assert config.pipeline.blocks == (1 if method == "abcd-monolithic" else 4)
-    assert (training.overlap > 0) == (method == "abcd-partition")
-    assert training.exact == (method == "abcd-exact")
-    assert training.visit_steps == (23 if method == "abcd-paper" else 0)
+    assert (training.recipe.overlap > 0) == (method == "abcd-partition")
+    assert training.recipe.exact == (method == "abcd-exact")
+    assert training.recipe.visit_steps == (23 if method == "abcd-paper" else 0)
 
 
 @pytest.mark.parametrize(

@@ -14,14 +14,14 @@ from abcd_ns.lab.stability.lab import Lab, make_stage, steps_for
 @given(
     drawn=st.integers(100, 10_000),
     views=st.integers(1, 50),
-    passes=st.integers(0, 20),
+    passes=st.integers(1, 20),
     blocks=st.sampled_from([1, 8]),
 )
 def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, passes, blocks):
-    config = TrainingConfig(warmup=0.2, batch=0, scaffold_passes=passes)
-    steps = steps_for(drawn, config, blocks, views)
+    config = TrainingConfig(warmup=0.2, batch=0)
+    steps = steps_for(drawn, config, blocks, views, passes)
     batch, share = (1, 0.0) if blocks == 1 else (4, config.warmup)
-    warm = min(math.ceil(share * steps), math.ceil(passes * views / WARM_UP_BATCH) or steps)
+    warm = min(math.ceil(share * steps), math.ceil(passes * views / WARM_UP_BATCH))
     assert warm * WARM_UP_BATCH + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)
 
 

@@ -29,8 +29,16 @@ COUNTED = ("grad2d", "count")
 REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
 """Shares of a visit after which a block among others is neither refined nor reset."""
+CULL_SCALE = 0.5
+"""Standard deviation, in scene units, over which a Gaussian is pruned once opacities were reset."""
+SPLIT_SCALE = 0.01
+"""Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
+MCMC_NOISE_LR = 5e5
+"""Strength of the exploration noise."""
+MCMC_OPACITY_REG, MCMC_SCALE_REG = 0.01, 0.01
+"""Weights of the mean opacity and of the mean standard deviation in the loss."""
 
 
 Infos = tuple[dict[str, Any], ...]
@@ -51,29 +59,17 @@ class DensityConfig:
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
     where a block sees every step, as splatfacto has it, and 30 elsewhere."""
-    warmup_passes: int = 1
-    """Times that each of a block's views is used before the block's first refinement."""
     reset_every: int = 3000
     """A block's own steps between opacity resets (`default` strategy); 0 means never."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
-    cull_scale_thresh: float = 0.5
-    """Standard deviation, in scene units, over which a Gaussian is pruned once opacities were reset."""
     densify_grad_thresh: float = 0.0008
     """Mean norm of the screen-space gradient over which a Gaussian is cloned or split."""
-    densify_size_thresh: float = 0.01
-    """Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
     use_absgrad: bool = True
     """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum."""
     max_gaussians: int = 0
     """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
     to begin with, a random choice of them begins."""
-    noise_lr: float = 5e5
-    """Strength of the exploration noise of `mcmc`."""
-    opacity_reg: float = 0.01
-    """Weight of the mean opacity in the loss (`mcmc`)."""
-    scale_reg: float = 0.01
-    """Weight of the mean standard deviation in the loss (`mcmc`)."""
 
     @property
     def limit(self) -> int | None:
@@ -138,18 +134,15 @@ class DensityControl:
 
     def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
         """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
-        config = self.config
-        if config.strategy != "mcmc":
+        if self.config.strategy != "mcmc":
             return params["means"].new_zeros(())
         opacity = torch.sigmoid(params["opacities"]).sum()
         scale = torch.exp(params["scales"]).sum() / 3
-        return (config.opacity_reg * opacity + config.scale_reg * scale) / max(scene_gaussians, 1)
+        return (MCMC_OPACITY_REG * opacity + MCMC_SCALE_REG * scale) / max(scene_gaussians, 1)
 
     def is_due(self, clock: DensityClock) -> bool:
         """Whether this step refines."""
-        warm = clock.steps >= self.config.warmup_passes * clock.views
-        running = self.config.refine_start <= clock.progress < self.config.refine_stop
-        if not (warm and running):
+        if not self.config.refine_start <= clock.progress < self.config.refine_stop:
             return False
         every = max(self.config.refine_every, clock.views, 1)
         if clock.refined is None:
@@ -248,8 +241,8 @@ class DensityControl:
         strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
             grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=config.densify_size_thresh,
-            prune_scale3d=config.cull_scale_thresh,
+            grow_scale3d=SPLIT_SCALE,
+            prune_scale3d=CULL_SCALE,
             refine_start_iter=0,
             refine_every=REFINE,
             reset_every=AFTER_RESET if has_reset else BEFORE_RESET,
@@ -269,7 +262,7 @@ class DensityControl:
         room = len(params["means"]) if clock.room is None else clock.room
         strategy = MCMCStrategy(
             cap_max=len(params["means"]) + max(room, 0),
-            noise_lr=self.config.noise_lr,
+            noise_lr=MCMC_NOISE_LR,
             refine_start_iter=0,
             refine_every=REFINE,
             min_opacity=MCMC_MIN_OPACITY,

@@ -60,7 +60,7 @@ class Sample:
             full_pixels=self.view.full.pixels,
             full_windows=ssim_windows(self.view.height, self.view.width),
             ssim_lambda=config.ssim_lambda,
-            pixel_loss=config.pixel_loss,
+            pixel_loss=config.recipe.pixel_loss,
         )
         return found / self.share
 
@@ -124,4 +124,4 @@ class Backgrounds:
 
 def part_to_draw(config: TrainingConfig, crop: Crop, step: int, place: int) -> Crop:
     """What the sample at `place` of a step's batch is drawn of a crop; depends on nothing else."""
-    return random_part(crop, config.crop_pixels, random.Random(f"part {config.seed} {step} {place}"))
+    return random_part(crop, config.limits.crop_pixels, random.Random(f"part {config.seed} {step} {place}"))

@@ -56,13 +56,13 @@ class StepDrawing:
         """Views in a step of the visit that is under way."""
         config, active = self._run.config, self._run.state.active
         if active is not None and active.is_whole:
-            return views_per_warm_up_step(config.batch, config.batch_limit)
-        return views_per_step(config.batch, self._run.scene.tree.num_blocks, config.batch_limit)
+            return views_per_warm_up_step(config.batch, config.limits.batch_limit)
+        return views_per_step(config.batch, self._run.scene.tree.num_blocks, config.limits.batch_limit)
 
     def size_of_crew(self, active: ActiveVisit) -> int:
         """Members that are to share the views of each of its steps."""
         config = self._run.config
-        if self._target is None or config.overlap > 0:  # there each pixel counts in a way of its own
+        if self._target is None or config.recipe.overlap > 0:  # there each pixel counts in a way of its own
             return 1
         threads = torch.get_num_threads() if can_fork(self._run.device) else 1
         return size_of_crew(config.processes or threads, self.batch, len(active.views))
@@ -159,7 +159,7 @@ class StepDrawing:
     def _degree(self) -> int:
         """The degree of spherical harmonics in this step."""
         active = self._run.active
-        changes = active.is_alone or self._run.config.sh_restart
+        changes = active.is_alone or self._run.config.recipe.sh_restart
         return self._run.sh_degree if changes else active.sh_degree
 
     def _sample(self, view: int, place: int, step: int) -> Sample:

@@ -40,7 +40,7 @@ class LiveBlock:
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
         check_room(count_at_rest(*which), run.config.sh_degree, run.device)
         rest = at_rest(*which).to(run.device)
-        if active.done == 0 and not run.config.keep_moments:
+        if active.done == 0 and not run.config.recipe.keep_moments:
             rest = rest.forgetful()
         attach(rest, run.params, run.optimizers, batch=batch)
         run.health.begin_visit(active, run.state.health)
@@ -94,7 +94,7 @@ class LiveBlock:
         run, active = self._run, self._run.active
         views = run.state.views.get(active.geometry.block, len(active.geometry.views))
         blocks = run.scene.tree.num_blocks
-        among_others = blocks > 1 and run.config.overlap == 0
+        among_others = blocks > 1 and run.config.recipe.overlap == 0
         if blocks > 1:
             views = min(views, active.steps * batch)  # once a visit, even with thousands of photos
         return DensityClock(
@@ -112,7 +112,7 @@ class LiveBlock:
     @property
     def has_outgrown(self) -> bool:
         """Whether the one block of the scene has just grown to where it must be cut."""
-        limits = self._run.config.block_limit, self._run.config.sole_limit
+        limits = self._run.config.limits.block_limit, self._run.config.limits.sole_limit
         grown = self._run.active.sole and self.clocks.refined == self.clocks.steps
         return grown and is_full(len(self), 1, *limits)
 

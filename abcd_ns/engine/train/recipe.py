@@ -1,0 +1,62 @@
+"""What makes a method, as opposed to what tunes one; and what the device's memory decides."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What makes a method. The methods of `ns-train` differ in this; its command line does not offer it."""
+
+    layers: bool = True
+    """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
+    overlap: float = 0.0
+    """Above 0: partition, train, merge. Each block is trained once, by itself, on its cell enlarged at each
+    face by this share of its extent, and keeps what lies in its cell at the end. Needs `layers` off."""
+    exact: bool = False
+    """Exact joint training: every step trains all blocks, one at a time on the device, each drawn twice.
+    Slow; the reference for gradients. There are no visits, so what concerns them has no effect."""
+    ownership: Literal["fragments", "means"] = "fragments"
+    """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
+    paper)."""
+    visit_steps: int = 0
+    """Steps of every visit, whatever the views that see its block, as the paper has; 0 shares steps out by
+    views."""
+    keep_moments: bool = True
+    """A block keeps Adam's moments and densification's statistics from visit to visit. Off, as in the paper,
+    every visit begins with new ones."""
+    migrate: bool = True
+    """Gaussians that left their cell by the end of a visit move to the block that holds them. Off, as in the
+    paper, they are deleted."""
+    sh_restart: bool = False
+    """The degree of spherical harmonics rises from 0 in every visit, over `sh_ramp` of its steps, as in the
+    paper; frozen blocks are then drawn with the highest."""
+    sh_ramp: float = 0.1
+    """Share of the run over which the degree rises from 0 to the highest."""
+    pixel_loss: Literal["l1", "l2"] = "l1"
+    """Mean absolute difference, as 3DGS, or mean squared difference, as the paper with `ssim_lambda` 0."""
+    batch_power: float = 1.0
+    """Learning rates grow with this power of the views in a step: 0.5 suits gradients that are noise, 1 such
+    as agree. A scene's views show different Gaussians, but a block's all show the same ones."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What fits on the device: `ns-train` derives it from the memory that training may take. 0 is no limit
+    but where another meaning stands."""
+
+    block_limit: int = 0
+    """Gaussians that a block may hold while it is trained; one that comes near it is cut in two when its
+    visit ends."""
+    sole_limit: int = 0
+    """The same for a block that is the whole scene: it has no neighbours, and draws one view in a step, so
+    there is room for more. 0 takes `block_limit`."""
+    batch_limit: int = 0
+    """Views in a step at most where `TrainingConfig.batch` is 0."""
+    crop_pixels: int = 0
+    """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
+    another one each time, and weighs it by how much of the crop it leaves out."""
+    scaffold_gaussians: int = 0
+    """Gaussians of the warm-up's scaffold; 0 takes as many as the memory of a visit allows."""
+    pass_gaussians: int = 0
+    """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
