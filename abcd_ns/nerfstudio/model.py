@@ -1,14 +1,14 @@
 """Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
 
 import hashlib
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
-from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
@@ -27,16 +27,27 @@ from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
+from abcd_ns.nerfstudio.fit import FREE_SHARE
 from abcd_ns.nerfstudio.metrics import image_metrics
-from abcd_ns.nerfstudio.room import FREE_SHARE
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.viewer.pictures import BlockPictures, Choice, Cropped, Show, asked_by_viewer, bounded
 
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.config import AbcdModelConfig
-
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
+
+
+@dataclass
+class AbcdModelConfig(SplatfactoModelConfig):
+    """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""
+
+    _target: type = field(default_factory=lambda: AbcdModel)
+    rasterizer: Literal["auto", "torch", "gsplat"] = "auto"
+    """What draws: gsplat's CUDA kernels or the torch rasterizer; auto takes gsplat on CUDA devices."""
+    render: Literal["merged", "composited"] = "merged"
+    """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
+
+    ownership: Literal["fragments", "means"] = "fragments"
+    """What a layer holds in composited pictures; taken over from the training options."""
 
 
 class AbcdModel(SplatfactoModel):
@@ -48,7 +59,7 @@ class AbcdModel(SplatfactoModel):
     scene in either case.
     """
 
-    config: "AbcdModelConfig"
+    config: AbcdModelConfig
 
     def populate_modules(self) -> None:
         """Register empty parameters; what a run begins with is made when it begins."""

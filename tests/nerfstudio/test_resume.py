@@ -13,7 +13,7 @@ from abcd_ns.engine.events import LayersDrawn, StepTaken
 from abcd_ns.engine.store import ParameterStore, crash_points
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run.run_folder import MadeFor
+from abcd_ns.nerfstudio.run.resuming import MadeFor
 from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
 from tests.nerfstudio.test_training import STEPS, configure, run
 from tests.reference.colmap_scene import write_scene

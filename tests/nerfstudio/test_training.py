@@ -16,8 +16,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
-from abcd_ns.nerfstudio.config import AbcdTrainerConfig
-from abcd_ns.nerfstudio.trainer import AbcdTrainer
+from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
 
 STEPS = 36

@@ -19,10 +19,12 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.configs import registered
 from abcd_ns.lab.runs.options import set_options
 from abcd_ns.lab.runs.records import read_record
-from abcd_ns.nerfstudio.config import AbcdTrainerConfig
-from abcd_ns.nerfstudio.pipeline import STORE, AbcdPipeline
+from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.nerfstudio.run.resuming import STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.settings import SCHEMA, SETTINGS_FILE, Settings
+from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings
+from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 CHECKPOINTS = "nerfstudio_models"
 _DAMAGE = (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, UnpicklingError)
@@ -110,7 +112,7 @@ def default_config(method: str) -> AbcdTrainerConfig | None:
         config = _registered(method)
     except UserError:
         return None
-    config.pipeline.model.mirror(config.pipeline.training)
+    mirror(config.pipeline.training, config.pipeline.model)
     return config
 
 

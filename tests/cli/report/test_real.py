@@ -17,7 +17,7 @@ from abcd_ns.cli.report.run_folder import load_pipeline, open_run
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.settings import SETTINGS_FILE
+from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HELD_OUT, write_scene
 

@@ -4,15 +4,14 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.config import AbcdTrainerConfig
 
 STATE = "abcd"
 """The folder of a run, beside `nerfstudio_models`, that holds the one that follows."""
@@ -31,6 +30,19 @@ class Start:
     """The pin of a checkpoint that was asked for; None is the newest generation."""
     step: int
     """Steps that were taken until then."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training, as its trainer begins it."""
+
+    config: TrainerConfig
+    folder: Path
+    """For all that is ours: STATE in the run's folder."""
+    total_steps: int
+    """Of the whole run, those before a resume included."""
+    resumed_from: Start | None
+    """What it goes on from; None begins anew."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +100,7 @@ def _agree(theirs: Any, mine: Any) -> bool:
     return theirs == mine
 
 
-def find_start(config: "AbcdTrainerConfig") -> Start | None:
+def find_start(config: TrainerConfig) -> Start | None:
     """What --load-dir, --load-step and --load-checkpoint ask for; None begins anew.
 
     `--load-dir` alone is the newest that the run has: its last visit's end, or its last checkpoint where that
