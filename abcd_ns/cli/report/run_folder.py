@@ -91,7 +91,9 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     Raises:
         UserError: the data is gone, or the run's options or checkpoint do not fit this version.
     """
-    where, config = str(run.path / "abcd" / SETTINGS_FILE), _registered(run.settings.method)
+    versions, config = run.settings.versions, _registered(run.settings.method)
+    wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
+    where = f"{run.path / 'abcd' / SETTINGS_FILE} (written by {wrote})"
     prefix = "pipeline."
     options = {n: v for n, v in run.settings.options.items() if n.startswith(prefix)}
     set_options(config.pipeline, {n.removeprefix(prefix): v for n, v in options.items()}, where)

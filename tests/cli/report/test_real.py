@@ -148,7 +148,7 @@ def test_options_that_this_version_has_not_are_named(copied):
     path = copied / "abcd" / SETTINGS_FILE
     settings = json.loads(path.read_text())
     for name, value, message in (
-        ("pipeline.training.magic", 1, "there is no option 'training.magic'"),
+        ("pipeline.training.magic", 1, r"\(written by abcd_ns .*\): there is no option 'training.magic'"),
         ("pipeline.training.batch", "many", "training.batch is 'many'; it must be a whole number"),
     ):
         path.write_text(json.dumps({**settings, "options": {**settings["options"], name: value}}))
