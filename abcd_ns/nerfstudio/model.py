@@ -144,7 +144,7 @@ class AbcdModel(SplatfactoModel):
         """
         expected = state.get("_extra_state", {}).get("checksum")
         count = len(state["gauss_params.means"])
-        self._loaded_is_too_large = count > self._room()
+        self._loaded_is_too_large = count > self._most_at_once()
         home = torch.device("cpu") if self._loaded_is_too_large else self.device
         for name, value in list(self.gauss_params.items()):
             self.gauss_params[name] = Parameter(torch.empty((count, *value.shape[1:]), device=home))
@@ -252,7 +252,7 @@ class AbcdModel(SplatfactoModel):
                 whole.tree, self.merged()
             )  # which block holds how many is not known otherwise
         scene = Cropped(whole, self._crop)
-        most = min(default_pass(scene), self._room())
+        most = min(default_pass(scene), self._most_at_once())
         painter = Painter(
             scene,
             [view],
@@ -269,9 +269,9 @@ class AbcdModel(SplatfactoModel):
         """Whether the device should not hold the whole scene at once."""
         if self._coordinator is None:
             return self._loaded_is_too_large
-        return self._coordinator.count() > min(default_pass(self.scene()), self._room())
+        return self._coordinator.count() > min(default_pass(self.scene()), self._most_at_once())
 
-    def _room(self) -> int:
+    def _most_at_once(self) -> int:
         """Gaussians that the device could draw at once, beside what it holds."""
         return int(FREE_SHARE * free_bytes(self.device)) // drawing_bytes(self.config.sh_degree)
 

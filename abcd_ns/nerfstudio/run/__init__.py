@@ -1,1 +1,1 @@
-"""A run as its user meets it: progress, log, folder and how it stops."""
+"""A run as its user meets it: progress, settings, log, how it stops and how it goes on."""

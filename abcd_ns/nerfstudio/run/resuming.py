@@ -1,4 +1,4 @@
-"""What a run keeps on disk beside nerfstudio's files, and how another run goes on from it."""
+"""How a run goes on from another, and what both keep on disk beside nerfstudio's files."""
 
 import hashlib
 from collections.abc import Sequence
