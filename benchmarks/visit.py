@@ -128,7 +128,7 @@ def read(source: Source) -> Capture:
 
 def _views_and_photos(dataset: AbcdDataset, near: float) -> tuple[list[View], PhotoReader]:
     views = [replace(view, near=near) for view in views_of(dataset.cameras)]
-    photos = [dataset.photos.crop(view.index, view.full).float() / 255 for view in views]
+    photos = [dataset.photos.image(view.index).float() / 255 for view in views]
     return views, lambda view, crop: photos[view][crop.slices]
 
 

@@ -280,7 +280,7 @@ def test_no_result_depends_on_the_ram_budget_and_none_exceeds_it(data, undisturb
         largest.append(max(blocks, default=0))
 
     trainer = run(config, after_step=measure)
-    layer = 4 * 4 * np.prod(trainer.pipeline.datamanager.train_dataset.photos.size(0))
+    layer = 4 * 4 * np.prod(trainer.pipeline.datamanager.train_dataset.photos.sources[0].size)
     assert max(peaks) <= budget + layer + max(largest)
     assert max(peaks) > min(budget, layer) / 2
     assert_same(trainer.base_dir, undisturbed)
