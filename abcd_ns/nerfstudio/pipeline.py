@@ -30,8 +30,9 @@ from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfi
 from abcd_ns.nerfstudio.fit import FITTED, Demand, Fit, device_budget, find_fit, ram_budget, share_out
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
-from abcd_ns.nerfstudio.run.resuming import STORE, MadeFor, Run, new_store, take_over
+from abcd_ns.nerfstudio.run.resuming import MadeFor, Run, new_store, take_over
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.peers.exact import ExactCoordinator

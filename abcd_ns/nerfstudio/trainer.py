@@ -25,7 +25,8 @@ from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
 from abcd_ns.nerfstudio.options import check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
-from abcd_ns.nerfstudio.run.resuming import STATE, Run, Start, find_start, pin_name
+from abcd_ns.nerfstudio.run import STATE
+from abcd_ns.nerfstudio.run.resuming import Run, Start, find_start, pin_name
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
 from abcd_ns.viewer.request_rules import THIS_MACHINE, WILDCARDS
 

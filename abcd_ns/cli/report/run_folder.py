@@ -21,7 +21,7 @@ from abcd_ns.lab.runs.options import set_options
 from abcd_ns.lab.runs.records import read_record
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
-from abcd_ns.nerfstudio.run.resuming import STORE
+from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig

@@ -36,7 +36,7 @@ from abcd_ns.nerfstudio.machine import (
     without_home,
 )
 from abcd_ns.nerfstudio.metrics import lpips_missing
-from abcd_ns.nerfstudio.run.resuming import STORE
+from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 RUN_FILE = "run.json"

@@ -12,11 +12,8 @@ from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.run import STATE, STORE
 
-STATE = "abcd"
-"""The folder of a run, beside `nerfstudio_models`, that holds the one that follows."""
-STORE = "store"
-"""The blocks at rest."""
 MADE_FOR = "made for"
 """The entry of a store's header that tells what it can be trained on with."""
 
