@@ -61,8 +61,8 @@ def run(
         pipeline = trainer.pipeline
         end_step = pipeline._after_step
 
-        def watched(who) -> None:
-            end_step(who)
+        def watched() -> None:
+            end_step()
             if after_step is not None:
                 after_step(trainer)
             if trainer.step + 1 == stop_after:
