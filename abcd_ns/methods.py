@@ -6,8 +6,9 @@ from nerfstudio.plugins.types import MethodSpecification
 from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.nerfstudio.config import AbcdPipelineConfig, AbcdTrainerConfig, FusedAdamConfig
-from abcd_ns.viewer.rules import THIS_MACHINE
+from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
+from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
+from abcd_ns.viewer.request_rules import THIS_MACHINE
 
 PAPER = TrainingConfig(
     recipe=Recipe(

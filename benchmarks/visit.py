@@ -40,7 +40,7 @@ from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.config import AbcdDataManagerConfig
+from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import views_of
 
@@ -129,7 +129,7 @@ def read(source: Source) -> Capture:
 
 def _views_and_photos(dataset: AbcdDataset, near: float) -> tuple[list[View], PhotoReader]:
     views = [replace(view, near=near) for view in views_of(dataset.cameras)]
-    photos = [dataset.photos.crop(view.index, view.full).float() / 255 for view in views]
+    photos = [dataset.photos.image(view.index).float() / 255 for view in views]
     return views, lambda view, crop: photos[view][crop.slices]
 
 

@@ -241,7 +241,9 @@ def test_imports_keep_to_the_contracts():
 )
 def test_the_contracts_notice_an_offence(contract, module, statement, tmp_path):
     skeleton = {"errors.py": "", "cli/main.py": "import abcd_ns.nerfstudio.model", "nerfstudio/model.py": ""}
-    skeleton |= dict.fromkeys(("late_bar.py", "lab/__init__.py", "data/__init__.py", "peers/exact.py"), "")
+    skeleton |= dict.fromkeys(
+        ("progress_bar.py", "lab/__init__.py", "data/__init__.py", "peers/exact.py"), ""
+    )
     floors = ("kernels", "gaussians", "render", "space", "store", "layers", "train")
     skeleton |= {f"engine/{floor}/__init__.py": "" for floor in floors} | {"engine/transfer.py": ""}
     skeleton |= {"engine/types.py": "", "engine/space/tree.py": "import abcd_ns.engine.types"}

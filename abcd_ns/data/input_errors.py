@@ -39,26 +39,21 @@ class InputError(UserError):
     """The input cannot be used; a command shows `str(error)` alone and exits with code 2.
 
     Args:
-        lines: what is wrong, each a sentence that names the file or value and the fix; `lines` keeps all.
-        limit: how many of them `str(error)` has; the rest is counted.
+        lines: what is wrong, each a sentence that names the file or value and the fix; `lines` keeps all,
+            `str(error)` has the first SHOWN and counts the rest.
     """
 
-    def __init__(self, *lines: str, limit: int = SHOWN):
+    def __init__(self, *lines: str):
         self.lines = tuple(one_line(line) for line in lines)
-        rest = len(lines) - limit
+        rest = len(lines) - SHOWN
         more = [f"... and {rest} more like these ({len(lines)} in all)."] if rest > 0 else []
-        super().__init__("\n".join([*self.lines[:limit], *more]))
+        super().__init__("\n".join([*self.lines[:SHOWN], *more]))
 
 
 class Problems:
-    """Collects errors so that all bad files are named at once, instead of one per run.
+    """Collects errors so that all bad files are named at once, instead of one per run."""
 
-    Args:
-        limit: see InputError.
-    """
-
-    def __init__(self, limit: int = SHOWN):
-        self.limit = limit
+    def __init__(self) -> None:
         self.lines: list[str] = []
 
     def add(self, line: str) -> None:
@@ -80,4 +75,4 @@ class Problems:
             InputError: something was noted.
         """
         if self.lines:
-            raise InputError(*self.lines, limit=self.limit)
+            raise InputError(*self.lines)

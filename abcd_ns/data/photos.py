@@ -19,7 +19,6 @@ from torch import Tensor
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.picture_files import has_alpha, open_picture, undecodable
 from abcd_ns.data.undistort import Undistortion
-from abcd_ns.engine.types import Crop
 
 _MASK_USED = 255
 
@@ -77,10 +76,6 @@ class Photos:
         """Bytes of decoded pixels that are kept now; at most the budget."""
         return self._cache.used
 
-    def size(self, index: int) -> tuple[int, int]:
-        """(width, height) of a photo, without reading it."""
-        return self.sources[index].size
-
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
         """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it.
 
@@ -88,18 +83,6 @@ class Photos:
             InputError: the file is gone, damaged or has another size than when it was checked.
         """
         return self._cache.get(("image", index), lambda: _read_photo(self.sources[index]))
-
-    def crop(self, index: int, crop: Crop) -> UInt8[Tensor, "h w c"]:
-        """The pixels of `crop`: a view of `image(index)`, so do not write to it.
-
-        Raises:
-            ValueError: the crop reaches over the border.
-            InputError: as `image`.
-        """
-        width, height = self.size(index)
-        if crop.x < 0 or crop.y < 0 or crop.x + crop.width > width or crop.y + crop.height > height:
-            raise ValueError(f"{crop} reaches over the border of photo {index}, {width} x {height} px.")
-        return self.image(index)[crop.slices]
 
     def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
         """Which pixels count, or None where the photo has no mask. Do not write to it.

@@ -3,7 +3,6 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,23 +10,32 @@ from torch import Tensor
 
 from abcd_ns.data.colmap_model import MODEL_FOLDERS, find_model, read_colmap
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.normalize import Similarity, normalizing_similarity
+from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
 from abcd_ns.data.photo_folders import PhotoFile, assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
 from abcd_ns.data.picture_files import check_regular
 from abcd_ns.data.scene import Frame, Lens, Scene, check_layout
 from abcd_ns.data.transforms_json import read_transforms
 from abcd_ns.data.undistort import Undistortion, undistortion
-from abcd_ns.late_bar import LateBar
-
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.progress_bar import ProgressBar
 
 MAX_AUTO_SIDE = 1600
 """Pixels along a photo's longer side, at most, where nothing is said: nerfstudio's MAX_AUTO_RESOLUTION."""
 DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
 """The option by which something is said."""
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Where a scene is, and how it is to be placed; AbcdDataParserConfig says more of each."""
+
+    data: Path
+    downscale_factor: int | None
+    orientation_method: Orientation
+    center_method: Center
+    auto_scale_poses: bool
+    scale_factor: float
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,7 @@ def read_scene(data: Path) -> Scene:
     raise InputError(f"--data {data} holds no model (looked for {looked} and transforms.json); {hint}")
 
 
-def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
+def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     """Read the model, look at the header and the end of every photo, and place the scene in its frame.
 
     Args:
@@ -87,20 +95,24 @@ def prepare(config: "AbcdDataParserConfig", needs_photos: bool) -> Prepared:
     Raises:
         InputError: the input cannot be used; all bad files are listed.
     """
-    wanted = config.downscale_factor
+    wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
         raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
     try:
-        scene = read_scene(config.data)
+        scene = read_scene(options.data)
         factor = automatic_factor(scene) if wanted is None else int(wanted)
         files, notes = _check_layout_and_photos(scene, factor, needs_photos)
     except OSError as error:
-        where = error.filename or config.data
+        where = error.filename or options.data
         raise InputError(f"{where} cannot be read ({error.strerror}); check its permissions.") from None
     sources, lenses = _sources(scene, files)
     poses = np.stack([frame.camera_to_world for frame in scene.frames])
     similarity = normalizing_similarity(
-        poses, config.orientation_method, config.center_method, config.auto_scale_poses, config.scale_factor
+        poses,
+        options.orientation_method,
+        options.center_method,
+        options.auto_scale_poses,
+        options.scale_factor,
     )
     points, in_model, more = _points(scene, similarity)
     both = scene.split_lists.in_both if scene.split_lists else 0
@@ -146,7 +158,7 @@ def check_masks(sources: list[PhotoSource]) -> None:
             return error.lines
         return ()
 
-    with ThreadPoolExecutor() as pool, LateBar("Looking at masks", len(masked)) as bar:
+    with ThreadPoolExecutor() as pool, ProgressBar("Looking at masks", len(masked)) as bar:
         for lines in pool.map(look, range(len(masked))):
             problems.lines.extend(lines)
             bar.advance()

@@ -2,28 +2,41 @@
 
 import random
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
-
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.config import AbcdDataManagerConfig
+from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 
 BATCH = "abcd_batch"
 """The key of a camera's metadata under which what to train on travels from here to the model."""
 
 
+@dataclass
+class AbcdDataManagerConfig(FullImageDatamanagerConfig):
+    """Photos, served by crop to the block in training."""
+
+    _target: type = field(default_factory=lambda: AbcdDataManager)
+    dataparser: AbcdDataParserConfig = field(default_factory=AbcdDataParserConfig)
+    """Where photos, poses and points come from: a COLMAP folder or a transforms.json."""
+    photo_cache_gb: float = 0.0
+    """RAM for decoded photos, GB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
+
+
 class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     """The subset of cameras, the crop and the layers come from the coordinator; the photo from here."""
 
-    config: "AbcdDataManagerConfig"
+    config: AbcdDataManagerConfig
     train_dataset: AbcdDataset
     eval_dataset: AbcdDataset
 

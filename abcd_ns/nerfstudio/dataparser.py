@@ -1,6 +1,6 @@
 """From a folder to cameras, points and photos: what `ns-train abcd --data DIR` takes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.normalize import Center, Orientation
-from abcd_ns.data.prepare import Prepared, check_masks, prepare
+from abcd_ns.data.prepare import Prepared, SceneOptions, check_masks, prepare
 
 
 @dataclass
@@ -119,7 +119,8 @@ class AbcdDataParser(DataParser):
             InputError: the input cannot be used.
         """
         if self._prepared is None:
-            self._prepared = prepare(self.config, needs_photos=self.downscale_factor is None)
+            options = {field.name: getattr(self.config, field.name) for field in fields(SceneOptions)}
+            self._prepared = prepare(SceneOptions(**options), needs_photos=self.downscale_factor is None)
             for note in (*self._prepared.chosen, *self._prepared.notes):
                 self.tell(note)
         return self._prepared

@@ -1,14 +1,15 @@
 """Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
 
 import hashlib
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
-from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
@@ -28,16 +29,27 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
+from abcd_ns.nerfstudio.fit import FREE_SHARE
 from abcd_ns.nerfstudio.metrics import image_metrics
-from abcd_ns.nerfstudio.room import FREE_SHARE
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.viewer.pictures import BlockPictures, Choice, Cropped, Show, asked_by_viewer, bounded
 
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.config import AbcdModelConfig
-
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
+
+
+@dataclass
+class AbcdModelConfig(SplatfactoModelConfig):
+    """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""
+
+    _target: type = field(default_factory=lambda: AbcdModel)
+    rasterizer: Literal["auto", "torch", "gsplat"] = "auto"
+    """What draws: gsplat's CUDA kernels or the torch rasterizer; auto takes gsplat on CUDA devices."""
+    render: Literal["merged", "composited"] = "merged"
+    """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
+
+    ownership: tyro.conf.Fixed[Literal["fragments", "means"]] = "fragments"
+    """What a layer holds in composited pictures; taken over from the method's recipe."""
 
 
 class AbcdModel(SplatfactoModel):
@@ -49,7 +61,7 @@ class AbcdModel(SplatfactoModel):
     scene in either case.
     """
 
-    config: "AbcdModelConfig"
+    config: AbcdModelConfig
 
     def populate_modules(self) -> None:
         """Register empty parameters; what a run begins with is made when it begins."""
@@ -134,7 +146,7 @@ class AbcdModel(SplatfactoModel):
         """
         expected = state.get("_extra_state", {}).get("checksum")
         count = len(state["gauss_params.means"])
-        self._loaded_is_too_large = count > self._room()
+        self._loaded_is_too_large = count > self._most_at_once()
         home = torch.device("cpu") if self._loaded_is_too_large else self.device
         for name, value in list(self.gauss_params.items()):
             self.gauss_params[name] = Parameter(torch.empty((count, *value.shape[1:]), device=home))
@@ -242,7 +254,7 @@ class AbcdModel(SplatfactoModel):
                 whole.tree, self.merged()
             )  # which block holds how many is not known otherwise
         scene = Cropped(whole, self._crop)
-        most = min(default_pass(scene), self._room())
+        most = min(default_pass(scene), self._most_at_once())
         painter = Painter(
             scene,
             [view],
@@ -259,9 +271,9 @@ class AbcdModel(SplatfactoModel):
         """Whether the device should not hold the whole scene at once."""
         if self._coordinator is None:
             return self._loaded_is_too_large
-        return self._coordinator.count() > min(default_pass(self.scene()), self._room())
+        return self._coordinator.count() > min(default_pass(self.scene()), self._most_at_once())
 
-    def _room(self) -> int:
+    def _most_at_once(self) -> int:
         """Gaussians that the device could draw at once, beside what it holds."""
         return int(FREE_SHARE * free_bytes(self.device)) // drawing_bytes(self.config.sh_degree)
 

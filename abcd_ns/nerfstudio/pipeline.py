@@ -1,13 +1,14 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.events import HeldOutScored
@@ -18,9 +19,11 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
+from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import Run
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.splitting import cut_at_rest
@@ -28,13 +31,13 @@ from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.datamanager import AbcdDataManager
-from abcd_ns.nerfstudio.model import AbcdModel
-from abcd_ns.nerfstudio.ram_budget import budget_bytes, share_out
-from abcd_ns.nerfstudio.room import FITTED, Demand, Room, device_budget, find_room
+from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
+from abcd_ns.nerfstudio.fit import FITTED, Demand, Fit, device_budget, find_fit, ram_budget, share_out
+from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
+from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
-from abcd_ns.nerfstudio.run.run_folder import STATE, MadeFor, new_store, take_over
-from abcd_ns.nerfstudio.run.run_folder import STORE as STORE
+from abcd_ns.nerfstudio.run.resuming import MadeFor, RunRequest, new_store, take_over
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.peers.exact import ExactTrainer
@@ -42,21 +45,49 @@ from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
 
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.config import AbcdPipelineConfig
-    from abcd_ns.nerfstudio.trainer import AbcdTrainer
+# What makes a method and what memory decides stand in config.yml, and are no flags of `ns-train`.
+for _not_offered in (Recipe, Limits):
+    tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
+
+
+@dataclass
+class AbcdPipelineConfig(VanillaPipelineConfig):
+    """ABCD: how space is cut and how its blocks are trained."""
+
+    _target: type = field(default_factory=lambda: AbcdPipeline)
+    datamanager: AbcdDataManagerConfig = field(default_factory=AbcdDataManagerConfig)
+    model: AbcdModelConfig = field(default_factory=AbcdModelConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    """How blocks are trained."""
+    blocks: int = 0
+    """Number of blocks that space is cut into; 1 is ordinary 3DGS. 0 takes as few as `device_budget_gb`
+    allows, one where the scene fits, and cuts blocks that outgrow it in two."""
+    device_budget_gb: float = 0.0
+    """Memory of the device that training may take, GB, by which `blocks` 0 is decided; 0 takes 0.9 of what is
+    free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
+    eighth for photos."""
+    partition: Literal["kd", "grid"] = "kd"
+    """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
+    near_plane: float = 0.0
+    """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
+    the nearest distance at which a photo shows a point."""
+    ram_budget_gb: float = 0.0
+    """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it.
+    0 takes 8, or 40% of the machine's memory where that is less."""
+    max_seconds: float | None = None
+    """Stop after this many seconds of training; evaluation and saving do not count."""
 
 
 class AbcdPipeline(VanillaPipeline):
     """ABCD in nerfstudio. Constructed without side effects: evaluation tools make one, too."""
 
-    config: "AbcdPipelineConfig"
+    config: AbcdPipelineConfig
     datamanager: AbcdDataManager
     model: AbcdModel
 
-    def __init__(self, config: "AbcdPipelineConfig", *args: Any, **kwargs: Any) -> None:
-        config.model.mirror(config.training)
-        self._ram = share_out(budget_bytes(config.ram_budget_gb))
+    def __init__(self, config: AbcdPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        mirror(config.training, config.model)
+        self._ram = share_out(ram_budget(config.ram_budget_gb))
         if not config.datamanager.photo_cache_gb:
             config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / 2**30
         # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
@@ -74,19 +105,22 @@ class AbcdPipeline(VanillaPipeline):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Everything exists by now, checkpoint included: begin, or go on, and drive the coordinator."""
-        trainer: AbcdTrainer = training_callback_attributes.trainer
-        self._coordinator = self._begin(trainer, training_callback_attributes.optimizers.optimizers)
+        trainer = training_callback_attributes.trainer
+        self._coordinator = self._begin(trainer.run, training_callback_attributes.optimizers.optimizers)
         self.datamanager.follow(self._coordinator)
         self.model.follow(self._coordinator)
         report = ProgressReport(self._coordinator)
         self._coordinator.announce.subscribe(report)
-        log = keep_log(trainer, self._coordinator)
+        photos = self.datamanager.train_dataset.photos
+        log = keep_log(trainer.run, photos, self._coordinator)
         self._coordinator.announce.subscribe(log)
         self.panel.follow(self._coordinator)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
         def end_step(step: int) -> None:  # noqa: ARG001 - the coordinator counts
-            self._after_step(trainer)
+            self._after_step()
+            if self._coordinator.finished:
+                trainer.stop_training = True
 
         def end_run(step: int) -> None:  # noqa: ARG001
             report.close()
@@ -120,22 +154,19 @@ class AbcdPipeline(VanillaPipeline):
             self._coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         return found
 
-    def _after_step(self, trainer: "AbcdTrainer") -> None:
+    def _after_step(self) -> None:
         if self._coordinator is None:
             raise RuntimeError("training has not begun")
         self._coordinator.after_step(self._rendered, self._psnrs)
         self._rendered = None
-        if self._coordinator.finished:
-            trainer.stop_training = True
 
     # -- set-up --------------------------------------------------------------------------------------
 
-    def _begin(self, trainer: "AbcdTrainer", optimizers: dict[str, Any]) -> Trainer:
-        config, folder = self.config, trainer.base_dir / STATE
-        views = self._views()
+    def _begin(self, asked: RunRequest, optimizers: dict[str, Any]) -> Trainer:
+        config, views = self.config, self._views()
         self.datamanager.device_photo_bytes = 0 if self._on_cpu else int(PHOTO_SHARE * self._budget)
         self.model.draws_with().warm_up()
-        store, resumed = self._open_store(folder / STORE, trainer, views)
+        store, resumed = self._open_store(asked, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
         limits = replace(config.training.limits, **self._fitted(store, resumed))
         training = replace(config.training, limits=limits, processes=self._processes())
@@ -144,7 +175,7 @@ class AbcdPipeline(VanillaPipeline):
             cut_at_rest(scene, state, training.limits.block_limit, training.limits.sole_limit)
         run = Run(
             training,
-            Budget(trainer.total_steps, config.max_seconds),
+            Budget(asked.total_steps, config.max_seconds),
             scene,
             views,
             self.model.draws_with(),
@@ -197,10 +228,10 @@ class AbcdPipeline(VanillaPipeline):
         its own."""
         if resumed and self.config.blocks == 0 and self.config.device_budget_gb > 0:
             blocks = BlockTree.from_json(store.header["tree"]).num_blocks
-            return self._room(sum(map(store.counts, range(blocks))), blocks).limits
+            return self._fit(sum(map(store.counts, range(blocks))), blocks).limits
         return {name: store.header.get(name, 0) for name in FITTED}
 
-    def _room(self, points: int, blocks: int = 1) -> Room:
+    def _fit(self, points: int, blocks: int = 1) -> Fit:
         """How many blocks for a scene that goes on with so many Gaussians in so many blocks."""
         config = self.config
         demand = Demand(
@@ -212,7 +243,7 @@ class AbcdPipeline(VanillaPipeline):
             blocks=blocks,
             on_cpu=self._on_cpu,
         )
-        return find_room(self._budget, demand)
+        return find_fit(self._budget, demand)
 
     @property
     def _pixels(self) -> int:
@@ -224,9 +255,9 @@ class AbcdPipeline(VanillaPipeline):
         """The number of blocks to begin with, and the limits that are fitted to the device, by name."""
         if self.config.blocks > 0:
             return self.config.blocks, {name: getattr(self.config.training.limits, name) for name in FITTED}
-        room = self._room(points)
-        CONSOLE.print(room.in_words(), highlight=False, soft_wrap=True)
-        return room.blocks, room.limits
+        fit = self._fit(points)
+        CONSOLE.print(fit.in_words(), highlight=False, soft_wrap=True)
+        return fit.blocks, fit.limits
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""
@@ -235,14 +266,13 @@ class AbcdPipeline(VanillaPipeline):
         self.model.near = self.config.near_plane or near_plane(known, views)
         return [replace(view, near=self.model.near) for view in views]
 
-    def _open_store(
-        self, folder: Path, trainer: "AbcdTrainer", views: list[View]
-    ) -> tuple[ParameterStore, bool]:
+    def _open_store(self, asked: RunRequest, views: list[View]) -> tuple[ParameterStore, bool]:
         """The run's own store: a copy of the one it goes on from, or a new one."""
         training, photos = self.config.training, self.datamanager.train_dataset.image_filenames
+        folder = asked.folder / STORE
         made_for = MadeFor.of(photos, views, training)
-        if trainer.resumed_from is not None:
-            return take_over(trainer.resumed_from, folder, made_for), True
+        if asked.resumed_from is not None:
+            return take_over(asked.resumed_from, folder, made_for), True
         everything = self.model.initial_gaussians()
         gaussians = thin_out(everything, training.density.limit, training.seed)
         if len(gaussians) < len(everything):

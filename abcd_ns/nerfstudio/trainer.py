@@ -1,14 +1,19 @@
 """nerfstudio's trainer, with checkpoints that a run can truly go on from, and an end that loses nothing."""
 
+import dataclasses
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.trainer import Trainer
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
@@ -16,12 +21,90 @@ from abcd_ns.engine.events import Event, LayersDrawn
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.dataparser import AbcdDataParser
+from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
+from abcd_ns.nerfstudio.options import check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
-from abcd_ns.nerfstudio.run.run_folder import Start, find_start, pin_name
+from abcd_ns.nerfstudio.run import STATE
+from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, find_start, pin_name
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
+from abcd_ns.viewer.request_rules import THIS_MACHINE, WILDCARDS
 
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.config import AbcdTrainerConfig
+
+@dataclass
+class FusedAdamConfig(AdamOptimizerConfig):
+    """Adam as 3DGS uses it, one pass over memory for each parameter."""
+
+    fused: bool = True
+    """Update a parameter and its moments in one kernel."""
+
+
+def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerConfig:
+    """Options of the viewer, on this machine alone unless the command line names a host.
+
+    ns-viewer replaces a run's viewer section by its own options, whose default is to listen on all networks.
+    """
+    flags = ("--viewer.websocket-host", "--viewer.websocket_host")
+    named = any(argument.partition("=")[0] in flags for argument in arguments)
+    if named or viewer.websocket_host not in WILDCARDS:
+        return viewer
+    return dataclasses.replace(viewer, websocket_host=THIS_MACHINE)
+
+
+@dataclass
+class AbcdTrainerConfig(TrainerConfig):
+    """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""
+
+    _target: type = field(default_factory=lambda: AbcdTrainer)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "viewer" and "viewer" in self.__dict__:
+            value = on_this_machine(value, sys.argv)
+        super().__setattr__(name, value)
+
+    def print_to_terminal(self) -> None:
+        """A few lines instead of nerfstudio's some hundred; all of it is in config.yml."""
+        pipeline = self.pipeline
+        what = f"{self.method_name} on {pipeline.datamanager.data}"
+        seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
+        blocks = {0: "as few blocks as fit", 1: "1 block"}.get(pipeline.blocks, f"{pipeline.blocks} blocks")
+        CONSOLE.print(f"{what}: {blocks}, {self.max_num_iterations:,} steps{seconds}", highlight=False)
+
+    def save_config(self) -> None:
+        """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
+        self.check()
+        super().save_config()
+
+    def check(self) -> None:
+        """Choose the device and look at the options and the data, before anything is written.
+
+        Exits with code 2 and one line for each fault that the user can mend.
+        """
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            self.machine.device_type = "cpu"
+            CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
+        with exit_on_user_error():
+            check_options(self)
+            parser = self.pipeline.datamanager.dataparser
+            if self.pipeline.datamanager.data is not None:
+                parser = dataclasses.replace(parser, data=self.pipeline.datamanager.data)
+            parser = parser.setup()
+            parser.check()
+            if self.pipeline.blocks == 0:
+                self._check_fit(parser)
+
+    def _check_fit(self, parser: AbcdDataParser) -> None:
+        """See that some block fits on the device."""
+        pipeline, model = self.pipeline, self.pipeline.model
+        demand = Demand(
+            parser.largest_image,
+            model.num_random if model.random_init else parser.points or model.num_random,
+            pipeline.training,
+            most=pipeline.training.density.limit,
+            factor=parser.factor,
+            on_cpu=self.machine.device_type == "cpu",
+        )
+        find_fit(device_budget(pipeline.device_budget_gb, self.machine.device_type), demand)
 
 
 class AbcdTrainer(Trainer):
@@ -31,16 +114,21 @@ class AbcdTrainer(Trainer):
     very step and within the visit that was under way. Ctrl-C and SIGTERM commit before the process ends.
     """
 
-    config: "AbcdTrainerConfig"
+    config: AbcdTrainerConfig
     pipeline: AbcdPipeline
     resumed_from: Start | None = None
     """What this run goes on from."""
 
-    def __init__(self, config: "AbcdTrainerConfig", *args: Any, **kwargs: Any) -> None:
+    def __init__(self, config: AbcdTrainerConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
         self.total_steps = config.max_num_iterations
         """Steps of the whole run, those before a resume included."""
         self._signals = StopSignals()
+
+    @property
+    def run(self) -> RunRequest:
+        """What the pipeline begins."""
+        return RunRequest(self.config, self.base_dir / STATE, self.total_steps, self.resumed_from)
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """As nerfstudio's; what the user can mend ends the process with one line and code 2."""

@@ -18,7 +18,7 @@ import viser
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from abcd_ns.viewer.rules import Headers, Rules, content_policy
+from abcd_ns.viewer.request_rules import Headers, Rules, content_policy
 
 UNREADABLE = (
     AssertionError,

@@ -3,12 +3,13 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import psutil
 import torch
 import viser
+from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from abcd_ns.engine.events import Event, LayersDrawn, SweepEnded, VisitBegan, VisitEnded
@@ -18,16 +19,13 @@ from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
-from abcd_ns.viewer.board import BlockRow, Board, Status, seconds_left, sweep_share
 from abcd_ns.viewer.boxes import boxes_of, bulk
 from abcd_ns.viewer.controls import Controls
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Choice
+from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, seconds_left, sweep_share
 from abcd_ns.viewer.scenery import Scenery, first_look, views_that_see
-from abcd_ns.viewer.words import block_table, headline, memory_table, sweep_line
-
-if TYPE_CHECKING:
-    from nerfstudio.viewer.viewer import Viewer
+from abcd_ns.viewer.texts import block_table, headline, memory_table, sweep_line
 
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 5.0
@@ -60,7 +58,7 @@ class AbcdPanel(ViewerControl):
     def __init__(self, model: Drawn, views: Callable[[], list[View]]) -> None:
         self._model, self._views = model, views
         self._coordinator: Trainer | None = None
-        self._board = Board()
+        self._history = RunHistory()
         self._controls: Controls | None = None
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
@@ -70,7 +68,7 @@ class AbcdPanel(ViewerControl):
         self._first_look: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
-    def _setup(self, viewer: "Viewer") -> None:
+    def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
         share, server = viewer.config.make_share_url, viewer.viser_server
         if (rules := rules_of(server)) is not None:
@@ -90,7 +88,7 @@ class AbcdPanel(ViewerControl):
     def follow(self, coordinator: Trainer) -> None:
         """From now on show how this run goes."""
         self._coordinator = coordinator
-        self._board = Board.resumed(coordinator.state, coordinator.stopwatch.seconds)
+        self._history = RunHistory.resumed(coordinator.state, coordinator.stopwatch.seconds)
         if self._controls is not None:
             self._lay_out()
             coordinator.announce.subscribe(self)
@@ -98,7 +96,7 @@ class AbcdPanel(ViewerControl):
 
     def __call__(self, event: Event) -> None:
         """Take an event in; the browser is told at visits' ends and otherwise once in a while."""
-        self._board.note(event, self._seconds)
+        self._history.note(event, self._seconds)
         self._layers = f"layers {event.done} of {event.total}" if isinstance(event, LayersDrawn) else ""
         due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
         if due or isinstance(event, (VisitBegan, VisitEnded, SweepEnded)):
@@ -143,18 +141,18 @@ class AbcdPanel(ViewerControl):
             self._report(self._coordinator)
 
     def _report(self, coordinator: Trainer) -> None:
-        board, state, seconds = self._board, coordinator.state, self._seconds
-        share, sweep = sweep_share(board, state), ""
-        if board.sweep is not None and not coordinator.finished:
-            visits = board.sweep_visits + len(state.queue) + (board.visit is not None)
-            left = seconds_left(seconds - board.sweep_began, share)
-            sweep = sweep_line(board.sweep, board.sweep_visits, visits, left)
+        history, state, seconds = self._history, coordinator.state, self._seconds
+        share, sweep = sweep_share(history, state), ""
+        if history.sweep is not None and not coordinator.finished:
+            visits = history.sweep_visits + len(state.queue) + (history.visit is not None)
+            left = seconds_left(seconds - history.sweep_began, share)
+            sweep = sweep_line(history.sweep, history.sweep_visits, visits, left)
         where, left = self._where(state.active), seconds_left(seconds, coordinator.progress)
         self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)
         self._controls.progress(coordinator.progress, share)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
             self._curve_drawn = self._updated
-            self._controls.draw_curve(board.curve)
+            self._controls.draw_curve(history.curve)
 
     def _where(self, active: ActiveVisit | None) -> str:
         if active is None:
@@ -175,7 +173,7 @@ class AbcdPanel(ViewerControl):
         active = self._coordinator.state.active
         whole = active is not None and active.is_whole
         counts = {block: None if whole else scene.count(block) for block in blocks}
-        return self._board.rows(counts, self._coordinator.state.views)
+        return self._history.rows(counts, self._coordinator.state.views)
 
     def _memory(self) -> list[tuple[str, int, int]]:
         rows = [("RAM", psutil.Process().memory_info().rss, psutil.virtual_memory().total)]
@@ -208,9 +206,9 @@ class AbcdPanel(ViewerControl):
         return self.viewer.train_lock or nullcontext()
 
     def _chosen_block(self) -> int | None:
-        if self._controls.block is not None or self._board.visit is None:
+        if self._controls.block is not None or self._history.visit is None:
             return self._controls.block
-        return self._board.visit.block
+        return self._history.visit.block
 
     def _show_cameras(self) -> None:
         block = self._chosen_block() if self._controls.cameras else None

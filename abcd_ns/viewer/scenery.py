@@ -12,8 +12,8 @@ from torch import Tensor
 
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.types import View
-from abcd_ns.viewer.board import Status
 from abcd_ns.viewer.boxes import SCENE_SCALE, center, frame_mesh
+from abcd_ns.viewer.run_history import Status
 
 COLORS = {
     Status.UNTRAINED: (150, 150, 160),

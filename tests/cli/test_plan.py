@@ -12,7 +12,7 @@ from abcd_ns.cli.plan.forecast import Share, device_shares, disk_shares, views_o
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.room import GB, Room
+from abcd_ns.nerfstudio.fit import GB, Fit
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 FITS = (Share("something", 1),)
@@ -42,7 +42,7 @@ def test_views_of_blocks_counts_as_a_loop_over_points_does():
 
 def test_a_forecast_adds_up():
     found = forecast(capture(), Wanted(blocks=4, max_gaussians=1000, steps=100), Console(quiet=True))
-    assert (found.room.blocks, sum(found.points_of_block), len(found.views_of_block)) == (4, 400, 4)
+    assert (found.fit.blocks, sum(found.points_of_block), len(found.views_of_block)) == (4, 400, 4)
     assert found.batch == 4
     assert found.seconds_per_step > 0
     low, high = found.hours
@@ -57,8 +57,8 @@ def test_a_device_budget_decides_how_many_blocks():
         forecast(capture(), Wanted(max_gaussians=3_000_000, device_budget_gb=gb), Console(quiet=True))
         for gb in (40, 3)
     )
-    assert few.room.blocks_at_the_end == few.room.blocks == many.room.blocks == 1
-    assert many.room.blocks_at_the_end > 2
+    assert few.fit.blocks_at_the_end == few.fit.blocks == many.fit.blocks == 1
+    assert many.fit.blocks_at_the_end > 2
     assert sum(share.nbytes for share in many.device) <= 3 * GB
 
 
@@ -68,38 +68,38 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
     found = forecast(
         dataclasses.replace(small, views=large), Wanted(device_budget_gb=0.15), Console(quiet=True)
     )
-    assert 0 < found.room.crop_pixels < 260_000
+    assert 0 < found.fit.crop_pixels < 260_000
     assert sum(share.nbytes for share in found.device) <= 0.15 * GB
     assert not found.warnings
 
 
 def test_a_device_keeps_layers_and_photos_besides():
     limit = DeviceNeeds(100, 4).block_limit(GB)
-    room = Room(blocks=2, limit=limit, sole=10**9, budget=GB, gaussians=10**9, batch=4)
-    shares = device_shares(room, DeviceNeeds(100, 4))
+    fit = Fit(blocks=2, limit=limit, sole=10**9, budget=GB, gaussians=10**9, batch=4)
+    shares = device_shares(fit, DeviceNeeds(100, 4))
     assert [share.nbytes for share in shares[2:]] == [GB // 8, GB // 8]
     assert GB - DeviceNeeds(100, 4).gaussian_bytes < sum(share.nbytes for share in shares) <= GB
-    alone = device_shares(dataclasses.replace(room, blocks=1), DeviceNeeds(100, 1, levels=0))
+    alone = device_shares(dataclasses.replace(fit, blocks=1), DeviceNeeds(100, 1, levels=0))
     assert [share.nbytes for share in alone[2:]] == [0, GB // 8]
 
 
 def test_disk_holds_two_generations_and_a_checkpoint():
-    room = Room(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000, batch=4)
+    fit = Fit(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000, batch=4)
     needs = DeviceNeeds(100, 1)
-    assert sum(share.nbytes for share in disk_shares(room, needs)) == 1000 * 236 * (2 * 3 + 1)
-    assert device_shares(room, needs)[0].nbytes == 1000 * needs.gaussian_bytes
+    assert sum(share.nbytes for share in disk_shares(fit, needs)) == 1000 * 236 * (2 * 3 + 1)
+    assert device_shares(fit, needs)[0].nbytes == 1000 * needs.gaussian_bytes
 
 
 @pytest.mark.parametrize("where", ["device", "ram", "disk"])
 def test_what_does_not_fit_is_said_with_what_to_do(where):
     shares = {"device": FITS, "ram": FITS, "disk": FITS, where: (Share("too much", 2**60),)}
-    (line,) = warnings_of(Room(2, 100, 100, GB, 100, 4), (5, 5), **shares)
+    (line,) = warnings_of(Fit(2, 100, 100, GB, 100, 4), (5, 5), **shares)
     assert {"device": "on the device", "ram": "of RAM", "disk": "of disk"}[where] in line
     assert ": " in line
 
 
 def test_blocks_that_hardly_any_view_sees_are_counted():
-    (line,) = warnings_of(Room(3, 100, 100, GB, 100, 4), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
+    (line,) = warnings_of(Fit(3, 100, 100, GB, 100, 4), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
     assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
 
 

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.input_errors import SHOWN, InputError, Problems
 from tests.data.dataparser_scenes import (
     NAMES,
     REAL,
@@ -217,12 +217,13 @@ def test_all_bad_photos_are_listed_at_once(scene):
 
 
 def test_long_lists_are_cut_with_a_count():
-    problems = Problems(limit=3)
-    for i in range(5):
+    problems = Problems()
+    for i in range(SHOWN + 2):
         problems.add(f"file\n{i}")
     with pytest.raises(InputError) as caught:
         problems.raise_if_any()
-    assert str(caught.value).splitlines()[2:] == ["file\\n2", "... and 2 more like these (5 in all)."]
+    last = [f"file\\n{SHOWN - 1}", f"... and 2 more like these ({SHOWN + 2} in all)."]
+    assert str(caught.value).splitlines()[SHOWN - 1 :] == last
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.photos import Photos, PhotoSource, area_reduce, default_budget
 from abcd_ns.data.scene import Lens
 from abcd_ns.data.undistort import distort, undistortion
-from abcd_ns.engine.types import Crop
 
 WIDTH, HEIGHT = 40, 24
 
@@ -75,7 +74,6 @@ def test_photo_that_needs_nothing_is_bit_equal(sources):
     photos = Photos(sources)
     for i in range(len(sources)):
         assert np.array_equal(photos.image(i).numpy(), noise(i))
-        assert photos.size(i) == (WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -101,25 +99,6 @@ def test_exif_orientation_is_not_applied(tmp_path):
     Image.fromarray(noise(0)).save(tmp_path / "p.png", exif=exif)
     photos = Photos([PhotoSource(tmp_path / "p.png", (WIDTH, HEIGHT), (WIDTH, HEIGHT))])
     assert np.array_equal(photos.image(0).numpy(), noise(0))
-
-
-@given(x=st.integers(0, WIDTH - 1), y=st.integers(0, HEIGHT - 1), data=st.data())
-@settings(derandomize=True, max_examples=20, deadline=None)
-def test_crop_is_a_view_of_the_photo(tmp_path_factory, x, y, data):
-    crop = Crop(x, y, data.draw(st.integers(1, WIDTH - x)), data.draw(st.integers(1, HEIGHT - y)))
-    path = saved(tmp_path_factory.mktemp("crop") / "p.png", noise(0))
-    photos = Photos([PhotoSource(path, (WIDTH, HEIGHT), (WIDTH, HEIGHT))])
-    pixels = photos.crop(0, crop)
-    expected = noise(0)[y : y + crop.height, x : x + crop.width]
-    assert pixels.dtype == torch.uint8
-    assert np.array_equal(pixels.numpy(), expected)
-    assert pixels.untyped_storage().data_ptr() == photos.image(0).untyped_storage().data_ptr()
-
-
-@pytest.mark.parametrize("crop", [Crop(-1, 0, 4, 4), Crop(0, 0, WIDTH + 1, 4), Crop(0, HEIGHT - 3, 4, 4)])
-def test_crop_over_the_border_is_an_error(sources, crop):
-    with pytest.raises(ValueError, match="border"):
-        Photos(sources).crop(0, crop)
 
 
 # Memory

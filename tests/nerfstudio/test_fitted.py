@@ -8,13 +8,13 @@ import torch
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
-from abcd_ns.nerfstudio.room import GB, Room
+from abcd_ns.nerfstudio.fit import GB, Fit
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import write_scene
 
 STEPS = 16
-ROOM = Room(blocks=3, limit=5000, sole=5000, budget=GB, gaussians=300, batch=2, crop_pixels=600)
+FIT = Fit(blocks=3, limit=5000, sole=5000, budget=GB, gaussians=300, batch=2, crop_pixels=600)
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +31,12 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
 
     monkeypatch.setattr(AbcdDataManager, "photo", noted)
     with monkeypatch.context() as patched:
-        patched.setattr("abcd_ns.nerfstudio.pipeline.find_room", lambda *_: ROOM)
+        patched.setattr("abcd_ns.nerfstudio.pipeline.find_fit", lambda *_: FIT)
         straight = run(configure(data, tmp_path / "straight", blocks=0, steps=STEPS))
         stopped = run(configure(data, tmp_path / "stopped", blocks=0, steps=STEPS), stop_after=9)
     assert "a step draws 0.0006 megapixels of 2 views" in capsys.readouterr().out
     with ParameterStore.open(stopped.base_dir / "abcd/store", read_only=True) as store:
-        assert {name: store.header[name] for name in ROOM.limits} == ROOM.limits
+        assert {name: store.header[name] for name in FIT.limits} == FIT.limits
     resumed = run(configure(data, tmp_path / "again", blocks=0, steps=STEPS, load_dir=stopped.base_dir))
     assert resumed.pipeline.coordinator.config.limits.crop_pixels == 600
     assert resumed.pipeline.coordinator.batch == 2

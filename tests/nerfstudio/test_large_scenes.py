@@ -45,7 +45,7 @@ def drawn(monkeypatch) -> list[int]:
 
 
 def short_of_memory(monkeypatch, gaussians: int = 1) -> None:
-    monkeypatch.setattr(AbcdModel, "_room", lambda _: gaussians)
+    monkeypatch.setattr(AbcdModel, "_most_at_once", lambda _: gaussians)
 
 
 def pictures(pipeline) -> list[dict]:
@@ -119,6 +119,6 @@ def test_a_scene_that_is_too_large_stays_on_the_cpu(trained, monkeypatch):
     assert {value.device.type for value in model.gauss_params.values()} == {"cpu"}
     assert torch.equal(model.means, checkpoint["pipeline"]["_model.gauss_params.means"])
     assert all(name in model.state_dict() for name in ("gauss_params.means", "gauss_params.quats"))
-    monkeypatch.setattr(AbcdModel, "_room", lambda _: 10**9)
+    monkeypatch.setattr(AbcdModel, "_most_at_once", lambda _: 10**9)
     with pytest.raises(Exception, match="meta"):  # where there is room, it goes there
         pipeline.load_pipeline(checkpoint["pipeline"], checkpoint["step"])

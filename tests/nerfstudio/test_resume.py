@@ -14,7 +14,7 @@ from abcd_ns.engine.store import ParameterStore, crash_points
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run.run_folder import MadeFor
+from abcd_ns.nerfstudio.run.resuming import MadeFor
 from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
 from tests.nerfstudio.test_training import STEPS, configure, run
 from tests.reference.colmap_scene import write_scene
@@ -281,7 +281,7 @@ def test_no_result_depends_on_the_ram_budget_and_none_exceeds_it(data, undisturb
         largest.append(max(blocks, default=0))
 
     trainer = run(config, after_step=measure)
-    layer = 4 * 4 * np.prod(trainer.pipeline.datamanager.train_dataset.photos.size(0))
+    layer = 4 * 4 * np.prod(trainer.pipeline.datamanager.train_dataset.photos.sources[0].size)
     assert max(peaks) <= budget + layer + max(largest)
     assert max(peaks) > min(budget, layer) / 2
     assert_same(trainer.base_dir, undisturbed)

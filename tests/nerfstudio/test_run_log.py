@@ -13,7 +13,7 @@ import pytest
 from abcd_ns.engine.events import HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.nerfstudio.run import run_log
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE, Meter, RunLog
-from abcd_ns.nerfstudio.settings import SETTINGS_FILE, flat_options
+from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE, flat_options
 from tests.nerfstudio.test_training import STEPS, configure, run
 from tests.reference.colmap_scene import write_scene
 

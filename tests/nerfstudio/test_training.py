@@ -17,8 +17,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.nerfstudio.config import AbcdTrainerConfig
-from abcd_ns.nerfstudio.trainer import AbcdTrainer
+from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
 
 STEPS = 36
@@ -63,8 +62,8 @@ def run(
         pipeline = trainer.pipeline
         end_step = pipeline._after_step
 
-        def watched(who) -> None:
-            end_step(who)
+        def watched() -> None:
+            end_step()
             if after_step is not None:
                 after_step(trainer)
             if trainer.step + 1 == stop_after:

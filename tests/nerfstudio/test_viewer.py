@@ -14,7 +14,7 @@ from nerfstudio.viewer.viewer import Viewer
 from PIL import Image
 
 from abcd_ns import methods
-from abcd_ns.nerfstudio.config import at_home
+from abcd_ns.nerfstudio.trainer import on_this_machine
 from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Show
@@ -250,7 +250,7 @@ def test_ns_viewer_stays_on_this_machine_and_shows_blocks(finished):
     ],
 )
 def test_other_networks_are_the_users_choice(host, arguments, expected):
-    assert at_home(ViewerConfig(websocket_host=host), arguments).websocket_host == expected
+    assert on_this_machine(ViewerConfig(websocket_host=host), arguments).websocket_host == expected
 
 
 def test_every_method_listens_on_this_machine_alone():

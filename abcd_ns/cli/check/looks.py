@@ -12,7 +12,7 @@ import numpy as np
 
 from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.picture_files import has_alpha, open_picture, orientation, undecodable
-from abcd_ns.late_bar import LateBar
+from abcd_ns.progress_bar import ProgressBar
 
 REDUCED = (64, 64)
 """JPEG photos are decoded at an eighth of their size, or a larger one of at least this many pixels."""
@@ -47,7 +47,7 @@ def look(source: PhotoSource) -> Look:
 def look_at_all(sources: Sequence[PhotoSource]) -> tuple[Look, ...]:
     """Decode all photos, several at a time, with a progress bar where that takes a while."""
     looks = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool, LateBar("Looking at photos", len(sources)) as bar:
+    with ThreadPoolExecutor(os.cpu_count()) as pool, ProgressBar("Looking at photos", len(sources)) as bar:
         for found in pool.map(look, sources):
             looks.append(found)
             bar.advance()

@@ -9,7 +9,7 @@ from typing import Any
 from abcd_ns.cli.doctor.hardware import Hardware, look_at_hardware
 from abcd_ns.cli.doctor.kernels import Kernels, look_at_kernels
 from abcd_ns.cli.doctor.packages import STARTED, Packages, look_at_packages
-from abcd_ns.late_bar import LateBar
+from abcd_ns.progress_bar import ProgressBar
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Facts:
 def gather() -> Facts:
     """Look at everything. Compiles nothing and writes nothing."""
     hardware = kernels = None
-    with LateBar("Looking at this machine", len(STARTED) + 3) as bar:
+    with ProgressBar("Looking at this machine", len(STARTED) + 3) as bar:
         packages = look_at_packages(bar.advance)
         if "torch" not in packages.broken:
             hardware = look_at_hardware()

@@ -18,7 +18,7 @@ from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run.run_folder import STATE, STORE
+from abcd_ns.nerfstudio.run import STATE, STORE
 
 TRANSFORMS = "dataparser_transforms.json"
 """nerfstudio's file that tells how the data's frame became the run's."""

@@ -35,9 +35,9 @@ from abcd_ns.engine.train.memory import DeviceNeeds, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.config import AbcdDataManagerConfig
+from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.room import GB, Demand, Room, device_budget, find_room
+from abcd_ns.nerfstudio.fit import GB, Demand, Fit, device_budget, find_fit
 from abcd_ns.nerfstudio.views import views_of
 
 R = TypeVar("R")
@@ -141,39 +141,39 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     pixels = max(view.full.pixels for view in views)
     most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
     demand = Demand(pixels, len(points), training, most=most, factor=capture.factor, on_cpu=on_cpu)
-    room = find_room(device_budget(wanted.device_budget_gb, device), demand)
-    room = replace(room, blocks=wanted.blocks or room.blocks)
-    training = replace(training, limits=replace(training.limits, **room.limits))
-    tree = build_kd(points, room.blocks)
+    fit = find_fit(device_budget(wanted.device_budget_gb, device), demand)
+    fit = replace(fit, blocks=wanted.blocks or fit.blocks)
+    training = replace(training, limits=replace(training.limits, **fit.limits))
+    tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
     seen = _said(console, "Looking which view sees which block", lambda: views_of_blocks(tree, points, views))
-    batch = views_per_step(training.batch, room.blocks, training.limits.batch_limit)
-    options = (training.sh_degree, training.limits.crop_pixels, levels_of(room.blocks), not on_cpu)
+    batch = views_per_step(training.batch, fit.blocks, training.limits.batch_limit)
+    options = (training.sh_degree, training.limits.crop_pixels, levels_of(fit.blocks), not on_cpu)
     needs = DeviceNeeds(pixels, batch, *options)
-    fullest = owner == owner.bincount(minlength=room.blocks).argmax()
+    fullest = owner == owner.bincount(minlength=fit.blocks).argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
     seconds = _said(console, "Timing a step", lambda: time_steps(gaussians, spread, training, batch))
     shares = {
-        "device": device_shares(room, needs),
-        "ram": ram_shares(room, needs, sum(3 * view.full.pixels for view in views), default_budget()),
-        "disk": disk_shares(room, needs),
+        "device": device_shares(fit, needs),
+        "ram": ram_shares(fit, needs, sum(3 * view.full.pixels for view in views), default_budget()),
+        "disk": disk_shares(fit, needs),
     }
     return Forecast(
-        room=room,
+        fit=fit,
         points=len(points),
         batch=batch,
         views_of_block=seen,
-        points_of_block=tuple(owner.bincount(minlength=room.blocks).tolist()),
+        points_of_block=tuple(owner.bincount(minlength=fit.blocks).tolist()),
         **shares,
         steps=wanted.steps,
         seconds_per_step=seconds,
-        warnings=tuple(warnings_of(room, seen, **shares)),
+        warnings=tuple(warnings_of(fit, seen, **shares)),
     )
 
 
 def warnings_of(
-    room: Room,
+    fit: Fit,
     seen: tuple[int, ...],
     device: tuple[Share, ...],
     ram: tuple[Share, ...],
@@ -181,9 +181,9 @@ def warnings_of(
 ) -> list[str]:
     """What would not fit, each with what to do about it."""
     lines = []
-    if (needed := _total(device)) > room.budget:
+    if (needed := _total(device)) > fit.budget:
         lines.append(
-            f"{needed / GB:.1f} GB on the device, but {room.budget / GB:.1f} GB may be taken: leave --blocks "
+            f"{needed / GB:.1f} GB on the device, but {fit.budget / GB:.1f} GB may be taken: leave --blocks "
             "out, or give more of them."
         )
     if (needed := _total(ram)) > (free := psutil.virtual_memory().available):
@@ -205,14 +205,14 @@ def warnings_of(
 
 def print_forecast(found: Forecast, console: Console) -> None:
     """Tables for people."""
-    room = found.room
-    console.print(f"[bold]{room.in_words()}[/]", highlight=False)
-    if room.blocks_at_the_end > room.blocks:
+    fit = found.fit
+    console.print(f"[bold]{fit.in_words()}[/]", highlight=False)
+    if fit.blocks_at_the_end > fit.blocks:
         console.print(
-            f"In the end {room.blocks_at_the_end} blocks, if {room.gaussians:,} Gaussians come of it.",
+            f"In the end {fit.blocks_at_the_end} blocks, if {fit.gaussians:,} Gaussians come of it.",
             highlight=False,
         )
-    if room.blocks > 1:
+    if fit.blocks > 1:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
         for title in ("by block", "least", "median", "most"):
             table.add_column(title, justify="left" if title == "by block" else "right")
@@ -230,7 +230,7 @@ def print_forecast(found: Forecast, console: Console) -> None:
     low, high = found.hours
     console.print(
         f"{found.steps:,} steps of {found.batch} view{'s' * (found.batch > 1)}: {_hours(low)} with as many "
-        f"Gaussians as points, {_hours(high)} with {room.gaussians:,}; a step on the initial points took "
+        f"Gaussians as points, {_hours(high)} with {fit.gaussians:,}; a step on the initial points took "
         f"{found.seconds_per_step:.3f} s.",
         highlight=False,
     )

@@ -13,7 +13,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.room import Room
+from abcd_ns.nerfstudio.fit import Fit
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
@@ -38,7 +38,7 @@ class Share:
 class Forecast:
     """All that `abcd plan` prints."""
 
-    room: Room
+    fit: Fit
     points: int
     batch: int
     views_of_block: tuple[int, ...]
@@ -55,9 +55,9 @@ class Forecast:
     @property
     def hours(self) -> tuple[float, float]:
         """Of the whole run: with as many Gaussians as points, and with as many as are expected."""
-        layers = 1 + LAYER_SHARE * (self.room.blocks_at_the_end > 1)
+        layers = 1 + LAYER_SHARE * (self.fit.blocks_at_the_end > 1)
         low = self.steps * self.seconds_per_step * layers / 3600
-        return low, low * max(self.room.gaussians / max(self.points, 1), 1.0)
+        return low, low * max(self.fit.gaussians / max(self.points, 1), 1.0)
 
 
 def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple[int, ...]:
@@ -76,22 +76,22 @@ def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple
     return tuple(counts.tolist())
 
 
-def device_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
+def device_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
     """What a visit to a block of the expected size takes on the device."""
-    limit = room.sole if room.blocks == 1 else room.limit
-    largest = min(-(-room.gaussians // room.blocks), limit)
+    limit = fit.sole if fit.blocks == 1 else fit.limit
+    largest = min(-(-fit.gaussians // fit.blocks), limit)
     trained = largest * needs.gaussian_bytes
     return (
         Share(f"a block of {largest:,} Gaussians in training", trained),
         Share("a step's pictures, or layers while they are drawn", needs.fixed_bytes),
-        Share("layers that are kept", needs.layer_bytes(room.budget)),
-        Share("photos that are kept", needs.photo_bytes(room.budget)),
+        Share("layers that are kept", needs.layer_bytes(fit.budget)),
+        Share("photos that are kept", needs.photo_bytes(fit.budget)),
     )
 
 
-def ram_shares(room: Room, needs: DeviceNeeds, photo_bytes: int, photo_budget: int) -> tuple[Share, ...]:
+def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int) -> tuple[Share, ...]:
     """What the rest takes in RAM, beside Python and torch."""
-    scene = room.gaussians * needs.parameter_bytes
+    scene = fit.gaussians * needs.parameter_bytes
     return (
         Share("decoded photos", min(photo_bytes, photo_budget)),
         Share("frozen blocks", min(scene, FROZEN_BYTES)),
@@ -99,9 +99,9 @@ def ram_shares(room: Room, needs: DeviceNeeds, photo_bytes: int, photo_budget: i
     )
 
 
-def disk_shares(room: Room, needs: DeviceNeeds) -> tuple[Share, ...]:
+def disk_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
     """What a run leaves and holds on disk."""
-    scene = room.gaussians * needs.parameter_bytes
+    scene = fit.gaussians * needs.parameter_bytes
     return (
         Share("blocks with their optimiser's state", GENERATIONS * STATES * scene),
         Share("checkpoint", scene),

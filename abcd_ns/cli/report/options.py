@@ -4,9 +4,9 @@ import shlex
 from dataclasses import dataclass
 
 from abcd_ns.cli.report.run_folder import default_config
-from abcd_ns.nerfstudio.config import MIRRORED
 from abcd_ns.nerfstudio.machine import without_home
-from abcd_ns.nerfstudio.settings import Plain, Settings, flat_options
+from abcd_ns.nerfstudio.options import MIRRORED
+from abcd_ns.nerfstudio.run.settings import Plain, Settings, flat_options
 
 ABOUT_THE_PLACE = {
     "data",

@@ -19,10 +19,12 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.configs import registered
 from abcd_ns.lab.runs.options import set_options
 from abcd_ns.lab.runs.records import read_record
-from abcd_ns.nerfstudio.config import AbcdTrainerConfig
-from abcd_ns.nerfstudio.pipeline import STORE, AbcdPipeline
+from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.settings import SCHEMA, SETTINGS_FILE, Settings
+from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings
+from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 CHECKPOINTS = "nerfstudio_models"
 _DAMAGE = (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, UnpicklingError)
@@ -89,7 +91,9 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     Raises:
         UserError: the data is gone, or the run's options or checkpoint do not fit this version.
     """
-    where, config = str(run.path / "abcd" / SETTINGS_FILE), _registered(run.settings.method)
+    versions, config = run.settings.versions, _registered(run.settings.method)
+    wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
+    where = f"{run.path / 'abcd' / SETTINGS_FILE} (written by {wrote})"
     prefix = "pipeline."
     options = {n: v for n, v in run.settings.options.items() if n.startswith(prefix)}
     set_options(config.pipeline, {n.removeprefix(prefix): v for n, v in options.items()}, where)
@@ -110,7 +114,7 @@ def default_config(method: str) -> AbcdTrainerConfig | None:
         config = _registered(method)
     except UserError:
         return None
-    config.pipeline.model.mirror(config.pipeline.training)
+    mirror(config.pipeline.training, config.pipeline.model)
     return config
 
 

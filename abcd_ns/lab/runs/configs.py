@@ -15,8 +15,10 @@ from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.job import HELD_OUT_EVERY, Job
 from abcd_ns.lab.runs.options import change_options
-from abcd_ns.nerfstudio.config import AbcdPipelineConfig, AbcdTrainerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
+from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
@@ -68,7 +70,7 @@ def check_options(job: Job) -> None:
         UserError: they do not.
     """
     pipeline = _abcd(job).pipeline
-    pipeline.model.mirror(pipeline.training)
+    mirror(pipeline.training, pipeline.model)
     if pipeline.blocks < 1:
         raise UserError(f"{job.variant.name}: blocks must be 1 or more, not {pipeline.blocks}.")
 

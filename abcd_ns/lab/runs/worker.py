@@ -28,7 +28,6 @@ from abcd_ns.lab.runs.job import Job, evenly
 from abcd_ns.lab.runs.records import decode, encode, read_json, write_json
 from abcd_ns.lab.runs.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.training import Training
-from abcd_ns.nerfstudio.config import AbcdTrainerConfig
 from abcd_ns.nerfstudio.machine import (
     describe_versions,
     disk_bytes,
@@ -37,7 +36,8 @@ from abcd_ns.nerfstudio.machine import (
     without_home,
 )
 from abcd_ns.nerfstudio.metrics import lpips_missing
-from abcd_ns.nerfstudio.pipeline import STORE
+from abcd_ns.nerfstudio.run import STORE
+from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 RUN_FILE = "run.json"
 """Written when all is done, beside the job."""

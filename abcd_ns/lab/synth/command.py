@@ -20,7 +20,7 @@ from abcd_ns.lab.synth.court import Layout, Site
 from abcd_ns.lab.synth.render import render
 from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points
 from abcd_ns.lab.synth.world import World
-from abcd_ns.late_bar import LateBar
+from abcd_ns.progress_bar import ProgressBar
 
 FORMAT = 1
 """Raised whenever the same settings would draw another scene."""
@@ -132,7 +132,7 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[list[Camera]
         picture = render(world, camera, lens, settings.supersample)
         Image.fromarray(picture).save(out / "images" / camera.name, optimize=False)
 
-    parts, bar = [], LateBar("Drawing", len(cameras), console)
+    parts, bar = [], ProgressBar("Drawing", len(cameras), console)
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool, bar:
         for court in range(settings.courts):
             own = range(court * count, (court + 1) * count)

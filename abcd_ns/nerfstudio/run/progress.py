@@ -2,7 +2,6 @@
 
 import math
 import time
-from datetime import timedelta
 
 import psutil
 import torch
@@ -22,6 +21,7 @@ from abcd_ns.engine.events import (
 from abcd_ns.engine.train.health_record import MENDED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.viewer.texts import clock
 
 SECONDS_BETWEEN_LINES = 10.0
 """Where the output is no terminal (a log file, say), a line is printed this often."""
@@ -76,7 +76,7 @@ class ProgressReport:
         state = self._coordinator.state
         CONSOLE.print(
             f"Trained {state.step:,} steps in {state.visit} visits, "
-            f"{_clock(self._coordinator.stopwatch.seconds)}; {self._summary()}",
+            f"{clock(self._coordinator.stopwatch.seconds)}; {self._summary()}",
             highlight=False,
         )
         lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
@@ -118,7 +118,7 @@ class ProgressReport:
         else:
             where = f"sweep {self._sweep} block {'-' if visit is None else visit.block + 1}/{blocks}"
         quality = "" if self._psnr is None else f"{self._psnr:.2f} dB  "
-        left = _clock(self._seconds_left())
+        left = clock(self._seconds_left())
         return f"{where}  {what}  {quality}{coordinator.count():,} Gaussians  {_memory()}  {left} left"
 
     def _seconds_left(self) -> float:
@@ -144,7 +144,3 @@ def _memory() -> str:
     if not torch.cuda.is_available():
         return resident
     return f"{torch.cuda.max_memory_allocated() / 2**30:.1f} GB GPU, {resident}"
-
-
-def _clock(seconds: float) -> str:
-    return str(timedelta(seconds=int(seconds)))

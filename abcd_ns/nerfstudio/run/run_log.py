@@ -7,12 +7,13 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import psutil
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from abcd_ns.data.photos import Photos
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.nerfstudio.machine import peak_rss_bytes
@@ -28,11 +29,8 @@ from abcd_ns.nerfstudio.run.log_lines import (
     VisitEndLine,
     VisitLine,
 )
-from abcd_ns.nerfstudio.run.run_folder import STATE
-from abcd_ns.nerfstudio.settings import write_settings
-
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.trainer import AbcdTrainer
+from abcd_ns.nerfstudio.run.resuming import RunRequest
+from abcd_ns.nerfstudio.run.settings import write_settings
 
 LOG_FILE = "log.jsonl"
 SECONDS_BETWEEN_SAMPLES = 1.0
@@ -187,18 +185,17 @@ def past_of(coordinator: Trainer, log: Path) -> list[str]:
     return kept
 
 
-def keep_log(trainer: "AbcdTrainer", coordinator: Trainer) -> RunLog:
+def keep_log(run: RunRequest, photos: Photos, coordinator: Trainer) -> RunLog:
     """Begin the log of a run, and write its settings beside it."""
-    folder, photos = trainer.base_dir / STATE, trainer.pipeline.datamanager.train_dataset.photos
-    write_settings(trainer.config, folder)
+    write_settings(run.config, run.folder)
     scene = coordinator.scene
     meters = (
         Meter("photos", lambda: photos.cached_bytes, photos.budget_bytes),
         Meter("frozen blocks", lambda: scene.cached_bytes, scene.ram_bytes),
         Meter("layers", lambda: coordinator.layer_bytes, coordinator.layer_limit),
     )
-    earlier = None if trainer.resumed_from is None else trainer.resumed_from.store.parent / LOG_FILE
-    return RunLog(coordinator, folder / LOG_FILE, meters, earlier)
+    earlier = None if run.resumed_from is None else run.resumed_from.store.parent / LOG_FILE
+    return RunLog(coordinator, run.folder / LOG_FILE, meters, earlier)
 
 
 def _finite(value: float | None) -> float | None:

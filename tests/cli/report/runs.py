@@ -13,7 +13,7 @@ from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.lab.runs.run import ViewScore
 from abcd_ns.nerfstudio.run.log_lines import KINDS
-from abcd_ns.nerfstudio.settings import SCHEMA, Settings, flat_options
+from abcd_ns.nerfstudio.run.settings import SCHEMA, Settings, flat_options
 from tests.lab.compare.records import MACHINE, VERSIONS
 
 TRAINING = {

@@ -17,7 +17,7 @@ from abcd_ns.cli.report.run_folder import load_pipeline, open_run
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.settings import SETTINGS_FILE
+from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HELD_OUT, write_scene
 
@@ -148,7 +148,7 @@ def test_options_that_this_version_has_not_are_named(copied):
     path = copied / "abcd" / SETTINGS_FILE
     settings = json.loads(path.read_text())
     for name, value, message in (
-        ("pipeline.training.magic", 1, "there is no option 'training.magic'"),
+        ("pipeline.training.magic", 1, r"\(written by abcd_ns .*\): there is no option 'training.magic'"),
         ("pipeline.training.batch", "many", "training.batch is 'many'; it must be a whole number"),
     ):
         path.write_text(json.dumps({**settings, "options": {**settings["options"], name: value}}))

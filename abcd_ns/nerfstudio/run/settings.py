@@ -47,30 +47,21 @@ class Settings:
 
 def write_settings(config: TrainerConfig, folder: Path) -> None:
     """Write `folder`/settings.json about a training that is about to begin; the folder must exist."""
-    content = dataclasses.asdict(describe_settings(config))
-    write_file(folder / SETTINGS_FILE, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
-
-
-def describe_settings(config: TrainerConfig) -> Settings:
-    """What this configuration trains, here and now."""
     data = Path(config.pipeline.datamanager.data)
-    return Settings(
+    path = data.resolve()
+    settings = Settings(
         schema=SCHEMA,
         method=config.method_name,
-        scene=scene_name(data),
+        scene=path.parent.name if path.suffix == ".json" else path.name,
         data=str(data),
-        data_path=str(data.resolve()),
+        data_path=str(path),
         begun=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         options=flat_options(config),
         versions=describe_versions(),
         machine=describe_machine(),
     )
-
-
-def scene_name(data: Path) -> str:
-    """What a scene is called: the name of its folder."""
-    path = data.resolve()
-    return path.parent.name if path.suffix == ".json" else path.name
+    content = json.dumps(dataclasses.asdict(settings), indent=2, allow_nan=False)
+    write_file(folder / SETTINGS_FILE, (content + "\n").encode())
 
 
 def flat_options(config: Any) -> dict[str, Plain]:

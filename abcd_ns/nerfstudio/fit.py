@@ -1,4 +1,4 @@
-"""How many blocks a scene needs on this device, and how much of its photos a step can draw."""
+"""What fits this machine: how many blocks, how much of a photo a step draws, and what is kept in RAM."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,6 +20,10 @@ FREE_SHARE = 0.9
 """Of a GPU's free memory: the rest is for what the allocator cannot use."""
 RAM_SHARE = 0.25
 """Of the machine's RAM, where the CPU is the device."""
+MOST_RAM = 8 << 30
+"""Bytes: of the automatic budget for what could be read or drawn again."""
+KEPT_SHARE = 0.4
+"""Of the machine's RAM for the same, where that is less."""
 LEAST_BLOCK = 1_000
 """A block with room for fewer Gaussians is not worth a visit."""
 PICTURE_SHARE = 0.75
@@ -34,7 +38,7 @@ MOST_DOWNSCALE = 64
 
 
 @dataclass(frozen=True)
-class Room:
+class Fit:
     """What a budget allows."""
 
     blocks: int
@@ -126,7 +130,7 @@ class Demand:
         return replace(self, pixels=max(self.pixels // times**2, 1), factor=self.factor * times)
 
 
-def find_room(budget: int, demand: Demand) -> Room:
+def find_fit(budget: int, demand: Demand) -> Fit:
     """The fewest blocks whose visits stay within `budget` bytes, on as many views of a step as leave room.
 
     What does not fit is tried with fewer views in a step, unless their number is set, then with parts of a
@@ -135,14 +139,14 @@ def find_room(budget: int, demand: Demand) -> Room:
     Raises:
         UserError: the budget has no room for any block worth a visit; says what would help.
     """
-    room = _room(budget, demand)
-    if room is None:
+    fit = _fit(budget, demand)
+    if fit is None:
         raise UserError(_refusal(budget, demand))
-    return room
+    return fit
 
 
-def _room(budget: int, demand: Demand) -> Room | None:
-    """As `find_room`; None where nothing fits."""
+def _fit(budget: int, demand: Demand) -> Fit | None:
+    """As `find_fit`; None where nothing fits."""
     batch, crop = _views_and_crop(budget, demand)
     # A single block has no neighbours and draws one view a step, so it may be larger.
     sole_batch = views_per_step(demand.training.batch, 1)
@@ -158,7 +162,7 @@ def _room(budget: int, demand: Demand) -> Room | None:
     if not limit and not fits_in_one:
         return None
     blocks = 1 if fits_in_one else _fewest(demand.first, limit, 0)
-    return Room(blocks, limit, max(sole, 0), budget, demand.gaussians, batch, crop)
+    return Fit(blocks, limit, max(sole, 0), budget, demand.gaussians, batch, crop)
 
 
 def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
@@ -199,9 +203,9 @@ def _refusal(budget: int, demand: Demand) -> str:
     ways = []
     if demand.training.batch > 1:
         one = replace(demand, training=replace(demand.training, batch=1))
-        ways += ["one view in a step by --pipeline.training.batch 1"] * (_room(budget, one) is not None)
+        ways += ["one view in a step by --pipeline.training.batch 1"] * (_fit(budget, one) is not None)
     times = 2
-    while times * demand.factor <= MOST_DOWNSCALE and _room(budget, demand.reduced(times)) is None:
+    while times * demand.factor <= MOST_DOWNSCALE and _fit(budget, demand.reduced(times)) is None:
         times *= 2
     if times * demand.factor <= MOST_DOWNSCALE:
         ways.append(f"smaller photos by {DOWNSCALE} {times * demand.factor}")
@@ -216,9 +220,34 @@ def _least_budget(budget: int, demand: Demand) -> float:
     """The least that suffices, GB to two digits."""
     step = GB // 100
     low, high = budget // step, 2 * (budget // step + 1)
-    while _room(high * step, demand) is None:
+    while _fit(high * step, demand) is None:
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if _room(middle * step, demand) is not None else (middle, high)
+        low, high = (low, middle) if _fit(middle * step, demand) is not None else (middle, high)
     return high / 100
+
+
+@dataclass(frozen=True)
+class RamShares:
+    """Bytes for each place that keeps what could be read or drawn again. None of them changes a result."""
+
+    photos: int
+    """Decoded photos."""
+    blocks: int
+    """Frozen blocks, read from the store."""
+    layers: int
+    """A visit's layers; where there is a GPU, those that have no room there."""
+
+
+def share_out(budget: int) -> RamShares:
+    """A quarter of `budget` bytes for photos, one for blocks, the rest for layers."""
+    photos = blocks = budget // 4
+    return RamShares(photos, blocks, budget - photos - blocks)
+
+
+def ram_budget(gigabytes: float) -> int:
+    """The budget in bytes; 0 GB is the smaller of 8 GiB and 40% of the machine's memory."""
+    if gigabytes:
+        return int(gigabytes * GB)
+    return min(MOST_RAM, int(KEPT_SHARE * psutil.virtual_memory().total))

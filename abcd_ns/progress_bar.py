@@ -9,7 +9,7 @@ APPEARS_AFTER = 2.0
 """Seconds of work after which the bar appears."""
 
 
-class LateBar:
+class ProgressBar:
     """A progress bar with the time left that appears only when the work takes a while, and goes at its end.
 
     Args:
@@ -24,7 +24,7 @@ class LateBar:
         self._start = time.monotonic()
         self._shown = False
 
-    def __enter__(self) -> "LateBar":
+    def __enter__(self) -> "ProgressBar":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,23 +1,19 @@
-"""What a run keeps on disk beside nerfstudio's files, and how another run goes on from it."""
+"""How a run goes on from another, and what both keep on disk beside nerfstudio's files."""
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.run import STATE, STORE
 
-if TYPE_CHECKING:
-    from abcd_ns.nerfstudio.config import AbcdTrainerConfig
-
-STATE = "abcd"
-"""The folder of a run, beside `nerfstudio_models`, that holds the one that follows."""
-STORE = "store"
-"""The blocks at rest."""
 MADE_FOR = "made for"
 """The entry of a store's header that tells what it can be trained on with."""
 
@@ -31,6 +27,19 @@ class Start:
     """The pin of a checkpoint that was asked for; None is the newest generation."""
     step: int
     """Steps that were taken until then."""
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """A training, as its trainer begins it."""
+
+    config: TrainerConfig
+    folder: Path
+    """For all that is ours: STATE in the run's folder."""
+    total_steps: int
+    """Of the whole run, those before a resume included."""
+    resumed_from: Start | None
+    """What it goes on from; None begins anew."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ def _agree(theirs: Any, mine: Any) -> bool:
     return theirs == mine
 
 
-def find_start(config: "AbcdTrainerConfig") -> Start | None:
+def find_start(config: TrainerConfig) -> Start | None:
     """What --load-dir, --load-step and --load-checkpoint ask for; None begins anew.
 
     `--load-dir` alone is the newest that the run has: its last visit's end, or its last checkpoint where that

@@ -1,16 +1,30 @@
-"""The number of blocks, the views of a step and what is drawn of them follow from the device's budget."""
+"""The number of blocks, the views of a step and what is drawn of them follow from the device's budget; the
+RAM budget is shared out whole. What that one does to a run is in test_resume.py."""
 
 import dataclasses
 import re
 
+import psutil
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
 from abcd_ns.engine.train.schedule import WARM_UP_BATCH
 from abcd_ns.engine.train.splitting import FULL
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.room import FITTED, GB, LEAST_BLOCK, Demand, Room, device_budget, find_room
+from abcd_ns.nerfstudio.fit import (
+    FITTED,
+    GB,
+    LEAST_BLOCK,
+    Demand,
+    Fit,
+    device_budget,
+    find_fit,
+    ram_budget,
+    share_out,
+)
 from tests.reference.scenes import training_config
 
 TRAINING = TrainingConfig()
@@ -21,29 +35,29 @@ MP = 1_000_000
 POINTS = 140_000
 
 
-def room_for(gb: float, pixels: int, points: int = POINTS, most: int | None = None, **training) -> Room:
-    return find_room(int(gb * GB), Demand(pixels, points, training_config(**training), most=most))
+def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = None, **training) -> Fit:
+    return find_fit(int(gb * GB), Demand(pixels, points, training_config(**training), most=most))
 
 
-def needs_of(room: Room, pixels: int, blocks: int) -> DeviceNeeds:
-    batch = 1 if blocks == 1 else room.batch
-    return DeviceNeeds(pixels, batch, crop_pixels=room.crop_pixels, levels=levels_of(blocks))
+def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
+    batch = 1 if blocks == 1 else fit.batch
+    return DeviceNeeds(pixels, batch, crop_pixels=fit.crop_pixels, levels=levels_of(blocks))
 
 
 @pytest.mark.parametrize("gaussians", [10_000, 1_000_000, 30_000_000])
 @pytest.mark.parametrize("gb", [4, 8, 24, 80])
 def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
-    room = room_for(gb, PIXELS, gaussians)
-    assert (room.batch, room.crop_pixels) == (4, 0)
-    for blocks, limit in ((1, room.sole), (max(room.blocks_at_the_end, 2), room.limit)):
-        needs = needs_of(room, PIXELS, blocks)
+    fit = fit_for(gb, PIXELS, gaussians)
+    assert (fit.batch, fit.crop_pixels) == (4, 0)
+    for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
+        needs = needs_of(fit, PIXELS, blocks)
         left = needs.left(gb * GB)
         assert left == gb * GB * (7 if blocks == 1 else 6) // 8
         assert needs.bytes_for(limit) <= left < needs.bytes_for(limit + 1)
-    assert (room.blocks == 1) == (gaussians <= FULL * room.sole)
-    if room.blocks > 1:
-        assert gaussians <= room.blocks * FULL * room.limit
-        assert room.blocks == 2 or gaussians > (room.blocks - 1) * FULL * room.limit
+    assert (fit.blocks == 1) == (gaussians <= FULL * fit.sole)
+    if fit.blocks > 1:
+        assert gaussians <= fit.blocks * FULL * fit.limit
+        assert fit.blocks == 2 or gaussians > (fit.blocks - 1) * FULL * fit.limit
 
 
 @pytest.mark.parametrize(
@@ -65,13 +79,13 @@ def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
     ],
 )
 def test_large_photos_are_trained_on_by_fewer_views_and_then_by_parts(gb, pixels, batch, whole):
-    room = room_for(gb, pixels)
-    assert (room.blocks, room.batch, room.crop_pixels == 0) == (1, batch, whole)
-    assert min(room.limit, room.sole) > POINTS
-    for blocks, limit in ((1, room.sole), (max(room.blocks_at_the_end, 2), room.limit)):
-        needs = needs_of(room, pixels, blocks)
+    fit = fit_for(gb, pixels)
+    assert (fit.blocks, fit.batch, fit.crop_pixels == 0) == (1, batch, whole)
+    assert min(fit.limit, fit.sole) > POINTS
+    for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
+        needs = needs_of(fit, pixels, blocks)
         assert needs.bytes_for(limit) <= needs.left(int(gb * GB))
-    said = room.in_words()
+    said = fit.in_words()
     assert "\n" not in said
     assert ("large" in said) == (batch < 4)
     assert ("megapixels of 1 view" in said) != whole
@@ -82,15 +96,15 @@ def test_large_photos_are_trained_on_by_fewer_views_and_then_by_parts(gb, pixels
 def test_with_more_memory_no_less_is_drawn(pixels, points):
     drawn = []
     for gb in (8, 10, 12, 16, 24, 40, 60, 80):
-        room = room_for(gb, pixels, points)
-        drawn.append(room.batch * min(room.crop_pixels or pixels, pixels))
+        fit = fit_for(gb, pixels, points)
+        drawn.append(fit.batch * min(fit.crop_pixels or pixels, pixels))
     assert drawn == sorted(drawn)
     assert drawn[-1] == 4 * pixels
 
 
 def test_a_deep_tree_leaves_less_room_where_photos_are_large():
     few, many = (
-        room_for(12, GARDEN, 100_000, most=most, crop_pixels=4 * MP) for most in (5_000_000, 200_000_000)
+        fit_for(12, GARDEN, 100_000, most=most, crop_pixels=4 * MP) for most in (5_000_000, 200_000_000)
     )
     assert many.blocks_at_the_end > few.blocks_at_the_end > 1
     assert many.limit < few.limit
@@ -101,7 +115,7 @@ def test_a_deep_tree_leaves_less_room_where_photos_are_large():
 
 def test_a_cpu_keeps_layers_and_photos_under_another_budget():
     demand = Demand(PIXELS, 10_000_000, TRAINING)
-    device, cpu = (find_room(8 * GB, dataclasses.replace(demand, on_cpu=on_cpu)) for on_cpu in (False, True))
+    device, cpu = (find_fit(8 * GB, dataclasses.replace(demand, on_cpu=on_cpu)) for on_cpu in (False, True))
     needs = dataclasses.replace(needs_of(cpu, PIXELS, cpu.blocks_at_the_end), keeps=False)
     assert needs.left(8 * GB) == 8 * GB
     assert (needs.layer_bytes(8 * GB), needs.photo_bytes(8 * GB)) == (0, 0)
@@ -110,15 +124,15 @@ def test_a_cpu_keeps_layers_and_photos_under_another_budget():
 
 
 def test_what_is_set_is_kept():
-    assert room_for(4, 2 * MP, batch=4).batch == 4
-    assert 0 < room_for(4, 2 * MP, batch=4).crop_pixels < 2 * MP
-    assert room_for(80, 2 * MP, batch=8).batch == 8
-    assert room_for(80, 2 * MP, crop_pixels=5000).crop_pixels == 5000
-    assert room_for(80, 2 * MP, batch_limit=2).batch == 2
+    assert fit_for(4, 2 * MP, batch=4).batch == 4
+    assert 0 < fit_for(4, 2 * MP, batch=4).crop_pixels < 2 * MP
+    assert fit_for(80, 2 * MP, batch=8).batch == 8
+    assert fit_for(80, 2 * MP, crop_pixels=5000).crop_pixels == 5000
+    assert fit_for(80, 2 * MP, batch_limit=2).batch == 2
 
 
 def test_what_a_run_keeps_are_limits_of_training():
-    limits = room_for(4, 12 * MP).limits
+    limits = fit_for(4, 12 * MP).limits
     assert tuple(limits) == FITTED
     fitted = dataclasses.replace(TRAINING.limits, **limits)
     assert fitted.crop_pixels > 0
@@ -126,13 +140,13 @@ def test_what_a_run_keeps_are_limits_of_training():
 
 
 def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
-    room = room_for(0.3, 100_000, 2_000)
-    assert (room.blocks, room.limit, room.blocks_at_the_end) == (1, 0, 1)
-    assert "no room for the layers" in room.in_words()
+    fit = fit_for(0.3, 100_000, 2_000)
+    assert (fit.blocks, fit.limit, fit.blocks_at_the_end) == (1, 0, 1)
+    assert "no room for the layers" in fit.in_words()
     with pytest.raises(UserError):
-        room_for(0.3, 100_000, 2_000_000)
+        fit_for(0.3, 100_000, 2_000_000)
     with pytest.raises(UserError):  # a run that has two blocks already
-        find_room(int(0.3 * GB), Demand(100_000, 2_000, TRAINING, blocks=2))
+        find_fit(int(0.3 * GB), Demand(100_000, 2_000, TRAINING, blocks=2))
 
 
 @pytest.mark.parametrize("block", [1, 3_333, 5_000_000])
@@ -145,8 +159,8 @@ def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixel
 
 
 def test_the_warm_up_is_larger_than_a_block_and_smaller_than_a_sole_one():
-    room = room_for(8, PIXELS, 30_000_000)
-    assert room.limit < scaffold_size(TRAINING, room.limit, PIXELS) < room.sole
+    fit = fit_for(8, PIXELS, 30_000_000)
+    assert fit.limit < scaffold_size(TRAINING, fit.limit, PIXELS) < fit.sole
 
 
 def test_the_warm_up_has_the_size_that_is_asked_for():
@@ -159,15 +173,15 @@ def test_with_one_view_in_a_step_the_warm_up_is_no_larger_than_a_block(fitted):
 
 
 def test_a_scene_that_fits_is_one_block():
-    def room(points, most=None):
-        return room_for(24, PIXELS, points, most)
+    def fit(points, most=None):
+        return fit_for(24, PIXELS, points, most)
 
-    assert room(2_000_000).blocks == 1
-    assert room(200_000_000).blocks > 10
+    assert fit(2_000_000).blocks == 1
+    assert fit(200_000_000).blocks > 10
     # What it may become is no reason to cut it now; what it may not become is none either.
-    assert room(2_000_000, most=100_000_000).blocks == 1
-    assert room(2_000_000, most=100_000_000).blocks_at_the_end > 10
-    assert room(200_000_000, most=2_000_000).blocks == 1
+    assert fit(2_000_000, most=100_000_000).blocks == 1
+    assert fit(2_000_000, most=100_000_000).blocks_at_the_end > 10
+    assert fit(200_000_000, most=2_000_000).blocks == 1
 
 
 @pytest.mark.parametrize(
@@ -182,27 +196,43 @@ def test_a_scene_that_fits_is_one_block():
 def test_a_refusal_names_options_that_help(gb, pixels, points, options):
     demand = Demand(pixels, points, TrainingConfig(**options), factor=2)
     with pytest.raises(UserError) as caught:
-        find_room(int(gb * GB), demand)
+        find_fit(int(gb * GB), demand)
     said = str(caught.value)
     assert f"{gb:.2f} GB may be taken" in said
     least = float(re.search(r"--pipeline\.device-budget-gb (\S+),", said)[1])
     assert f"takes {least:.2f} GB" in said
     assert least > gb
-    assert find_room(int((least + 0.01) * GB), demand).batch >= 1
+    assert find_fit(int((least + 0.01) * GB), demand).batch >= 1
     with pytest.raises(UserError):
-        find_room(int((least - 0.03) * GB), demand)
+        find_fit(int((least - 0.03) * GB), demand)
     if factor := re.search(r"--pipeline\.datamanager\.dataparser\.downscale-factor (\d+)", said):
         times = int(factor[1]) // 2
-        assert find_room(int(gb * GB), demand.reduced(times)).batch >= 1
+        assert find_fit(int(gb * GB), demand.reduced(times)).batch >= 1
     if "--pipeline.training.batch 1" in said:
-        assert find_room(int(gb * GB), dataclasses.replace(demand, training=TrainingConfig(batch=1)))
+        assert find_fit(int(gb * GB), dataclasses.replace(demand, training=TrainingConfig(batch=1)))
 
 
 def test_where_photos_are_all_too_large_smaller_ones_are_proposed():
     with pytest.raises(UserError, match=r"by --pipeline\.datamanager\.dataparser\.downscale-factor 2, or"):
-        find_room(2 * GB, Demand(GARDEN, 400_000, TRAINING))
+        find_fit(2 * GB, Demand(GARDEN, 400_000, TRAINING))
 
 
 def test_the_budget_is_what_is_wanted_or_a_share_of_what_there_is():
     assert device_budget(3.0, "cpu") == 3 * GB
     assert device_budget(0.0, "cpu") > 0
+
+
+@given(st.integers(0, 2**50))
+def test_shares_of_ram_add_up(budget):
+    shares = share_out(budget)
+    assert sum(vars(shares).values()) == budget
+    assert min(vars(shares).values()) >= 0
+
+
+def test_the_automatic_ram_budget_is_a_part_of_the_machines():
+    automatic = ram_budget(0.0)
+    assert 0 < automatic <= min(8 * 2**30, psutil.virtual_memory().total // 2)
+
+
+def test_a_ram_budget_can_be_given():
+    assert ram_budget(1.5) == 3 * 2**29

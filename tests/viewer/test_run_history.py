@@ -10,8 +10,8 @@ from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
-from abcd_ns.viewer.board import MOST_POINTS, BlockRow, Board, Status, seconds_left, sweep_share
-from abcd_ns.viewer.words import MOST_ROWS, block_table, clock, headline, memory_table, sweep_line
+from abcd_ns.viewer.run_history import MOST_POINTS, BlockRow, RunHistory, Status, seconds_left, sweep_share
+from abcd_ns.viewer.texts import MOST_ROWS, block_table, clock, headline, memory_table, sweep_line
 
 
 def began(visit: int, block: int | None, sweep: int = 0, steps: int = 10) -> VisitBegan:
@@ -32,13 +32,13 @@ def active(block: int, done: int = 0, steps: int = 10) -> ActiveVisit:
 
 
 def test_a_block_is_untrained_then_active_then_done():
-    board = Board()
-    assert board.status(1, views=9) is Status.UNTRAINED
-    board.note(began(0, 1), 0.0)
-    assert board.status(1, views=9) is Status.ACTIVE
-    assert board.status(0, views=9) is Status.UNTRAINED
-    board.note(ended(0, 1), 1.0)
-    assert board.status(1, views=9) is Status.DONE
+    history = RunHistory()
+    assert history.status(1, views=9) is Status.UNTRAINED
+    history.note(began(0, 1), 0.0)
+    assert history.status(1, views=9) is Status.ACTIVE
+    assert history.status(0, views=9) is Status.UNTRAINED
+    history.note(ended(0, 1), 1.0)
+    assert history.status(1, views=9) is Status.DONE
 
 
 @pytest.mark.parametrize(
@@ -46,26 +46,26 @@ def test_a_block_is_untrained_then_active_then_done():
     [(0, Status.UNDER_OBSERVED), (2, Status.UNDER_OBSERVED), (3, Status.UNTRAINED), (None, Status.UNTRAINED)],
 )
 def test_a_block_that_hardly_any_view_shows_says_so(views, expected):
-    assert Board().status(0, views) is expected
+    assert RunHistory().status(0, views) is expected
 
 
 def test_during_the_warm_up_no_block_is_active():
-    board = Board()
-    board.note(began(0, None), 0.0)
-    rows = board.rows({0: None, 1: None}, {})
+    history = RunHistory()
+    history.note(began(0, None), 0.0)
+    rows = history.rows({0: None, 1: None}, {})
     assert [row.status for row in rows] == [Status.UNTRAINED] * 2
-    board.note(ended(0, None), 1.0)
-    assert board.visits == {}
+    history.note(ended(0, None), 1.0)
+    assert history.visits == {}
 
 
 def test_the_table_gives_each_blocks_last_psnr():
-    board = Board()
-    board.note(began(0, 0), 0.0)
-    board.note(step(10.0), 0.1)
-    board.note(step(20.0), 0.2)
-    board.note(step(math.nan), 0.3)
-    board.note(ended(0, 0), 1.0)
-    rows = board.rows({0: 1234, 1: 5}, {0: 9, 1: 1})
+    history = RunHistory()
+    history.note(began(0, 0), 0.0)
+    history.note(step(10.0), 0.1)
+    history.note(step(20.0), 0.2)
+    history.note(step(math.nan), 0.3)
+    history.note(ended(0, 0), 1.0)
+    rows = history.rows({0: 1234, 1: 5}, {0: 9, 1: 1})
     assert [row.psnr for row in rows] == [15.0, None]
     table = block_table(rows)
     assert "| 1 | done | 1,234 | 15.00 | 9 |" in table
@@ -84,9 +84,9 @@ def test_a_table_of_a_finished_run_has_no_empty_columns():
 
 
 def test_of_many_blocks_the_table_shows_the_urgent_ones():
-    board = Board()
-    board.note(began(0, 90), 0.0)
-    rows = board.rows(dict.fromkeys(range(100), 1), {**dict.fromkeys(range(100), 9), 70: 0})
+    history = RunHistory()
+    history.note(began(0, 90), 0.0)
+    rows = history.rows(dict.fromkeys(range(100), 1), {**dict.fromkeys(range(100), 9), 70: 0})
     lines = block_table(rows).splitlines()
     shown = [int(line.split("|")[1]) for line in lines if line.startswith("| ") and line[2].isdigit()]
     assert shown == [*range(1, MOST_ROWS - 1), 71, 91]
@@ -94,51 +94,51 @@ def test_of_many_blocks_the_table_shows_the_urgent_ones():
 
 
 def test_the_curve_has_a_point_every_other_second():
-    board = Board()
+    history = RunHistory()
     for tick in range(100):
-        board.note(step(10.0 + tick), 0.1 * tick)
-    assert board.curve[0] == (0.0, 10.0)
-    gaps = [b - a for (a, _), (b, _) in zip(board.curve, board.curve[1:], strict=False)]
+        history.note(step(10.0 + tick), 0.1 * tick)
+    assert history.curve[0] == (0.0, 10.0)
+    gaps = [b - a for (a, _), (b, _) in zip(history.curve, history.curve[1:], strict=False)]
     assert min(gaps) >= 2.0 - 1e-9
     # Each point is the mean of the steps since the last one: 1 to 20, then 21 to 40.
-    assert board.curve[1][1] == pytest.approx(10 + 10.5)
-    assert board.curve[2][1] == pytest.approx(10 + 30.5)
+    assert history.curve[1][1] == pytest.approx(10 + 10.5)
+    assert history.curve[2][1] == pytest.approx(10 + 30.5)
 
 
 def test_a_long_curve_is_thinned_and_keeps_its_end():
-    board = Board()
+    history = RunHistory()
     for tick in range(3 * MOST_POINTS):
-        board.note(step(float(tick)), 3.0 * tick)
-        assert board.curve[-1][0] == 3.0 * tick
-        assert len(board.curve) <= MOST_POINTS
-    assert board.curve == sorted(board.curve)
-    assert len(board.curve) > MOST_POINTS / 2
+        history.note(step(float(tick)), 3.0 * tick)
+        assert history.curve[-1][0] == 3.0 * tick
+        assert len(history.curve) <= MOST_POINTS
+    assert history.curve == sorted(history.curve)
+    assert len(history.curve) > MOST_POINTS / 2
 
 
 def test_progress_through_the_sweep():
-    board, state = Board(), RunState(queue=[VisitPlan(1, 10), VisitPlan(2, 10), VisitPlan(3, 10)])
-    board.note(began(0, 0), 4.0)
+    history, state = RunHistory(), RunState(queue=[VisitPlan(1, 10), VisitPlan(2, 10), VisitPlan(3, 10)])
+    history.note(began(0, 0), 4.0)
     state.active = active(0, done=5)
-    assert board.sweep_began == 4.0
-    assert sweep_share(board, state) == pytest.approx(0.5 / 4)
-    board.note(ended(0, 0), 6.0)
-    board.note(began(1, 1), 6.0)
+    assert history.sweep_began == 4.0
+    assert sweep_share(history, state) == pytest.approx(0.5 / 4)
+    history.note(ended(0, 0), 6.0)
+    history.note(began(1, 1), 6.0)
     state.queue.pop(0)
     state.active = active(1)
-    assert sweep_share(board, state) == pytest.approx(1 / 4)
-    assert board.sweep_began == 4.0
-    board.note(ended(1, 1), 8.0)
-    board.note(SweepEnded(0, 20), 8.0)
-    board.note(began(2, 3, sweep=1), 9.0)
-    assert (board.sweep, board.sweep_began, board.sweep_visits) == (1, 9.0, 0)
+    assert sweep_share(history, state) == pytest.approx(1 / 4)
+    assert history.sweep_began == 4.0
+    history.note(ended(1, 1), 8.0)
+    history.note(SweepEnded(0, 20), 8.0)
+    history.note(began(2, 3, sweep=1), 9.0)
+    assert (history.sweep, history.sweep_began, history.sweep_visits) == (1, 9.0, 0)
 
 
 def test_visits_without_planned_steps_count_when_they_are_over():
     state = RunState(queue=[VisitPlan(1, 10)], active=active(0, done=500, steps=UNLIMITED))
-    assert sweep_share(Board(), state) == 0.0
-    assert sweep_share(Board(sweep_visits=1), state) == pytest.approx(1 / 3)
-    assert sweep_share(Board(), RunState()) == 0.0
-    assert sweep_share(Board(), RunState(active=active(WHOLE))) == 0.0
+    assert sweep_share(RunHistory(), state) == 0.0
+    assert sweep_share(RunHistory(sweep_visits=1), state) == pytest.approx(1 / 3)
+    assert sweep_share(RunHistory(), RunState()) == 0.0
+    assert sweep_share(RunHistory(), RunState(active=active(WHOLE))) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -153,13 +153,13 @@ def test_a_resumed_run_knows_which_blocks_had_their_visit():
     state = RunState(
         sweep=0, visit=3, queue=[VisitPlan(2, 10)], views={0: 9, 1: 9, 2: 9, 3: 0}, active=active(1, done=4)
     )
-    board = Board.resumed(state, seconds=7.0)
-    statuses = [board.status(block, state.views[block]) for block in range(4)]
+    history = RunHistory.resumed(state, seconds=7.0)
+    statuses = [history.status(block, state.views[block]) for block in range(4)]
     assert statuses == [Status.DONE, Status.ACTIVE, Status.UNTRAINED, Status.UNDER_OBSERVED]
-    assert sweep_share(board, state) == pytest.approx((1 + 0.4) / 3)
+    assert sweep_share(history, state) == pytest.approx((1 + 0.4) / 3)
     state.sweep = 1
-    assert Board.resumed(state, 7.0).status(2, 9) is Status.DONE
-    assert Board.resumed(RunState(), 0.0) == Board()
+    assert RunHistory.resumed(state, 7.0).status(2, 9) is Status.DONE
+    assert RunHistory.resumed(RunState(), 0.0) == RunHistory()
 
 
 def test_words():

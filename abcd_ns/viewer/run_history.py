@@ -40,7 +40,7 @@ class BlockRow:
 
 
 @dataclass
-class Board:
+class RunHistory:
     """Follows a run, event by event."""
 
     visits: dict[int, int] = field(default_factory=dict)
@@ -62,22 +62,24 @@ class Board:
     """PSNR of the steps since the last point of the curve."""
 
     @staticmethod
-    def resumed(state: RunState, seconds: float) -> "Board":
-        """The board of a run that goes on: which blocks had a visit follows from the plan of the sweep."""
+    def resumed(state: RunState, seconds: float) -> "RunHistory":
+        """Of a run that goes on: which blocks had a visit follows from the plan of the sweep."""
         waiting = {plan.block for plan in state.queue}
         if state.active is not None:
             waiting.add(state.active.geometry.block)
         seen = [block for block, views in state.views.items() if views > 0]
         visits = {block: state.sweep + (block not in waiting) for block in seen}
         over = sum(block not in waiting for block in seen)
-        board = Board(visits={b: n for b, n in visits.items() if n}, sweep_began=seconds, sweep_visits=over)
-        board.sweep = state.sweep if state.views else None
+        history = RunHistory(
+            visits={b: n for b, n in visits.items() if n}, sweep_began=seconds, sweep_visits=over
+        )
+        history.sweep = state.sweep if state.views else None
         if (active := state.active) is not None:
             block = None if active.is_whole else active.geometry.block
-            board.visit = VisitBegan(
+            history.visit = VisitBegan(
                 active.number, state.sweep, block, active.steps, len(active.geometry.views), 0
             )
-        return board
+        return history
 
     def note(self, event: Event, seconds: float) -> None:
         """Take an event in; `seconds` of training have passed."""
@@ -128,13 +130,13 @@ class Board:
         ]
 
 
-def sweep_share(board: Board, state: RunState) -> float:
+def sweep_share(history: RunHistory, state: RunState) -> float:
     """Share of the sweep's visits that is done, 0..1; a visit whose steps are planned counts in part."""
     active = state.active
     if active is None or active.is_whole:
         return 0.0
     part = active.done / active.steps if 0 < active.steps < UNLIMITED else 0.0
-    return (board.sweep_visits + part) / (board.sweep_visits + 1 + len(state.queue))
+    return (history.sweep_visits + part) / (history.sweep_visits + 1 + len(state.queue))
 
 
 def seconds_left(elapsed: float, share: float) -> float | None:

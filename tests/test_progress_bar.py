@@ -5,22 +5,22 @@ import io
 import pytest
 from rich.console import Console
 
-from abcd_ns import late_bar
-from abcd_ns.late_bar import LateBar
+from abcd_ns import progress_bar
+from abcd_ns.progress_bar import ProgressBar
 
 
 @pytest.mark.parametrize(("after", "shown"), [(-1.0, True), (1e9, False)])
 def test_it_appears_only_when_work_takes_long(monkeypatch, after, shown):
-    monkeypatch.setattr(late_bar, "APPEARS_AFTER", after)
+    monkeypatch.setattr(progress_bar, "APPEARS_AFTER", after)
     stream = io.StringIO()
-    with LateBar("Counting sheep", 3, Console(file=stream, force_terminal=True)) as bar:
+    with ProgressBar("Counting sheep", 3, Console(file=stream, force_terminal=True)) as bar:
         for _ in range(3):
             bar.advance()
     assert ("Counting sheep" in stream.getvalue()) == shown
 
 
 def test_it_is_not_in_output_that_is_piped_on(monkeypatch, capsys):
-    monkeypatch.setattr(late_bar, "APPEARS_AFTER", -1.0)
-    with LateBar("Counting sheep", 1) as bar:
+    monkeypatch.setattr(progress_bar, "APPEARS_AFTER", -1.0)
+    with ProgressBar("Counting sheep", 1) as bar:
         bar.advance()
     assert capsys.readouterr().out == ""

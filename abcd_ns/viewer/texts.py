@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from datetime import timedelta
 
-from abcd_ns.viewer.board import BlockRow, Status
+from abcd_ns.viewer.run_history import BlockRow, Status
 
 MOST_ROWS = 24
 """Of the table of blocks; with more blocks those that are active or under-observed come first."""
