@@ -10,7 +10,7 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from abcd_ns import methods
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
-from abcd_ns.nerfstudio.settings import flat_options
+from abcd_ns.nerfstudio.run.settings import flat_options
 
 METHODS = {
     found.config.method_name: found.config
