@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
+from abcd_ns.lab.runs.results import Curve, Line
 from abcd_ns.lab.stability.captures import PAIR, table, with_gains, with_noisy_poses
 from abcd_ns.lab.stability.freshness import BLOCKS, train_stale
 from abcd_ns.lab.stability.lab import Lab, Method, Stage
@@ -18,29 +19,6 @@ WITH_BLOCKS: tuple[Method, ...] = ("abcd", "abcd-ablated")
 
 Train = Callable[[Lab], float]
 """Trains, and gives the held-out PSNR, dB."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """One method's values."""
-
-    name: str
-    """The method, and after a comma how it differs."""
-    x: tuple[float, ...]
-    psnr: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Curve:
-    """One chart."""
-
-    name: str
-    title: str
-    x_label: str
-    lines: tuple[Line, ...]
-    note: str = ""
-    level: float | None = None
-    """One block, where it does not depend on x; dB."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +50,6 @@ class Study:
         yield Curve(self.name, self.title, self.x_label, lines, self.note, level)
 
 
-def _score(lab: Lab, stage: Stage, method: Method, name: str | None = None, **options) -> float:
-    return lab.compared(stage, method, name, **options)
-
-
 def studies() -> tuple[Study, ...]:
     """All of them, on the table with its balls."""
     stage = table()
@@ -85,7 +59,7 @@ def studies() -> tuple[Study, ...]:
 
 def _call(stage: Stage, method: Method, **options) -> Train:
     """Training and scoring that still waits for its lab."""
-    return partial(_score, stage=stage, method=method, **options)
+    return partial(Lab.compared, stage=stage, method=method, **options)
 
 
 def _of_training(stage: Stage, one_block: Train) -> tuple[Study, ...]:

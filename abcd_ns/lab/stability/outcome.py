@@ -1,4 +1,4 @@
-"""What a scenario is, and what came of it."""
+"""What a scenario is, and what it finds out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,21 +35,6 @@ class Scenario:
     run: Callable[[Lab], Finding]
     cost: int = 1
     """How long it takes, in trainings of a curve's point; for the time left."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A scenario and its finding, as stability.json keeps it."""
-
-    id: str
-    fails: str
-    done: str
-    rule: str
-    passed: bool
-    worse: bool
-    said: dict[str, str]
-    numbers: dict[str, float]
-    seconds: float
 
 
 def db(value: float) -> str:
