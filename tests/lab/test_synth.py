@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.synth import SynthError, synth
 from abcd_ns.lab.synth.cameras import Camera, Lens, court_cameras, look_at
+from abcd_ns.lab.synth.command import synth
 from abcd_ns.lab.synth.court import Site, build_court
 from abcd_ns.lab.synth.geometry import box, lathe
 from abcd_ns.lab.synth.lighting import tone_map
@@ -155,7 +155,7 @@ def test_foreign_folder_is_refused_even_with_overwrite(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "holiday.jpg").write_bytes(b"dear")
     for overwrite in (False, True):
-        with pytest.raises(SynthError, match="not empty"):
+        with pytest.raises(UserError, match="not empty"):
             synth(tmp_path, **TINY, overwrite=overwrite)
     assert contents(tmp_path) == {"images/holiday.jpg": b"dear"}
 
@@ -164,7 +164,7 @@ def test_other_scene_is_replaced_only_on_request(tmp_path: Path) -> None:
     small = {**TINY, "courts": 1, "views_per_court": 3, "points_per_court": 40, "supersample": 1}
     synth(tmp_path, **small)
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(SynthError, match="--overwrite"):
+    with pytest.raises(UserError, match="--overwrite"):
         synth(tmp_path, **{**small, "views_per_court": 2})
     synth(tmp_path, **{**small, "views_per_court": 2}, overwrite=True)
     assert len(list((tmp_path / "images").iterdir())) == 2
@@ -179,7 +179,7 @@ def test_interrupted_scene_is_not_taken_for_a_finished_one(tmp_path: Path) -> No
         )
         with pytest.raises(OSError, match="full"):
             synth(tmp_path, **small)
-    with pytest.raises(SynthError, match="unfinished"):
+    with pytest.raises(UserError, match="unfinished"):
         synth(tmp_path, **small)
     synth(tmp_path, **small, overwrite=True)
     assert pycolmap.Reconstruction(str(tmp_path / "sparse" / "0")).num_images() == 3

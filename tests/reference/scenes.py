@@ -19,6 +19,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.lab.stability.world import look_at
 
 
 def random_gaussians(
@@ -38,18 +39,6 @@ def random_gaussians(
         features_rest=0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3),
         opacities=normal(count, 1),
     )
-
-
-def look_at(eye: Tensor, target: Tensor) -> Tensor:
-    """[4, 4] world to camera, OpenCV convention, with the world's z up."""
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(
-        torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0]).to(eye)), dim=0
-    )
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat = torch.eye(4, dtype=eye.dtype)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    return viewmat
 
 
 def ring_of_views(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -17,14 +16,9 @@ from abcd_ns.lab.compare.pictures import draw_pictures
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, make_settings, words
 from abcd_ns.lab.runs.job import METHODS, Job, Method, Plan
-from abcd_ns.lab.runs.records import decode
+from abcd_ns.lab.runs.records import decode, read_toml
 from abcd_ns.lab.runs.results import LeftOut, Results
 from abcd_ns.lab.runs.run import Failure, Run
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 PICTURES = "pictures"
 
@@ -107,13 +101,7 @@ def read_options(path: Path) -> Options:
     Raises:
         UserError: the file is absent, is no TOML, or has a key or value that does not fit.
     """
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"--config {path} does not exist.") from None
-    except (ValueError, OSError) as error:
-        raise UserError(f"--config {path} cannot be read as TOML: {error}.") from None
-    return decode(Options, data, str(path))
+    return decode(Options, read_toml(path, f"--config {path} does not exist."), str(path))
 
 
 def make_plan(options: Options) -> Plan:

@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import json
 import math
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +16,11 @@ from typing import Any, TypeVar
 import msgspec
 
 from abcd_ns.errors import UserError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 R = TypeVar("R")
 
@@ -80,6 +86,23 @@ def read_json(path: Path) -> Any:
         raise RecordError(f"{path} does not exist.") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise RecordError(f"{path} is not JSON ({error}); delete it and run again.") from None
+
+
+def read_toml(path: Path, absent: str) -> dict[str, Any]:
+    """A user's options in TOML.
+
+    Args:
+        absent: what to say where there is no such file.
+
+    Raises:
+        RecordError: the file is absent, or is no TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RecordError(absent) from None
+    except (ValueError, OSError) as error:
+        raise RecordError(f"{path} cannot be read as TOML: {error}.") from None
 
 
 def read_record(path: Path, cls: type[R], schema: int) -> R:

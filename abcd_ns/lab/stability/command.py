@@ -154,9 +154,7 @@ def carry_out(
         keep(outcomes, curves)
     for study in wanted:
         meter.begin(f"chart: {study.title}")
-        for curve in study.make(lab):
-            meter.advance()
-            curves += [] if curve is None else [curve]
+        curves.append(study.make(lab, meter.advance))
         meter.console.print(f"      chart: {study.title}", highlight=False)
         keep(outcomes, curves)
     return outcomes

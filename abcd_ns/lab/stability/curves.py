@@ -1,6 +1,6 @@
 """Held-out PSNR against one thing at a time: what the charts show."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -36,18 +36,20 @@ class Study:
     def __len__(self) -> int:
         return len(self.points) + (self.level is not None)
 
-    def make(self, lab: Lab) -> Iterator[Curve | None]:
-        """Yields None after each training but the last, then the curve."""
-        level = None if self.level is None else self.level(lab)
-        if level is not None:
-            yield None
+    def make(self, lab: Lab, advance: Callable[[], None] = lambda: None) -> Curve:
+        """The curve; `advance` is called after each training."""
+
+        def trained(train: Train) -> float:
+            score = train(lab)
+            advance()
+            return score
+
+        level = None if self.level is None else trained(self.level)
         found: dict[str, list[tuple[float, float]]] = {}
-        for number, (line, x, train) in enumerate(self.points, start=1):
-            found.setdefault(line, []).append((x, train(lab)))
-            if number < len(self.points):
-                yield None
+        for line, x, train in self.points:
+            found.setdefault(line, []).append((x, trained(train)))
         lines = tuple(Line(name, *map(tuple, zip(*pairs, strict=True))) for name, pairs in found.items())
-        yield Curve(self.name, self.title, self.x_label, lines, self.note, level)
+        return Curve(self.name, self.title, self.x_label, lines, self.note, level)
 
 
 def studies() -> tuple[Study, ...]:
