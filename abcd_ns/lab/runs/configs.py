@@ -14,7 +14,7 @@ from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.job import HELD_OUT_EVERY, Job
 from abcd_ns.lab.runs.options import change_options
-from abcd_ns.nerfstudio.config import AbcdPipelineConfig, AbcdTrainerConfig
+from abcd_ns.nerfstudio.config import AbcdTrainerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 
 ENDLESS = 10**9
@@ -75,11 +75,6 @@ def check_options(job: Job) -> None:
 def registered(method: str) -> AbcdTrainerConfig | None:
     """The configuration that `ns-train` knows a method of ABCD's by, not a copy; None for any other."""
     return _REGISTERED[method].config if method in _REGISTERED else None
-
-
-def default_options(method: str) -> AbcdPipelineConfig:
-    """The method's pipeline as it is registered; not a copy."""
-    return _REGISTERED[method].config.pipeline
 
 
 def _abcd(job: Job) -> AbcdTrainerConfig:

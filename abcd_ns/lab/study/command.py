@@ -148,12 +148,12 @@ class OptionsStudy(Conditions):
         Raises:
             UserError: an option cannot be used, or is none of the method's.
         """
-        from abcd_ns.lab.runs.configs import default_options
+        from abcd_ns.lab.runs.configs import registered
         from abcd_ns.lab.runs.options import parse_variant, read_value, value_of
 
         if not self.vary:
             raise UserError("Give at least one change of an option with --vary NAME=VALUE.")
-        pipeline, notes = default_options(self.method), []
+        pipeline, notes = registered(self.method).pipeline, []
         variants = [parse_variant(text, pipeline) for text in self.vary]
         folders = [variant.folder for variant in variants]
         shared = {BLOCKS: self.blocks, LIMIT: self.max_gaussians}
