@@ -25,32 +25,46 @@ from abcd_ns.late_bar import LateBar
 FORMAT = 1
 """Raised whenever the same settings would draw another scene."""
 MARKER = "synth.json"
+LIMITS = {
+    "courts": (1, 10_000),
+    "views_per_court": (2, 10_000),
+    "width": (16, 8192),
+    "height": (16, 8192),
+    "seed": (0, 2**31 - 1),
+    "points_per_court": (1, 10_000_000),
+    "supersample": (1, 8),
+}
+"""The least and the most that each may be."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All that decides what is drawn; see `synth`."""
+    """All that decides what is drawn."""
 
-    courts: int
-    layout: Layout
-    views_per_court: int
-    width: int
-    height: int
-    seed: int
-    points_per_court: int
-    supersample: int
+    courts: int = 2
+    """Number of courts."""
+    layout: Layout = "grid"
+    """Courts in a near-square grid or in one row."""
+    views_per_court: int = 24
+    """Pictures taken inside each court."""
+    width: int = 320
+    """Of the pictures, in pixels."""
+    height: int = 240
+    """Of the pictures, in pixels."""
+    seed: int = 0
+    """Chooses colours, objects, openings, sun and camera poses."""
+    points_per_court: int = 4000
+    """Sparse points to write per court, fewer where views overlap little."""
+    supersample: int = 2
+    """Rays per pixel along each axis."""
 
-    def __post_init__(self) -> None:
-        limits = {
-            "courts": (1, 10_000),
-            "views_per_court": (2, 10_000),
-            "width": (16, 8192),
-            "height": (16, 8192),
-            "seed": (0, 2**31 - 1),
-            "points_per_court": (1, 10_000_000),
-            "supersample": (1, 8),
-        }
-        for name, (low, high) in limits.items():
+    def check(self) -> None:
+        """Whether all of them can be drawn.
+
+        Raises:
+            UserError: one is out of range.
+        """
+        for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
             if not low <= value <= high:
                 flag = "--" + name.replace("_", "-")
@@ -63,18 +77,10 @@ class Settings:
         return "abcd synth OUT " + " ".join(flags)
 
 
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def synth(
     out: Annotated[Path, tyro.conf.Positional],
-    /,
-    *,
-    courts: int = 2,
-    layout: Layout = "grid",
-    views_per_court: int = 24,
-    width: int = 320,
-    height: int = 240,
-    seed: int = 0,
-    points_per_court: int = 4000,
-    supersample: int = 2,
+    settings: Annotated[Settings, tyro.conf.arg(name="")],
     overwrite: bool = False,
 ) -> None:
     """Draw a scene of walled courts side by side, as a COLMAP data set.
@@ -84,22 +90,13 @@ def synth(
 
     Args:
         out: Folder for images/, sparse/0/ and SOURCE.md; must be empty, absent or an earlier result.
-        courts: Number of courts.
-        layout: Courts in a near-square grid or in one row.
-        views_per_court: Pictures taken inside each court.
-        width: Of the pictures, in pixels.
-        height: Of the pictures, in pixels.
-        seed: Chooses colours, objects, openings, sun and camera poses.
-        points_per_court: Sparse points to write per court, fewer where views overlap little.
-        supersample: Rays per pixel along each axis.
+        settings: All that decides what is drawn.
         overwrite: Replace an earlier result of this command that has other settings or is incomplete.
 
     Raises:
         UserError: a setting is out of range, or `out` holds something else.
     """
-    settings = Settings(
-        courts, layout, views_per_court, width, height, seed, points_per_court, supersample
-    )  # fmt: skip
+    settings.check()
     console = Console(stderr=True)
     if not _prepare(out, settings, overwrite):
         console.print(f"{out} already holds this scene; nothing to do.", highlight=False, soft_wrap=True)
@@ -109,7 +106,7 @@ def synth(
     (out / "SOURCE.md").write_text(_source(settings, len(cameras), len(points.xyz)), encoding="utf-8")
     write_json(out / MARKER, _marker(settings, complete=True))
     console.print(
-        f"{out}: {len(cameras)} pictures and {len(points.xyz)} points of {courts} courts.",
+        f"{out}: {len(cameras)} pictures and {len(points.xyz)} points of {settings.courts} courts.",
         highlight=False,
         soft_wrap=True,
     )
