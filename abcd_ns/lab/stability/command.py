@@ -31,13 +31,8 @@ from abcd_ns.nerfstudio.machine import describe_machine
 
 KIND = "stability report"
 _MODULES = (values, sizes, emptiness, growth, cameras, captures, freshness, borders)
-SCENARIOS: dict[str, Scenario] = {
-    scenario.id: scenario
-    for scenario in sorted(
-        (scenario for module in _MODULES for scenario in module.SCENARIOS),
-        key=lambda scenario: int(scenario.id[1:]),
-    )
-}
+_FOUND = {one.id: one for module in _MODULES for one in vars(module).values() if isinstance(one, Scenario)}
+SCENARIOS = {id: _FOUND[id] for id in sorted(_FOUND, key=lambda id: int(id[1:]))}
 """By id, A1 to A22."""
 
 

@@ -37,6 +37,13 @@ class Scenario:
     """How long it takes, in trainings of a curve's point; for the time left."""
 
 
+def scenario(
+    id: str, fails: str, done: str, rule: str, cost: int = 1
+) -> Callable[[Callable[[Lab], Finding]], Scenario]:
+    """Makes a scenario of the function that carries it out."""
+    return lambda run: Scenario(id, fails, done, rule, run, cost)
+
+
 def db(value: float) -> str:
     """In decibels, with two digits."""
     return f"{value:.2f} dB"
