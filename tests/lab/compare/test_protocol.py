@@ -103,9 +103,9 @@ def test_there_are_examples():
     ("text", "message"),
     [
         ("bloks = 3", "unknown field 'bloks'; did you mean 'blocks'"),
-        ("blocks = 'three'", "Expected int | null, got str - at blocks"),
+        ("blocks = 'three'", r"Expected int \| null, got str - at blocks"),
         ("methods = ['abcd', 3]", r"got int - at methods\[1\]"),
-        ("seeds = 0", "Expected array | null, got int - at seeds"),
+        ("seeds = 0", r"Expected array \| null, got int - at seeds"),
         ("blocks = ", "cannot be read as TOML"),
     ],
 )
