@@ -155,7 +155,7 @@ def extent(task: Task) -> Iterator[Found]:
     settings = LandSettings(size.gaussians, 3, 16 * MIB, size.device_limit_mb * MIB)
     plan = scale.make_plan(Path(task.work), settings, size.tiles, size.tiles, task.seed)
     plan = replace(plan, jobs=tuple(sorted(plan.jobs, key=lambda job: job.tiles)))
-    for results in experiment.made(plan, Console(), judge=scale.too_large):
+    for results in experiment.run_jobs(plan, Console(), leave_out=scale.too_large):
         yield {"scale": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
 
 

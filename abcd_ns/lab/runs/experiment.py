@@ -18,11 +18,11 @@ from abcd_ns.nerfstudio.machine import Machine, describe_machine, describe_versi
 Found = Sequence[tuple[Job, Run | Failure]]
 Draw = Callable[[Results, Path], list[Path]]
 """Writes charts of results into a folder and returns their paths."""
-Judge = Callable[[Job, Run | Failure | None], LeftOut | None]
+LeaveOut = Callable[[Job, Run | Failure | None], LeftOut | None]
 """Why a job's method is left out from now on, if it is; asked before the job, and with what came of it."""
 
 
-def allow(job: Job, outcome: Run | Failure | None) -> None:
+def leave_none_out(job: Job, outcome: Run | Failure | None) -> None:
     """Leaves nothing out."""
 
 
@@ -31,20 +31,22 @@ def carry_out(
     console: Console,
     draw: Draw,
     overwrite: bool = False,
-    judge: Judge = allow,
+    leave_out: LeaveOut = leave_none_out,
 ) -> int:
     """Do all jobs of the plan and write what came of them; exit code 1 if a run failed.
 
     Args:
         overwrite: drop the runs that the plan's folder holds.
     """
-    for results in made(plan, console, overwrite, judge):
+    for results in run_jobs(plan, console, overwrite, leave_out):
         write_results(plan.out / RESULTS_FILE, results)  # each time: a long one may be interrupted
     report(results, plan.out, console, draw)
     return 1 if results.failures else 0
 
 
-def made(plan: Plan, console: Console, overwrite: bool = False, judge: Judge = allow) -> Iterator[Results]:
+def run_jobs(
+    plan: Plan, console: Console, overwrite: bool = False, leave_out: LeaveOut = leave_none_out
+) -> Iterator[Results]:
     """Do the plan's jobs, one by one; after each, all that was found so far."""
     machine, found, left_out = describe_machine(), [], []
     shared = {"settings": dataclasses.asdict(plan.settings), "machine": dataclasses.asdict(machine)}
@@ -52,10 +54,10 @@ def made(plan: Plan, console: Console, overwrite: bool = False, judge: Judge = a
     for number, job in enumerate(plan.jobs, start=1):
         if job.method in {left.method for left in left_out}:
             continue
-        left = judge(job, None)
+        left = leave_out(job, None)
         if left is None:
             outcome = finish_job(job, plan.out, console, f"[{number}/{len(plan.jobs)}] {job.name}")
-            left = judge(job, outcome)
+            left = leave_out(job, outcome)
             found += [(job, outcome)] if left is None else []
         if left is not None:
             left_out.append(left)

@@ -13,7 +13,7 @@ from rich.console import Console
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, carry_out, impossible, make_plan
 from abcd_ns.lab.runs import runner
-from abcd_ns.lab.runs.experiment import made
+from abcd_ns.lab.runs.experiment import run_jobs
 from abcd_ns.lab.runs.job import Job, Plan
 from abcd_ns.lab.runs.records import encode
 from abcd_ns.lab.runs.results import read_results
@@ -42,7 +42,7 @@ def plan(tmp_path) -> Plan:
 
 def run(plan: Plan, overwrite: bool = False) -> list[Run | Failure]:
     """What comes of the plan's jobs, in their order."""
-    *_, results = made(plan, Console(file=StringIO()), overwrite)
+    *_, results = run_jobs(plan, Console(file=StringIO()), overwrite)
     found = {(one.method, one.seed): one for one in (*results.runs, *results.failures)}
     return [found[job.method, job.seed] for job in plan.jobs]
 
