@@ -50,9 +50,9 @@ def take_folder(out: Path, marker: Path, kind: str) -> bool:
         UserError: it is a file, or a folder of something else.
     """
     if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out} is a file; name a folder.")
+        raise UserError(f"{out} is a file; name a folder.")
     if not marker.exists() and out.is_dir() and any(out.iterdir()):
-        raise UserError(f"--out {out} is not empty and holds no {kind}; name another folder.")
+        raise UserError(f"{out} is not empty and holds no {kind}; name another folder.")
     out.mkdir(parents=True, exist_ok=True)
     return marker.exists()
 
