@@ -289,8 +289,8 @@ def test_results_come_back_as_they_were_written(make, tmp_path):
 @pytest.mark.cli
 def test_a_study_that_really_trains(scene, tmp_path):
     """Two numbers of blocks, under a limit below the scene's 300 points."""
-    conditions = Conditions(scene, tmp_path / "out", steps=12, evals=2, max_gaussians=150)
-    code, printed = carried_out(BlocksStudy(**conditions, blocks=(1, 3)).plan())
+    given = {"data": scene, "out": tmp_path / "out", "steps": 12, "evals": 2, "max_gaussians": 150}
+    code, printed = carried_out(BlocksStudy(**given, blocks=(1, 3)).plan())
     assert code == 0, printed
     results = read_results(tmp_path / "out" / "results.json")
     for arm, blocks in zip(results.arms, (1, 3), strict=True):
