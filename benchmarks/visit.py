@@ -36,7 +36,7 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
@@ -150,7 +150,7 @@ def begin(
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     keep = None if blocks == 1 else len(capture.gaussians) // blocks
     store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=seed))
-    run = Run(
+    run = TrainingRun(
         TrainingConfig(seed=seed, processes=processes),
         Budget(steps=steps, seconds=seconds),
         StoredScene(tree, store),

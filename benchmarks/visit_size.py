@@ -34,7 +34,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import passes_for_layers
 from abcd_ns.engine.train.training_loop import train_step
@@ -83,7 +83,7 @@ def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], 
         density=DensityConfig(strategy="off"),
     )
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    run = Run(
+    run = TrainingRun(
         config,
         Budget(steps=1_000_000),
         StoredScene(tree, store, 16 << 30),

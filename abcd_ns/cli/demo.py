@@ -17,6 +17,7 @@ from rich.table import Table
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.pictures import draw_comparison, read_picture
 from abcd_ns.lab.runs.job import evenly
+from abcd_ns.lab.runs.runner import take_folder
 
 SCENE = {"courts": 2, "views_per_court": 20, "width": 192, "height": 144, "points_per_court": 3000}
 MARKER = "abcd-demo.txt"
@@ -150,11 +151,7 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
 
 def _claim(out: Path) -> None:
     """Make `out` a folder of this command."""
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out} is a file; name a folder.")
-    if out.is_dir() and any(out.iterdir()) and not (out / MARKER).exists():
-        raise UserError(f"--out {out} is not empty and is not of this command; name another folder.")
-    out.mkdir(parents=True, exist_ok=True)
+    take_folder(out, out / MARKER, "demo")
     (out / MARKER).write_text("Made by `abcd demo`. Everything here may be deleted.\n", encoding="utf-8")
 
 

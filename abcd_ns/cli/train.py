@@ -8,11 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from abcd_ns.errors import UserError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from abcd_ns.lab.runs.records import read_toml
 
 USAGE = """usage: abcd train FILE.toml [OPTIONS]
 
@@ -48,12 +44,7 @@ def command_line(path: Path) -> list[str]:
     Raises:
         UserError: the file is absent, is no TOML, names no method, or holds what no option can be.
     """
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist; configs/ has examples.") from None
-    except (ValueError, OSError) as error:
-        raise UserError(f"{path} cannot be read as TOML: {error}.") from None
+    data = read_toml(path, f"{path} does not exist; configs/ has examples.")
     method = data.pop(METHOD, None)
     if not isinstance(method, str):
         raise UserError(f'{path} names no method; begin it with: method = "abcd"')

@@ -24,7 +24,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
 from abcd_ns.engine.train.recipe import Limits, Recipe
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.splitting import cut_at_rest
 from abcd_ns.engine.train.step.batch import Sample
@@ -173,7 +173,7 @@ class AbcdPipeline(VanillaPipeline):
         if resumed:
             state = RunState.from_json(store.state)
             cut_at_rest(scene, state, training.limits.block_limit, training.limits.sole_limit)
-        run = Run(
+        run = TrainingRun(
             training,
             Budget(asked.total_steps, config.max_seconds),
             scene,
@@ -188,7 +188,7 @@ class AbcdPipeline(VanillaPipeline):
             coordinator.restore()
         return coordinator
 
-    def _trainer_of(self, run: Run) -> Trainer:
+    def _trainer_of(self, run: TrainingRun) -> Trainer:
         """Who trains by the run's options."""
         if run.config.recipe.exact:
             return ExactTrainer(run)

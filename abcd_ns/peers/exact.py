@@ -35,7 +35,7 @@ from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.visibility import reaches
 from abcd_ns.engine.store.scaffold import join, part
 from abcd_ns.engine.train.density.control import DensityClock
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
 from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, background, part_to_draw
 from abcd_ns.engine.train.trainer import Trainer
@@ -79,7 +79,7 @@ class ExactTrainer(Trainer):
     Between steps no Gaussians are live, so that the caller's optimizers have nothing to step.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: TrainingRun) -> None:
         super().__init__(run)
         run.fit_density(1)  # every block sees every step
         self._optics = Optics(list(self.views.values()), run.rasterizer.window_side)

@@ -37,7 +37,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import initial_of
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.planner import NothingSeenError
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.train.schedule import plan_sweep
 from abcd_ns.engine.train.step.batch import Batch
@@ -132,7 +132,7 @@ class Surfaces:
 class BlocksAlone:
     """Visits each block once, in its enlarged cell, for its share of the budget; see `Visits`."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: TrainingRun) -> None:
         self._run, self._scene = run, run.scene
         self._surfaces: Surfaces | None = None
         self._regions: dict[int, Region] = {}
@@ -236,7 +236,7 @@ class BlocksAlone:
         return join([BlockState.fresh(g) for g in [own, *(g[box.contains(g.means)] for g in around)]])
 
 
-def independent_trainer(run: Run) -> Coordinator:
+def independent_trainer(run: TrainingRun) -> Coordinator:
     """Trains each block in one visit, alone; `training.overlap` is above 0. No Gaussian migrates."""
     run.config = replace(run.config, recipe=replace(run.config.recipe, migrate=False))
     return Coordinator(run, BlocksAlone(run))

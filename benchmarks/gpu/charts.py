@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from abcd_ns.lab.runs.records import decode
+from abcd_ns.lab.runs.results import Results
 from abcd_ns.lab.runs.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
-from abcd_ns.lab.runs.tables import GIB, NOTHING, print_rows
-from abcd_ns.lab.scale.chart import draw as draw_scale
-from abcd_ns.lab.scale.results import ScaleResults, notes_of, rows_of
+from abcd_ns.lab.runs.tables import GIB, NOTHING, notes, print_rows, rows
+from abcd_ns.lab.scale.charts import draw_scale
 
 Record = dict[str, Any]
 SHADES = ("#0072B2", "#56A0D3", "#003A5D")
@@ -28,7 +28,7 @@ def draw(records: Sequence[Record], out: Path) -> list[Path]:
         if part.startswith("compare") and found.get("runs"):
             drawn += _draw_comparison(part, found, out)
         elif part == "extent" and found:
-            drawn += draw_scale(decode(ScaleResults, found["scale"], "extent.json"), out)
+            drawn += draw_scale(decode(Results, found["scale"], "extent.json"), out)
         elif part == "visit" and found.get("by_blocks"):
             drawn += _draw_visit(found, out)
     return drawn
@@ -37,10 +37,10 @@ def draw(records: Sequence[Record], out: Path) -> list[Path]:
 def show(records: Sequence[Record], console: Console) -> None:
     """A table for each part, below it what went wrong."""
     for record in records:
-        rows, notes = _rows(record["part"], record["found"])
+        table, remarks = _rows(record["part"], record["found"])
         trouble = [f"{record['part']}: {record['error']}"] if record["error"] else []
         dry = ["a dry run: these numbers mean nothing"] if record["dry_run"] else []
-        print_rows(rows, [*dry, *notes, *trouble], console)
+        print_rows(table, [*dry, *remarks, *trouble], console)
 
 
 def _rows(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
@@ -50,14 +50,14 @@ def _rows(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
     if part.startswith("compare"):
         return _rows_of_comparison(part, found)
     if part == "extent":
-        results = decode(ScaleResults, found["scale"], "extent.json")
-        return rows_of(results), notes_of(results)
+        results = decode(Results, found["scale"], "extent.json")
+        return rows(results), [*results.findings, *notes(results)]
     if part == "visit":
         columns = found["by_blocks"]
         titles = ["visit, ms a view", *(f"{column['blocks']} blocks" for column in columns)]
         stages = columns[0]["ms_per_view"] if columns else {}
-        rows = [[stage, *(f"{column['ms_per_view'][stage]:.2f}" for column in columns)] for stage in stages]
-        return [titles, *rows], []
+        body = [[stage, *(f"{column['ms_per_view'][stage]:.2f}" for column in columns)] for stage in stages]
+        return [titles, *body], []
     if part == "tests":
         counts = ("passed", "failed", "skipped")
         why = [f"{test}: {reason}" for test, reason in found["why_failed"].items()]
@@ -68,10 +68,10 @@ def _rows(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
 
 def _rows_of_comparison(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
     titles = [part, "PSNR (dB)", "SSIM", "Gaussians", "steps", "seconds", "GPU (GiB)", "reserved (GiB)"]
-    rows = []
+    body = []
     for run in found["runs"]:
         memory = [run["peak_device_bytes"], run["peak_reserved_bytes"]]
-        rows.append(
+        body.append(
             [
                 run["arm"],
                 f"{run['psnr_merged']:.2f}",
@@ -82,8 +82,10 @@ def _rows_of_comparison(part: str, found: Record) -> tuple[list[list[str]], list
                 *(NOTHING if size is None else f"{size / GIB:.2f}" for size in memory),
             ]
         )
-    notes = [f"{left['method']} is left out: {left['reason']}" for left in found["left_out"]]
-    return [titles, *rows], notes + [f"{fail['arm']} failed: {fail['reason']}" for fail in found["failures"]]
+    left_out = [f"{left['method']} is left out: {left['reason']}" for left in found["left_out"]]
+    return [titles, *body], left_out + [
+        f"{fail['arm']} failed: {fail['reason']}" for fail in found["failures"]
+    ]
 
 
 @in_style

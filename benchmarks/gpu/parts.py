@@ -21,14 +21,14 @@ from rich.console import Console
 
 from abcd_ns.cli.doctor.hardware import look_at_hardware
 from abcd_ns.engine.render import make_rasterizer, self_check
-from abcd_ns.lab.compare.command import without_impossible
-from abcd_ns.lab.compare.protocol import Options, make_plan
-from abcd_ns.lab.runs.job import Change, Job, Settings, Variant
+from abcd_ns.lab.compare.command import Options, impossible, make_plan
+from abcd_ns.lab.runs import experiment
+from abcd_ns.lab.runs.job import Change, Job, Variant
 from abcd_ns.lab.runs.records import decode, encode, read_json, write_json
 from abcd_ns.lab.runs.run import Run
-from abcd_ns.lab.runs.runner import claim, run_jobs
+from abcd_ns.lab.runs.runner import claim, finish_job
 from abcd_ns.lab.scale import command as scale
-from abcd_ns.lab.scale.arm import ArmJob
+from abcd_ns.lab.scale.worker import LandSettings
 from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
 from benchmarks import visit
 
@@ -109,36 +109,36 @@ def count_tests(report: Path) -> Found:
     return {"passed": len(cases) - found["failed"] - found["skipped"], **found}
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The runs at one budget: `abcd compare`'s, and `abcd`'s with several numbers of blocks."""
-
-    settings: Settings
-    jobs: tuple[Job, ...]
-    out: Path
-    kind = "GPU comparison"
-
-
 def compare(task: Task, by_steps: bool) -> Iterator[Found]:
     """Every method on the scene, under the protocol of `abcd compare`, at equal time or at equal steps."""
     size, console = task.size, Console()
     budget = {"steps": size.steps} if by_steps else {"seconds": size.seconds}
     given = Options(
-        task.data, size.methods, (task.seed,), blocks=8, evals=6, pictures=0, out=task.work, **budget
+        data=task.data,
+        methods=size.methods,
+        seeds=(task.seed,),
+        evals=6,
+        pictures=0,
+        out=task.work,
+        **budget,
     )
-    plan, left_out = without_impossible(make_plan(given))
+    plan = make_plan(given)
     several = [Variant((Change("blocks", str(count)),)) for count in size.blocks]
     jobs = (*plan.jobs, *(Job("abcd", task.seed, plan.settings, variant) for variant in several))
-    comparison = Comparison(plan.settings, jobs, plan.out)
-    claim(plan.out, comparison, describe_machine(), overwrite=False)
+    shared = {"settings": asdict(plan.settings), "machine": asdict(describe_machine())}
+    claim(plan.out, "GPU comparison", shared)
     found: Found = {
         "settings": asdict(plan.settings) | {"data": plan.settings.scene},
         "runs": [],
         "failures": [],
+        "left_out": [],
     }
-    found["left_out"] = [asdict(left) for left in left_out]
     for job in jobs:
-        (outcome,) = run_jobs(replace(comparison, jobs=(job,)), console)
+        left = impossible(job)
+        if left is not None:
+            found["left_out"].append(asdict(left))
+            continue
+        outcome = finish_job(job, plan.out, console, job.name)
         what = "runs" if isinstance(outcome, Run) else "failures"
         found[what].append(
             {"arm": f"{job.method} {job.variant.name}".removesuffix(" default"), **encode(outcome)}
@@ -152,14 +152,10 @@ def compare(task: Task, by_steps: bool) -> Iterator[Found]:
 def extent(task: Task) -> Iterator[Found]:
     """`abcd scale`, small scenes first, by blocks and as one."""
     size = task.size
-    jobs = tuple(
-        ArmJob(
-            tiles, size.gaussians, whole, 0 if whole else 3, 16 * MIB, task.seed, size.device_limit_mb * MIB
-        )
-        for tiles in size.tiles
-        for whole in (False, True)
-    )
-    for results in scale.measured(scale.Plan(Path(task.work), jobs), Console()):
+    settings = LandSettings(size.gaussians, 3, 16 * MIB, size.device_limit_mb * MIB)
+    plan = scale.make_plan(Path(task.work), settings, size.tiles, size.tiles, task.seed)
+    plan = replace(plan, jobs=tuple(sorted(plan.jobs, key=lambda job: job.tiles)))
+    for results in experiment.run_jobs(plan, Console(), leave_out=scale.too_large):
         yield {"scale": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
 
 

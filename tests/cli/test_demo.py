@@ -156,7 +156,7 @@ def test_a_second_demo_trains_anew_on_the_same_scene(tmp_path, monkeypatch):
 def test_a_folder_of_something_else_is_left_alone(commands, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("")
-    with pytest.raises(UserError, match="is not empty and is not of this command"):
+    with pytest.raises(UserError, match="is not empty and holds no demo"):
         demo(out=tmp_path / "mine")
     assert os.listdir(tmp_path / "mine") == ["thesis.tex"]
     with pytest.raises(UserError, match="is a file"):

@@ -1,19 +1,22 @@
 """`abcd scale`: the land is what it claims to be, and a measurement can be made and read back."""
 
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
 
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.records import decode, encode, read_json, read_record
-from abcd_ns.lab.scale.arm import Arm, ArmJob, run
-from abcd_ns.lab.scale.chart import draw
-from abcd_ns.lab.scale.command import scale
+from abcd_ns.lab.runs.findings import find_growth
+from abcd_ns.lab.runs.records import decode, encode, read_json
+from abcd_ns.lab.runs.results import Arm, Results, read_results
+from abcd_ns.lab.runs.run import Failure, Footing, Run
+from abcd_ns.lab.runs.tables import notes, rows, write_table
+from abcd_ns.lab.scale.charts import draw_scale
+from abcd_ns.lab.scale.command import make_plan, scale
 from abcd_ns.lab.scale.land import Land, color_of
-from abcd_ns.lab.scale.results import SCHEMA, ScaleResults, growth, notes_of, rows_of, write_table
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings, run
+from tests.lab.compare.records import made_up, made_up_run
 
 MIB = 2**20
 
@@ -69,49 +72,55 @@ def test_cameras_see_their_own_tile():
         assert 0 < pixel[1] < view.height
 
 
-@pytest.mark.parametrize("monolithic", [False, True])
-def test_a_measurement_trains_and_says_what_it_took(tmp_path, monolithic):
-    job = ArmJob(2, 300, monolithic, 0 if monolithic else 1, MIB, 0)
-    arm = run(job, tmp_path)
-    assert arm.gaussians == 600
-    assert arm.peak_rss_bytes >= arm.base_rss_bytes > 0
-    assert arm.store_bytes >= 600 * 3 * 59 * 4
-    assert arm.steps > 0
-    assert arm.psnr > 10
-    assert (arm.visit_seconds is None) == monolithic
-    assert decode(Arm, encode(arm), "here") == arm
+@pytest.mark.parametrize("method", ["abcd", WHOLE])
+def test_a_measurement_trains_and_says_what_it_took(tmp_path, method):
+    jobs = make_plan(tmp_path, LandSettings(300, 1, MIB), [2], [2], 0).jobs
+    job = next(job for job in jobs if job.method == method)
+    assert decode(LandJob, encode(job), "here") == job
+    found = run(job, tmp_path)
+    assert (found.gaussians, found.blocks) == (600, 1 if method == WHOLE else 2)
+    assert found.peak_rss_bytes >= found.memory.base_rss_bytes > 0
+    assert found.store_bytes >= 600 * 3 * 59 * 4
+    assert found.steps > 0
+    assert found.psnr > 10
+    assert (found.memory.visit_seconds is None) == (method == WHOLE)
+    assert decode(Run, encode(found), "here") == found
 
 
-def made_up(tiles: int, peak: int, monolithic: bool = False, device: int | None = None) -> Arm:
-    visit = None if monolithic else 2.0
-    return Arm(
-        tiles, tiles * 1000, monolithic, 400 * MIB, peak * MIB, device, 10, 1.0, 1.0, visit, visit, 5, 20.0
-    )
+def made_up_land(tiles: int, peak: int, method: str = "abcd", device: int | None = None) -> Arm:
+    visit = None if method == WHOLE else 2.0
+    footing = Footing(400 * MIB, 1.0, 1.0, visit, visit)
+    fields = {"gaussians": tiles * 1000, "peak_rss_bytes": peak * MIB, "peak_device_bytes": device}
+    found = made_up_run(method, **fields)
+    found = replace(found, memory=footing, psnr_merged=None, curve=())
+    return Arm(method, f"tiles={tiles}", tiles, (found,))
+
+
+def results_of(*arms: Arm) -> Results:
+    return made_up("study of scale", *arms, settings=None)
 
 
 def test_growth_is_from_the_smallest_to_the_largest():
-    arms = [made_up(8, 520), made_up(2, 500), made_up(4, 900), made_up(8, 9000, True)]
-    found = growth(arms)
-    assert found is not None
-    assert found.blocks == (2, 8)
-    assert found.ram == pytest.approx(0.04)
-    assert found.device is None
-    assert growth([made_up(2, 500, device=100), made_up(4, 500, device=150)]).device == pytest.approx(0.5)
-    assert growth(arms[:1]) is None
+    arms = [made_up_land(2, 500), made_up_land(4, 900), made_up_land(8, 520), made_up_land(8, 9000, WHOLE)]
+    results = results_of(*arms)
+    assert find_growth(results, "peak_rss_bytes") == pytest.approx(0.04)
+    assert find_growth(results, "peak_device_bytes") is None
+    assert results.findings == ("From 2 to 8 blocks of ABCD, peak RAM grows by 4.0%; allowed: 5%.",)
+    on_gpu = results_of(made_up_land(2, 500, device=100), made_up_land(4, 500, device=150))
+    assert "GPU memory by 50.0%" in on_gpu.findings[0]
+    assert results_of(arms[0]).findings == ()
 
 
 def test_results_are_written_in_words_and_drawn(tmp_path):
-    arms = (made_up(2, 500), made_up(8, 520), made_up(2, 450, True), made_up(8, 900, True))
-    results = ScaleResults(
-        SCHEMA, "2026-01-01", "abcd scale", describe_machine(), describe_versions(), arms, growth(arms), ()
-    )
+    sizes = ((2, 500, "abcd"), (8, 520, "abcd"), (2, 450, WHOLE), (8, 900, WHOLE))
+    results = results_of(*(made_up_land(*size) for size in sizes))
     write_table(results, tmp_path / "table.md")
     text = (tmp_path / "table.md").read_text()
-    assert "ABCD, 8 blocks" in text
+    assert "| abcd | 8 | 8,000 | 520 |" in text
     assert "grows by 4.0%" in text
-    assert len(rows_of(results)) == 5
-    assert any("400 MiB" in note for note in notes_of(results))
-    assert all(path.stat().st_size > 1000 for path in draw(results, tmp_path))
+    assert len(rows(results)) == 5
+    assert any("400 MiB" in note for note in notes(results))
+    assert all(path.stat().st_size > 1000 for path in draw_scale(results, tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -143,19 +152,20 @@ def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are
     """No GPU here: the processes' ends are made up."""
     tried = []
 
-    def made_up_end(job: ArmJob, _: Path) -> Arm | str:
-        tried.append((job.tiles, job.monolithic))
-        assert job.device_limit_bytes == 512 * MIB
-        if job.monolithic and job.tiles > 2:
-            return "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
-        return made_up(job.tiles, 500, job.monolithic, device=100)
+    def made_up_end(job: LandJob, *_) -> Run | Failure:
+        tried.append((job.tiles, job.method))
+        assert job.settings.device_limit_bytes == 512 * MIB
+        if job.method == WHOLE and job.tiles > 2:
+            reason = "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
+            return Failure(job.method, job.seed, reason, "log.txt")
+        return made_up_land(job.tiles, 500, job.method, device=100).runs[0]
 
-    monkeypatch.setattr("abcd_ns.lab.scale.command.measure", made_up_end)
+    monkeypatch.setattr("abcd_ns.lab.runs.experiment.finish_job", made_up_end)
     assert scale(tmp_path, blocks=(2, 4, 8), gaussians=10, device_limit_mb=512) == 0
-    assert tried == [(2, False), (4, False), (8, False), (2, True), (4, True)]
-    found = read_record(tmp_path / "scale.json", ScaleResults, SCHEMA)
-    assert (found.one_block_too_large, found.failures, len(found.arms)) == (4, (), 4)
-    assert "As one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
+    assert tried == [(2, "abcd"), (4, "abcd"), (8, "abcd"), (2, WHOLE), (4, WHOLE)]
+    found = read_results(tmp_path / "results.json")
+    assert (found.failures, len(found.arms)) == ((), 4)
+    assert "as one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
     assert "--device-limit-mb 512" in found.command
 
 
@@ -163,9 +173,9 @@ def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are
 def test_the_command_measures_writes_and_reuses(tmp_path, capsys):
     out = tmp_path / "out"
     assert scale(out, blocks=(2, 4), gaussians=200, visits=1) == 0
-    first = read_json(out / "scale.json")
-    assert {arm["tiles"] for arm in first["arms"]} == {2, 4}
+    first = read_json(out / "results.json")
+    assert {arm["value"] for arm in first["arms"]} == {2, 4}
     assert scale(out, blocks=(2, 4), gaussians=200, visits=1) == 0
-    assert read_json(out / "scale.json")["arms"] == first["arms"]
-    assert not list(out.glob("arms/*/store"))
+    assert read_json(out / "results.json")["arms"] == first["arms"]
+    assert not list(out.glob("runs/*/*/store"))
     assert "peak RAM grows by" in capsys.readouterr().out.replace("\n", " ")

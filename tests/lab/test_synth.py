@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.synth import SynthError, synth
 from abcd_ns.lab.synth.cameras import Camera, Lens, court_cameras, look_at
+from abcd_ns.lab.synth.command import Settings, synth
 from abcd_ns.lab.synth.court import Site, build_court
 from abcd_ns.lab.synth.geometry import box, lathe
 from abcd_ns.lab.synth.lighting import tone_map
@@ -30,7 +30,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("synth") / "two"
-    synth(out, **TINY)
+    synth(out, Settings(**TINY))
     return out
 
 
@@ -45,12 +45,12 @@ def picture(scene: Path, name: str) -> np.ndarray:
 
 def test_same_settings_give_same_bytes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: 1)
-    synth(tmp_path / "again", **TINY)
+    synth(tmp_path / "again", Settings(**TINY))
     assert contents(tmp_path / "again") == contents(scene)
 
 
 def test_seed_changes_the_scene(scene: Path, tmp_path: Path) -> None:
-    synth(tmp_path / "other", **TINY, seed=1)
+    synth(tmp_path / "other", Settings(**TINY, seed=1))
     mine, other = contents(scene), contents(tmp_path / "other")
     assert mine.keys() == other.keys()
     assert all(mine[name] != other[name] for name in mine if name.endswith(".png"))
@@ -146,7 +146,7 @@ def test_more_rays_per_pixel_converge() -> None:
 
 def test_finished_scene_is_left_alone(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {p: p.stat().st_mtime_ns for p in scene.rglob("*")}
-    synth(scene, **TINY)
+    synth(scene, Settings(**TINY))
     assert "already holds this scene" in capsys.readouterr().err
     assert {p: p.stat().st_mtime_ns for p in scene.rglob("*")} == before
 
@@ -155,18 +155,18 @@ def test_foreign_folder_is_refused_even_with_overwrite(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "holiday.jpg").write_bytes(b"dear")
     for overwrite in (False, True):
-        with pytest.raises(SynthError, match="not empty"):
-            synth(tmp_path, **TINY, overwrite=overwrite)
+        with pytest.raises(UserError, match="not empty"):
+            synth(tmp_path, Settings(**TINY), overwrite)
     assert contents(tmp_path) == {"images/holiday.jpg": b"dear"}
 
 
 def test_other_scene_is_replaced_only_on_request(tmp_path: Path) -> None:
     small = {**TINY, "courts": 1, "views_per_court": 3, "points_per_court": 40, "supersample": 1}
-    synth(tmp_path, **small)
+    synth(tmp_path, Settings(**small))
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(SynthError, match="--overwrite"):
-        synth(tmp_path, **{**small, "views_per_court": 2})
-    synth(tmp_path, **{**small, "views_per_court": 2}, overwrite=True)
+    with pytest.raises(UserError, match="--overwrite"):
+        synth(tmp_path, Settings(**{**small, "views_per_court": 2}))
+    synth(tmp_path, Settings(**{**small, "views_per_court": 2}), True)
     assert len(list((tmp_path / "images").iterdir())) == 2
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
@@ -178,10 +178,10 @@ def test_interrupted_scene_is_not_taken_for_a_finished_one(tmp_path: Path) -> No
             "abcd_ns.lab.synth.command.write_model", lambda *_: (_ for _ in ()).throw(OSError("full"))
         )
         with pytest.raises(OSError, match="full"):
-            synth(tmp_path, **small)
-    with pytest.raises(SynthError, match="unfinished"):
-        synth(tmp_path, **small)
-    synth(tmp_path, **small, overwrite=True)
+            synth(tmp_path, Settings(**small))
+    with pytest.raises(UserError, match="unfinished"):
+        synth(tmp_path, Settings(**small))
+    synth(tmp_path, Settings(**small), overwrite=True)
     assert pycolmap.Reconstruction(str(tmp_path / "sparse" / "0")).num_images() == 3
 
 
@@ -190,7 +190,7 @@ def test_interrupted_scene_is_not_taken_for_a_finished_one(tmp_path: Path) -> No
 )
 def test_settings_out_of_range_name_their_flag(tmp_path: Path, name: str, value: int) -> None:
     with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is {value}") as caught:
-        synth(tmp_path / "out", **{**TINY, name: value})
+        synth(tmp_path / "out", Settings(**{**TINY, name: value}))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 

@@ -20,10 +20,11 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.recipe import Limits, Recipe
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.lab.stability.world import look_at
 
 
 def random_gaussians(
@@ -43,18 +44,6 @@ def random_gaussians(
         features_rest=0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3),
         opacities=normal(count, 1),
     )
-
-
-def look_at(eye: Tensor, target: Tensor) -> Tensor:
-    """[4, 4] world to camera, OpenCV convention, with the world's z up."""
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(
-        torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0]).to(eye)), dim=0
-    )
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat = torch.eye(4, dtype=eye.dtype)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    return viewmat
 
 
 def ring_of_views(
@@ -95,7 +84,7 @@ def make_coordinator(
     tree: BlockTree | None = None,
     resume: bool = False,
     scaffold: int | None = None,
-    kind: Callable[[Run], Trainer] | None = None,
+    kind: Callable[[TrainingRun], Trainer] | None = None,
     content: Callable = blocks_at_rest,
     ram_bytes: int = 2 << 30,
     layer_bytes: int = LAYER_BYTES,
@@ -119,7 +108,7 @@ def make_coordinator(
         store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
         store.commit(content(tree, gaussians, *([] if scaffold is None else [scaffold])))
     config = training_config(sh_degree=gaussians.sh_degree, **training)
-    run = Run(
+    run = TrainingRun(
         config,
         Budget(steps=steps),
         StoredScene(tree, store, ram_bytes),

@@ -18,7 +18,7 @@ from abcd_ns.engine.store.settle import settle
 from abcd_ns.engine.store.special_blocks import LIVE
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.schedule import exponential_decay
 from abcd_ns.engine.train.splitting import cut_full
@@ -41,7 +41,7 @@ class Coordinator(Trainer):
 
     def __init__(
         self,
-        run: Run,
+        run: TrainingRun,
         visits: Visits | None = None,
         source: LayerSource | None = None,
         target: Callable[[Sample], Target] | None = None,

@@ -8,7 +8,7 @@ from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.store.scene import BlockScene
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 
 
@@ -34,7 +34,7 @@ class LayerSource:
     """
 
     def __init__(
-        self, run: Run, room: LayerRoom | None = None, around: Callable[[], BlockScene] | None = None
+        self, run: TrainingRun, room: LayerRoom | None = None, around: Callable[[], BlockScene] | None = None
     ) -> None:
         self._run, self.room = run, room or LayerRoom()
         self._around = around or (lambda: run.scene)

@@ -12,7 +12,7 @@ from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.store.settle import has_scaffold
 from abcd_ns.engine.store.special_blocks import WHOLE
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
     SCAFFOLD_PASSES,
@@ -64,7 +64,7 @@ class Planner:
     """ABCD's visits: sweeps over all blocks that any view sees, after a warm-up; all that it remembers is in
     the run's state."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: TrainingRun) -> None:
         self._run = run
         self._config, self._budget, self._scene = run.config, run.budget, run.scene
         self._views = run.views

@@ -16,7 +16,7 @@ from abcd_ns.engine.train.schedule import sh_degree_at
 from abcd_ns.engine.types import View
 
 
-class Run:
+class TrainingRun:
     """One training run over a scene at rest, through the caller's live parameters and optimizers.
 
     Args:

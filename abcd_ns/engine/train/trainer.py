@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.train.density.control import DensityControl
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import RunState, Stopwatch
 from abcd_ns.engine.train.step.batch import Batch, Rendered
 
@@ -19,7 +19,7 @@ from abcd_ns.engine.train.step.batch import Batch, Rendered
 class Trainer(ABC):
     """Trains a scene step by step, and tells its listeners what happens."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: TrainingRun) -> None:
         self.run = run
         self.config, self.scene, self.views = run.config, run.scene, run.views
         self.params, self.optimizers, self.device = run.params, run.optimizers, run.device

@@ -1,6 +1,8 @@
 """`abcd compare`: train ABCD and its peers on one scene and compare."""
 
-from datetime import datetime, timezone
+import dataclasses
+import shlex
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -8,42 +10,70 @@ import torch
 import tyro
 from rich.console import Console
 
+from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy
 from abcd_ns.lab.compare.pictures import draw_pictures
-from abcd_ns.lab.compare.protocol import Options, Plan, make_plan, read_options
-from abcd_ns.lab.compare.results import SCHEMA, LeftOut, Protocol, Results, write_results
-from abcd_ns.lab.compare.tables import print_table, write_table
-from abcd_ns.lab.runs.job import HELD_OUT_EVERY, Job, Method
+from abcd_ns.lab.runs import experiment
+from abcd_ns.lab.runs.checks import Flag, make_settings, words
+from abcd_ns.lab.runs.job import METHODS, Job, Method, Plan
+from abcd_ns.lab.runs.records import decode, read_toml
+from abcd_ns.lab.runs.results import LeftOut, Results
 from abcd_ns.lab.runs.run import Failure, Run
-from abcd_ns.lab.runs.runner import claim, run_jobs
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
 
-RESULTS_FILE, TABLE_FILE, PICTURES = "results.json", "table.md", "pictures"
+PICTURES = "pictures"
 
 
-def _words(metavar: str, *aliases: str):
-    """How --help shows an option that is None unless it is given."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="", aliases=aliases or None)
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a user gives, on the command line or in a TOML file; None is what was not given."""
+
+    data: Annotated[str | None, words("PATH")] = None
+    """The scene: a folder with a COLMAP model or transforms.json, as for `ns-train abcd --data`."""
+    out: Annotated[str | None, words("PATH")] = None
+    """Folder for the results; absent, empty, or one of an earlier comparison under the same protocol."""
+    methods: Annotated[tuple[Method, ...] | None, words("METHOD ...")] = None
+    """Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-exact, abcd-paper
+    (needs steps) and splatfacto (needs CUDA)."""
+    seconds: Annotated[float | None, words("S")] = None
+    """Budget of a run: seconds of training; evaluation, saving and compiling do not count."""
+    steps: Annotated[int | None, words("N")] = None
+    """Budget of a run: optimisation steps. Give either this or seconds."""
+    seeds: Annotated[tuple[int, ...] | None, words("N ...", "--seed")] = None
+    """One run of every method for each. Default: 0."""
+    downscale: Annotated[int | None, words("N")] = None
+    """Divides the photos' width and height. Default: 1."""
+    blocks: Annotated[int | None, words("N")] = None
+    """Blocks of every method that has any. Default: 8."""
+    evals: Annotated[int | None, words("N")] = None
+    """Points of the curve of held-out PSNR over time, the last at the end. Default: 8."""
+    max_gaussians: Annotated[int | None, words("N")] = None
+    """In the whole scene; 0 for no limit. Default: 0."""
+    no_densify: Flag = False
+    """Train the initial Gaussians only: none are added or pruned."""
+    pictures: Annotated[int | None, words("N")] = None
+    """Held-out views to show. Default: 3."""
+
+    def over(self, other: "Options") -> "Options":
+        """These options, and `other`'s where these were not given."""
+        given = {
+            name: value for name, value in vars(self).items() if value is not None and value is not False
+        }
+        if "seconds" in given or "steps" in given:
+            # A budget on the command line takes the place of the file's, whatever its unit.
+            other = dataclasses.replace(other, seconds=None, steps=None)
+        return dataclasses.replace(other, **given)
 
 
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+DEFAULTS = Options(
+    methods=METHODS[:3], seeds=(0,), downscale=1, blocks=8, evals=8, max_gaussians=0, pictures=3
+)
 
 
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def compare(
+    options: Annotated[Options, tyro.conf.arg(name="")],
     *,
-    data: Annotated[Path | None, _words("PATH")] = None,
-    out: Annotated[Path | None, _words("PATH")] = None,
-    methods: Annotated[tuple[Method, ...] | None, _words("METHOD ...")] = None,
-    seconds: Annotated[float | None, _words("S")] = None,
-    steps: Annotated[int | None, _words("N")] = None,
-    seeds: Annotated[tuple[int, ...] | None, _words("N ...", "--seed")] = None,
-    downscale: Annotated[int | None, _words("N")] = None,
-    blocks: Annotated[int | None, _words("N")] = None,
-    evals: Annotated[int | None, _words("N")] = None,
-    max_gaussians: Annotated[int | None, _words("N")] = None,
-    no_densify: Flag = False,
-    pictures: Annotated[int | None, _words("N")] = None,
-    config: Annotated[Path | None, _words("FILE.toml")] = None,
+    config: Annotated[Path | None, words("FILE.toml")] = None,
     overwrite: Flag = False,
 ) -> int:
     """Train several methods on one scene under one protocol, and write what came of it.
@@ -54,122 +84,76 @@ def compare(
     are finished.
 
     Args:
-        data: The scene: a folder with a COLMAP model or transforms.json, as for `ns-train abcd --data`.
-        out: Folder for the results; absent, empty, or one of an earlier comparison under the same protocol.
-        methods: Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-exact,
-            abcd-paper (needs steps) and splatfacto (needs CUDA).
-        seconds: Budget of a run: seconds of training; evaluation, saving and compiling do not count.
-        steps: Budget of a run: optimisation steps. Give either this or seconds.
-        seeds: One run of every method for each. Default: 0.
-        downscale: Divides the photos' width and height. Default: 1.
-        blocks: Blocks of every method that has any. Default: 8.
-        evals: Points of the curve of held-out PSNR over time, the last at the end. Default: 8.
-        max_gaussians: In the whole scene; 0 for no limit. Default: 0.
-        no_densify: Train the initial Gaussians only: none are added or pruned.
-        pictures: Held-out views to show. Default: 3.
+        options: what is compared, and under which conditions.
         config: TOML file with any of these options by their names; the command line goes before it.
         overwrite: Drop the runs that OUT holds.
 
     Raises:
         UserError: an option cannot be used, or OUT holds something else.
     """
-    given = Options(
-        data=data and str(data),
-        out=out and str(out),
-        methods=methods,
-        seconds=seconds,
-        steps=steps,
-        seeds=seeds,
-        downscale=downscale,
-        blocks=blocks,
-        evals=evals,
-        max_gaussians=max_gaussians,
-        no_densify=no_densify or None,
-        pictures=pictures,
-    )
-    plan = make_plan(given.over(read_options(config)) if config else given)
+    plan = make_plan(options.over(read_options(config)) if config else options)
     return carry_out(plan, Console(), overwrite)
+
+
+def read_options(path: Path) -> Options:
+    """Options from a TOML file whose keys are the names of the command line's options.
+
+    Raises:
+        UserError: the file is absent, is no TOML, or has a key or value that does not fit.
+    """
+    return decode(Options, read_toml(path, f"--config {path} does not exist."), str(path))
+
+
+def make_plan(options: Options) -> Plan:
+    """Fill in defaults and check everything that can be checked without reading the scene.
+
+    Raises:
+        UserError: an option is missing, out of range or contradicts another.
+    """
+    given = options.over(DEFAULTS)
+    for method in given.methods:
+        if method not in METHODS:
+            raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
+    if not given.methods:
+        raise UserError("Give at least one of --methods.")
+    if "abcd-paper" in given.methods and given.steps is None:
+        raise UserError(
+            "abcd-paper gives each cell a fixed number of steps: use --steps instead of --seconds."
+        )
+    shared = {n: v for n, v in vars(given).items() if n not in ("methods", "no_densify")}
+    settings = make_settings(**shared, densify=not given.no_densify)
+    methods = [method for method in METHODS if method in given.methods]
+    jobs = tuple(Job(method, seed, settings) for seed in given.seeds for method in methods)
+    out = Path(given.out)
+    line = ["abcd", "compare", "--data", settings.scene, "--methods", *methods, "--seeds", *given.seeds]
+    line += settings.words()
+    line += [] if settings.densify else ["--no-densify"]
+    line += ["--pictures", settings.pictures, "--out", out.name]
+    return Plan("comparison", settings, out, jobs, shlex.join(map(str, line)))
 
 
 def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     """Do all runs of the plan and write what came of them; exit code 1 if a run failed."""
-    plan, left_out = without_impossible(plan)
-    for left in left_out:
-        console.print(f"{left.method} is left out: {left.reason}.", highlight=False, soft_wrap=True)
-    machine = describe_machine()
-    claim(plan.out, plan, machine, overwrite)
-    outcomes = run_jobs(plan, console)
-    results = Results(
-        schema=SCHEMA,
-        protocol=describe_protocol(plan),
-        machine=machine,
-        versions=describe_versions(),
-        runs=tuple(outcome for outcome in outcomes if isinstance(outcome, Run)),
-        failures=tuple(outcome for outcome in outcomes if isinstance(outcome, Failure)),
-        left_out=left_out,
-    )
-    report(results, plan, console)
-    return 1 if results.failures else 0
+
+    def draw(results: Results, out: Path) -> list[Path]:
+        charts = [*draw_speed_accuracy(results, out), *draw_size_accuracy(results, out)]
+        return [*charts, *draw_pictures(_first_runs(results, plan), out / PICTURES)]
+
+    return experiment.carry_out(plan, console, draw, overwrite, impossible)
 
 
-def without_impossible(plan: Plan) -> tuple[Plan, tuple[LeftOut, ...]]:
-    """The plan without the methods that cannot run on this machine or under this protocol, and why."""
-    reason = None
+def impossible(job: Job, outcome: Run | Failure | None = None) -> LeftOut | None:  # noqa: ARG001
+    """Why the job's method cannot run on this machine or under this protocol, if it cannot."""
+    if job.method != "splatfacto":
+        return None
     if not torch.cuda.is_available():
-        reason = "it needs a CUDA device, and there is none here"
-    elif plan.settings.max_gaussians:
-        reason = "it has no limit on the number of Gaussians, and this protocol sets one"
-    if reason is None or "splatfacto" not in plan.methods:
-        return plan, ()
-    methods = tuple(method for method in plan.methods if method != "splatfacto")
-    return Plan(plan.settings, methods, plan.seeds, plan.out), (LeftOut("splatfacto", reason),)
+        return LeftOut(job.method, "it needs a CUDA device, and there is none here")
+    if job.settings.max_gaussians:
+        return LeftOut(job.method, "it has no limit on the number of Gaussians, and this protocol sets one")
+    return None
 
 
-def describe_protocol(plan: Plan) -> Protocol:
-    """What results.json says of how the comparison was made."""
-    settings = plan.settings
-    return Protocol(
-        scene=settings.scene,
-        held_out=f"every {HELD_OUT_EVERY}th view of the list sorted by name, from the first on",
-        methods=plan.methods,
-        seeds=plan.seeds,
-        date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        command=plan.command,
-        **{
-            name: getattr(settings, name)
-            for name in (
-                "downscale",
-                "seconds",
-                "steps",
-                "blocks",
-                "evals",
-                "max_gaussians",
-                "densify",
-                "pictures",
-            )
-        },
-    )
-
-
-def report(results: Results, plan: Plan, console: Console) -> None:
-    """Write results.json, table, chart and pictures, and print the table."""
-    out = plan.out
-    write_results(out / RESULTS_FILE, results)
-    write_table(results, out / TABLE_FILE)
-    paths = [
-        out / RESULTS_FILE,
-        out / TABLE_FILE,
-        *draw_speed_accuracy(results, out),
-        *draw_size_accuracy(results, out),
-        *draw_pictures(_first_runs(results, plan), out / PICTURES),
-    ]
-    if results.runs:
-        print_table(results, console)
-    for path in paths:
-        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
-
-
-def _first_runs(results: Results, plan: Plan) -> list[tuple[Run, Path]]:
+def _first_runs(results: Results, plan: Plan) -> list[tuple]:
     """Each method's first run, with the folder of its pictures."""
-    first = [results.of(method)[0] for method in results.methods]
+    first = [arm.runs[0] for arm in results.arms]
     return [(run, Job(run.method, run.seed, plan.settings).folder(plan.out) / PICTURES) for run in first]

@@ -17,7 +17,6 @@ from abcd_ns.lab.runs.job import HELD_OUT_EVERY, Job
 from abcd_ns.lab.runs.options import change_options
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.options import mirror
-from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 ENDLESS = 10**9
@@ -78,11 +77,6 @@ def check_options(job: Job) -> None:
 def registered(method: str) -> AbcdTrainerConfig | None:
     """The configuration that `ns-train` knows a method of ABCD's by, not a copy; None for any other."""
     return _REGISTERED[method].config if method in _REGISTERED else None
-
-
-def default_options(method: str) -> AbcdPipelineConfig:
-    """The method's pipeline as it is registered; not a copy."""
-    return _REGISTERED[method].config.pipeline
 
 
 def _abcd(job: Job) -> AbcdTrainerConfig:

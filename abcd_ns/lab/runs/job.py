@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 Method = Literal[
     "abcd-monolithic", "abcd", "abcd-ablated", "abcd-partition", "abcd-exact", "abcd-paper", "splatfacto"
@@ -44,6 +44,13 @@ class Settings:
         """Shares of the run, up to 1, at which held-out views are drawn; denser where quality rises fast."""
         return tuple((k / self.evals) ** 2 for k in range(1, self.evals + 1))
 
+    def words(self, blocks: bool = True) -> list[Any]:
+        """What every command line says of them, `blocks` or not."""
+        words = ["--steps", self.steps] if self.seconds is None else ["--seconds", f"{self.seconds:g}"]
+        words += ["--downscale", self.downscale, "--evals", self.evals]
+        words += ["--blocks", self.blocks] if blocks else []
+        return words + (["--max-gaussians", self.max_gaussians] if self.max_gaussians else [])
+
 
 @dataclass(frozen=True)
 class Change:
@@ -70,6 +77,12 @@ class Variant:
         return " ".join(map(str, self.changes)) or "default"
 
     @property
+    def number(self) -> int | None:
+        """What is set, where that is one whole number."""
+        values = [change.value for change in self.changes]
+        return int(values[0]) if len(values) == 1 and values[0].isdecimal() else None
+
+    @property
     def folder(self) -> str:
         """The name as a part of a path; "" for the method as it is."""
         return re.sub(r"[^\w.=+-]+", "_", self.name) if self.changes else ""
@@ -87,6 +100,10 @@ class Job:
     seed: int
     settings: Settings
     variant: Variant = AS_IT_IS
+    worker = "abcd_ns.lab.runs.worker"
+    """The module that does it."""
+    scratch = ()
+    """Folders beside the job that are dropped when it is done."""
 
     @property
     def name(self) -> str:
@@ -100,24 +117,37 @@ class Job:
         return out / "runs" / self.method / "-".join([*parts, f"seed-{self.seed}"])
 
 
-class Plan(Protocol):
-    """The runs of one folder, whatever they are for."""
+@dataclass(frozen=True)
+class Plan:
+    """All runs of an experiment."""
+
+    kind: str
+    """What the folder holds, in a word or a few; what is of another kind goes into another folder."""
+    settings: Any
+    """What all runs share: a frozen dataclass of JSON's scalars."""
+    out: Path
+    jobs: tuple[Job, ...]
+    """In the order in which they are made: seed by seed, so that one that is interrupted has every arm's
+    first seed first."""
+    command: str
+    """The command line that makes the same."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the table has to know of the jobs."""
 
     @property
-    def kind(self) -> str:
-        """What the folder holds, in a word or a few: "comparison"."""
+    def methods(self) -> tuple[str, ...]:
+        """In their order."""
+        return tuple(dict.fromkeys(job.method for job in self.jobs))
 
     @property
-    def settings(self) -> Settings:
-        """What all runs share."""
+    def variants(self) -> tuple[Variant, ...]:
+        """In their order."""
+        return tuple(dict.fromkeys(job.variant for job in self.jobs))
 
     @property
-    def out(self) -> Path:
-        """The folder."""
-
-    @property
-    def jobs(self) -> tuple[Job, ...]:
-        """All runs, in the order in which they are made."""
+    def seeds(self) -> tuple[int, ...]:
+        """In their order."""
+        return tuple(dict.fromkeys(job.seed for job in self.jobs))
 
 
 def evenly(count: int, wanted: int) -> tuple[int, ...]:

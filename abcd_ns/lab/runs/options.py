@@ -2,11 +2,14 @@
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, Union
+
+import msgspec
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.job import Change, Variant
@@ -75,10 +78,10 @@ def set_options(config: Any, values: Mapping[str, bool | int | float | str | Non
             raise UserError(f"{where}: there is no option {path!r} in this version of abcd_ns.")
         if path not in known:
             continue
-        found = _read(known[path], str(value))
-        if found is _NOT_OF_TYPE:
-            raise UserError(f"{where}: {path} is {value!r}; it must be {_words(known[path])}.")
-        _set(config, path, found)
+        try:
+            _set(config, path, _read(known[path], str(value)))
+        except ValueError:
+            raise UserError(f"{where}: {path} is {value!r}; it must be {_words(known[path])}.") from None
 
 
 def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -109,13 +112,11 @@ def read_value(change: Change, pipeline: Any) -> Any:
     known = option_names(pipeline)
     if change.path not in known:
         raise UserError(f"There is no option {change.path!r}; {_near(change.path, known)}")
-    found = _read(known[change.path], change.value)
-    if found is _NOT_OF_TYPE:
-        raise UserError(f"{change} does not fit: {change.path} must be {_words(known[change.path])}.")
-    return found
-
-
-_NOT_OF_TYPE = object()
+    try:
+        return _read(known[change.path], change.value)
+    except ValueError:
+        words = _words(known[change.path])
+        raise UserError(f"{change} does not fit: {change.path} must be {words}.") from None
 
 
 def _set(config: Any, path: str, value: Any) -> None:
@@ -162,26 +163,17 @@ def _is_a_word(hint: Any) -> bool:
 
 
 def _read(hint: Any, text: str) -> Any:
-    for alternative in _alternatives(hint):
-        value = _read_one(alternative, text)
-        if value is not _NOT_OF_TYPE:
-            return value
-    return _NOT_OF_TYPE
+    """The value that a word says, by the option's type.
 
-
-def _read_one(hint: Any, text: str) -> Any:
-    if hint is type(None):
-        return None if text.lower() == "none" else _NOT_OF_TYPE
-    if typing.get_origin(hint) is Literal:
-        return {str(choice): choice for choice in typing.get_args(hint)}.get(text, _NOT_OF_TYPE)
-    if hint is bool:
-        return {"true": True, "false": False}.get(text.lower(), _NOT_OF_TYPE)
-    try:
-        value = hint(text)
-    except ValueError:
-        return _NOT_OF_TYPE
-    # "nan" and "inf" are floats to Python, and no setting of anything here.
-    return _NOT_OF_TYPE if hint is float and not abs(value) < float("inf") else value
+    Raises:
+        ValueError: it says none.
+    """
+    if text.lower() == "none" and type(None) in _alternatives(hint):
+        return None
+    value = msgspec.convert(text, hint, strict=False, dec_hook=lambda kind, word: kind(word))
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{text} is no setting of anything here")
+    return value
 
 
 def _words(hint: Any) -> str:

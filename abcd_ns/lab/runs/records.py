@@ -1,4 +1,4 @@
-"""Frozen dataclasses to JSON and back, with every field checked by its annotation.
+"""Frozen dataclasses to JSON and back, every field checked by its annotation.
 
 Results are read again later, by people and programs that were not there: what cannot be stated in JSON (NaN,
 infinity) is refused when it is written, and a file that does not fit is refused when it is read.
@@ -8,14 +8,19 @@ import dataclasses
 import difflib
 import json
 import math
-import types
-import typing
+import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
+import msgspec
+
 from abcd_ns.errors import UserError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 R = TypeVar("R")
 
@@ -28,24 +33,21 @@ def decode(cls: type[R], data: Any, where: str) -> R:
     """`data`, as JSON or TOML gives it, as the dataclass `cls`.
 
     Args:
-        where: the file that `data` comes from, and the place in it; begins every message.
+        where: the file that `data` comes from; begins every message.
 
     Raises:
-        RecordError: a field is unknown, missing or of another type.
+        RecordError: a field is missing or of another type, or there is none of that name.
     """
-    if not isinstance(data, dict):
-        raise RecordError(f"{where} must be a table of named values, not {data!r}.")
-    hints = typing.get_type_hints(cls)
-    fields = {field.name: field for field in dataclasses.fields(cls)}
-    for name in data:
-        if name not in fields:
-            close = difflib.get_close_matches(name, fields, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(fields)}."
+    if isinstance(data, dict):
+        names = [field.name for field in dataclasses.fields(cls)]
+        for name in data.keys() - set(names):
+            close = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(names)}."
             raise RecordError(f"{where} has an unknown field {name!r}; {hint}")
-    missing = [n for n, f in fields.items() if n not in data and _is_required(f)]
-    if missing:
-        raise RecordError(f"{where} lacks the field {missing[0]!r}.")
-    return cls(**{name: _value(hints[name], value, f"{where}: {name}") for name, value in data.items()})
+    try:
+        return msgspec.convert(data, cls)
+    except msgspec.ValidationError as error:
+        raise RecordError(f"{where}: {str(error).replace('`', '').replace('$.', '')}.") from None
 
 
 def encode(record: Any) -> dict[str, Any]:
@@ -76,18 +78,31 @@ def read_json(path: Path) -> Any:
     """What `write_json` wrote.
 
     Raises:
-        RecordError: the file is absent, is no JSON, or holds NaN or infinity.
+        RecordError: the file is absent, or is no JSON, which has no NaN and no infinity.
     """
-
-    def refuse(constant: str) -> None:
-        raise RecordError(f"{path} holds {constant}, which is no number in JSON; delete it and run again.")
-
     try:
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+        return msgspec.json.decode(path.read_bytes())
     except FileNotFoundError:
         raise RecordError(f"{path} does not exist.") from None
-    except ValueError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise RecordError(f"{path} is not JSON ({error}); delete it and run again.") from None
+
+
+def read_toml(path: Path, absent: str) -> dict[str, Any]:
+    """A user's options in TOML.
+
+    Args:
+        absent: what to say where there is no such file.
+
+    Raises:
+        RecordError: the file is absent, or is no TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RecordError(absent) from None
+    except (ValueError, OSError) as error:
+        raise RecordError(f"{path} cannot be read as TOML: {error}.") from None
 
 
 def read_record(path: Path, cls: type[R], schema: int) -> R:
@@ -103,50 +118,17 @@ def read_record(path: Path, cls: type[R], schema: int) -> R:
     return decode(cls, data, str(path))
 
 
-def _is_required(field: dataclasses.Field) -> bool:
-    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in args:
-            return None
-        *others, last = (arg for arg in args if arg is not type(None))
-        for hint in others:
-            with suppress(RecordError):
-                return _value(hint, value, where)
-        return _value(last, value, where)
-    if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise RecordError(f"{where} must be a list, not {value!r}.")
-        return tuple(_value(args[0], item, f"{where}[{i}]") for i, item in enumerate(value))
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise RecordError(f"{where} must be a table of named values, not {value!r}.")
-        return {key: _value(args[1], item, f"{where}.{key}") for key, item in value.items()}
-    if dataclasses.is_dataclass(hint):
-        return decode(hint, value, where)
-    return _scalar(hint, value, where)
-
-
-def _scalar(hint: type, value: Any, where: str) -> Any:
-    # A bool is an int in Python, and no number to whoever writes a file.
-    is_bool = isinstance(value, bool)
-    if hint is float and isinstance(value, (int, float)) and not is_bool:
-        return float(value)
-    if isinstance(value, hint) and is_bool == (hint is bool):
-        return value
-    name = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}[hint]
-    raise RecordError(f"{where} must be {name}, not {value!r}.")
-
-
 def _leaves(data: Any, path: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(data, dict):
-        for key, value in data.items():
-            yield from _leaves(value, f"{path}.{key}" if path else str(key))
-    elif isinstance(data, (list, tuple)):
-        for i, value in enumerate(data):
-            yield from _leaves(value, f"{path}[{i}]")
-    else:
+    items = (
+        data.items()
+        if isinstance(data, dict)
+        else enumerate(data)
+        if isinstance(data, (list, tuple))
+        else None
+    )
+    if items is None:
         yield path, data
+        return
+    for key, value in items:
+        step = f"[{key}]" if isinstance(key, int) else f".{key}" if path else str(key)
+        yield from _leaves(value, path + step)

@@ -48,13 +48,15 @@ class Run:
     total_seconds: float
     """Of the process, from its start to the end of saving; evaluation not."""
     psnr: float
-    """Composited, dB. Likewise `ssim` and `lpips`."""
+    """Composited, dB. Likewise `ssim` and `lpips`. Where nothing is held out (`abcd scale`), of the crops
+    trained on, mean of the last visit's steps."""
     ssim: float | None
     lpips: float | None
     lpips_reason: str | None
     """Why `lpips` is None."""
-    psnr_merged: float
-    """All Gaussians drawn at once, as every viewer does, dB. Likewise `ssim_merged`."""
+    psnr_merged: float | None
+    """All Gaussians drawn at once, as every viewer does, dB. Likewise `ssim_merged`. None where nothing is
+    held out."""
     ssim_merged: float | None
     ordering_gap_db: float | None
     """PSNR of the merged against the composited pictures, from the mean of the views' squared errors."""
@@ -78,6 +80,23 @@ class Run:
     peak_reserved_bytes: int | None = None
     """The most that torch took from the GPU for what it held, likewise; None in results of versions that
     did not ask."""
+    memory: "Footing | None" = None
+    """What `abcd scale` asks beyond."""
+
+
+@dataclass(frozen=True)
+class Footing:
+    """Where a run's memory and time began, and what a visit took."""
+
+    base_rss_bytes: int
+    """RAM before the scene was made: Python, torch and the kernels."""
+    make_seconds: float
+    plan_seconds: float
+    """Until the first visit began: which views see which block."""
+    visit_seconds: float | None
+    """Mean of the visits but the first, whose time holds `plan_seconds`."""
+    layer_seconds: float | None
+    """Of it, for layers."""
 
 
 @dataclass(frozen=True)

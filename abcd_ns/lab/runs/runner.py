@@ -1,74 +1,69 @@
 """Runs jobs one after the other, each in a process of its own, and keeps what earlier calls finished."""
 
-import dataclasses
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.job import Job, Plan, Settings
+from abcd_ns.lab.runs.job import Job
 from abcd_ns.lab.runs.records import RecordError, decode, encode, read_json, write_json
 from abcd_ns.lab.runs.run import Failure, Run
-from abcd_ns.nerfstudio.machine import Machine
+from abcd_ns.lab.runs.work import RUN_FILE
 
-JOB_FILE, RUN_FILE, LOG_FILE = "job.json", "run.json", "log.txt"
-WORKER = (sys.executable, "-m", "abcd_ns.lab.runs.worker")
+JOB_FILE, LOG_FILE = "job.json", "log.txt"
 POLL_SECONDS = 0.2
 SECONDS_BETWEEN_LINES = 30.0
 """Where the output is no terminal, a line says this often that a run is still going on."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Claim:
-    """Under what a folder's runs were made."""
-
-    settings: Settings
-    machine: Machine
-
-
-def claim_file(kind: str) -> str:
-    """The file that marks a folder of such results and holds what all its runs share."""
-    return f"{kind.replace(' ', '-')}.json"
-
-
-def claim(out: Path, plan: Plan, machine: Machine, overwrite: bool) -> None:
-    """Make `out` the folder of this plan's runs.
+def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = False) -> None:
+    """Make `out` the folder of an experiment's results.
 
     Args:
+        kind: of the experiment, in words.
+        shared: what all its runs have in common, by part and name: values of JSON's.
         overwrite: drop the runs that are there.
 
     Raises:
-        UserError: `out` holds something else, or runs under another protocol or from another machine.
+        UserError: `out` holds something else, or runs that do not share that.
     """
-    mine = Claim(plan.settings, machine)
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out} is a file; name a folder.")
-    path = out / claim_file(plan.kind)
-    if not path.exists():
-        if out.is_dir() and any(out.iterdir()):
-            raise UserError(f"--out {out} is not empty and holds no {plan.kind}; name another folder.")
-        out.mkdir(parents=True, exist_ok=True)
-    elif overwrite:
+    marker = out / f"{kind.replace(' ', '-')}.json"
+    if take_folder(out, marker, kind) and overwrite:
         shutil.rmtree(out / "runs", ignore_errors=True)
-    else:
-        _check_same(decode(Claim, read_json(path), str(path)), mine, out)
-    write_json(path, encode(mine))
+    elif marker.exists():
+        _check_same(read_json(marker), shared, out)
+    write_json(marker, dict(shared))
 
 
-def _check_same(theirs: Claim, mine: Claim, out: Path) -> None:
-    for part in ("settings", "machine"):
-        old, new = (vars(getattr(claim, part)) for claim in (theirs, mine))
-        for name in new:
-            if old[name] != new[name]:
+def take_folder(out: Path, marker: Path, kind: str) -> bool:
+    """Whether `out` is there already, with its marker; it is made where it is absent.
+
+    Raises:
+        UserError: it is a file, or a folder of something else.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out} is a file; name a folder.")
+    if not marker.exists() and out.is_dir() and any(out.iterdir()):
+        raise UserError(f"{out} is not empty and holds no {kind}; name another folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    return marker.exists()
+
+
+def _check_same(theirs: Any, mine: Mapping[str, Any], out: Path) -> None:
+    for part, values in mine.items():
+        for name, new in values.items():
+            old = theirs.get(part, {}).get(name) if isinstance(theirs, dict) else None
+            if old != new:
                 raise UserError(
-                    f"--out {out} holds runs with {name} {old[name]}, not {new[name]}, which cannot be "
+                    f"--out {out} holds runs with {name} {old}, not {new}, which cannot be "
                     "compared; name another folder, or drop them with --overwrite."
                 )
 
@@ -77,45 +72,37 @@ def finished_run(job: Job, out: Path) -> Run | None:
     """The run of the very same job that an earlier call finished, if any."""
     folder = job.folder(out)
     try:
-        if decode(Job, read_json(folder / JOB_FILE), str(folder)) != job:
+        if decode(type(job), read_json(folder / JOB_FILE), str(folder)) != job:
             return None
         return decode(Run, read_json(folder / RUN_FILE), str(folder / RUN_FILE))
     except RecordError:
         return None  # unfinished, or of another version of this program: to be run again
 
 
-def run_jobs(plan: Plan, console: Console, worker: Sequence[str] = WORKER) -> list[Run | Failure]:
-    """Finish all jobs of the plan, in order; a run that fails does not stop the others.
-
-    Args:
-        worker: command that is given the path of a job file.
-    """
-    found: list[Run | Failure] = []
-    for number, job in enumerate(plan.jobs, start=1):
-        head = f"[{number}/{len(plan.jobs)}] {job.name}"
-        outcome = finished_run(job, plan.out)
-        if outcome is not None:
-            console.print(f"{head}: reused, {_short(outcome)}", markup=False, highlight=False)
-        else:
-            outcome = run_job(job, plan.out, console, head, worker)
-            console.print(f"{head}: {_short(outcome)}", markup=False, highlight=False, soft_wrap=True)
-        found.append(outcome)
-    return found
+def finish_job(job: Job, out: Path, console: Console, head: str) -> Run | Failure:
+    """The job's run, made now if no earlier call did; `head` begins every line about it."""
+    outcome, how = finished_run(job, out), "reused, "
+    if outcome is None:
+        outcome, how = run_job(job, out, console, head), ""
+    console.print(f"{head}: {how}{_short(outcome)}", markup=False, highlight=False, soft_wrap=True)
+    return outcome
 
 
-def run_job(
-    job: Job, out: Path, console: Console, head: str, worker: Sequence[str] = WORKER
-) -> Run | Failure:
+def command_of(job: Job) -> tuple[str, ...]:
+    """What does the job, before the path of its file."""
+    return (sys.executable, "-m", job.worker)
+
+
+def run_job(job: Job, out: Path, console: Console, head: str) -> Run | Failure:
     """Start the job's process and wait for it."""
     folder = job.folder(out)
-    if folder.exists():
-        shutil.rmtree(folder)
+    shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     write_json(folder / JOB_FILE, encode(job))
     log = folder / LOG_FILE
     with open(log, "wb") as stream:
         process = subprocess.Popen(
-            [*worker, str(folder / JOB_FILE)],
+            [*command_of(job), str(folder / JOB_FILE)],
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=subprocess.STDOUT,
@@ -127,6 +114,8 @@ def run_job(
             if process.poll() is None:  # Ctrl-C
                 process.terminate()
                 process.wait()
+            for name in job.scratch:
+                shutil.rmtree(folder / name, ignore_errors=True)
     run = finished_run(job, out) if process.returncode == 0 else None
     reason = _reason(process.returncode, log)
     return run or Failure(job.method, job.seed, reason, str(log.relative_to(out)), job.variant.name)
@@ -163,7 +152,7 @@ def _reason(code: int, log: Path) -> str:
 def _short(outcome: Run | Failure) -> str:
     if isinstance(outcome, Failure):
         return f"failed: {outcome.reason} (see {outcome.log})"
-    return (
-        f"{outcome.psnr_merged:.2f} dB merged, {outcome.gaussians:,} Gaussians, {outcome.steps:,} steps in "
-        f"{outcome.train_seconds:.0f} s"
-    )
+    score = "" if outcome.psnr_merged is None else f"{outcome.psnr_merged:.2f} dB merged, "
+    gpu = "" if outcome.peak_device_bytes is None else f", {outcome.peak_device_bytes / 2**30:.2f} GiB of GPU"
+    done = f"{outcome.gaussians:,} Gaussians, {outcome.steps:,} steps in {outcome.train_seconds:.0f} s"
+    return f"{score}{done}, {outcome.peak_rss_bytes / 2**30:.2f} GiB of RAM{gpu}"

@@ -1,14 +1,17 @@
 """How charts look: colours, marks and type, the same in all of them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.text import Annotation
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 P, R = ParamSpec("P"), TypeVar("R")
 
@@ -89,6 +92,41 @@ def lay_grid(axes: Axes) -> None:
     """Pale lines behind everything."""
     axes.grid(color="#d9d9d9", linewidth=0.5)
     axes.set_axisbelow(True)
+
+
+def plot(axes: Axes, x: Sequence[float], y: Sequence[float], method: str, **more: Any) -> Line2D:
+    """A method's line with its marks, in its colour; `more` goes before the usual look."""
+    look = {"markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5, "linewidth": 1.4}
+    (line,) = axes.plot(x, y, **{**look, "color": COLORS[method], "marker": MARKERS[method], **more})
+    return line
+
+
+def scatter(axes: Axes, x: Sequence[float], y: Sequence[float], color: str) -> None:
+    """Single runs as small dots behind the means."""
+    axes.scatter(x, y, s=9, color=color, alpha=0.4, linewidths=0)
+
+
+def write_beside(
+    axes: Axes, text: str, xy: tuple[float, float], offset: tuple[float, float], **more: Any
+) -> Annotation:
+    """A word beside a point, `offset` printer's points away; `more` is matplotlib's."""
+    return axes.annotate(text, xy=xy, xytext=offset, textcoords="offset points", **{"fontsize": 8, **more})
+
+
+def tick_at(axes: Axes, values: Iterable[float], write: Callable[[float], str], base: int | None = 2) -> None:
+    """Marks on the axis of x at these values and no others, on a logarithmic scale if there is a base."""
+    if base is not None:
+        axes.set_xscale("log", base=base)
+    axes.xaxis.set_major_locator(FixedLocator(sorted(set(values))))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: write(value)))
+
+
+def short(count: float) -> str:
+    """32000 as 32k."""
+    if count >= 1e6:
+        return f"{count / 1e6:.3g}M"
+    return f"{count / 1e3:.3g}k" if count >= 1000 else f"{count:g}"
 
 
 def name_and_score(name: str, psnr: float) -> str:

@@ -1,7 +1,8 @@
-"""Tables of runs: what is measured, in which words and with how many digits."""
+"""Results as tables: what is measured, in which words and with how many digits."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean, stdev
 
 from rich import box
@@ -9,17 +10,24 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
+from abcd_ns.lab.runs.findings import find_default, find_difference
+from abcd_ns.lab.runs.job import HELD_OUT_EVERY
+from abcd_ns.lab.runs.results import Arm, Curve, Outcome, Results
 from abcd_ns.lab.runs.run import Run
 from abcd_ns.nerfstudio.machine import Machine
 
+TABLE_FILE = "table.md"
 NOTHING = "-"
 """Stands where there is no value."""
+MIB, GIB = 2**20, 2**30
 Value = Callable[[Run], float | None]
+Rows = list[list[str]]
+"""Of a table, its titles first."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One row."""
+    """One row or column."""
 
     title: str
     """With its unit."""
@@ -27,11 +35,8 @@ class Measure:
     digits: int
 
 
-def _in(unit: int, get: Value) -> Value:
-    return lambda run: None if (size := get(run)) is None else size / unit
-
-
-MIB, GIB = 2**20, 2**30
+def _in(unit: int, name: str) -> Value:
+    return lambda run: None if getattr(run, name) is None else getattr(run, name) / unit
 
 
 MEASURES = (
@@ -47,15 +52,42 @@ MEASURES = (
     Measure("training (s)", lambda run: run.train_seconds, 1),
     Measure("of it, layers (s)", lambda run: run.layer_seconds, 1),
     Measure("whole process (s)", lambda run: run.total_seconds, 1),
-    Measure("peak GPU memory (GiB)", _in(GIB, lambda run: run.peak_device_bytes), 2),
-    Measure("peak GPU memory, reserved (GiB)", _in(GIB, lambda run: run.peak_reserved_bytes), 2),
-    Measure("peak RAM (GiB)", _in(GIB, lambda run: run.peak_rss_bytes), 2),
-    Measure("blocks on disk (MiB)", _in(MIB, lambda run: run.store_bytes), 1),
+    Measure("peak GPU memory (GiB)", _in(GIB, "peak_device_bytes"), 2),
+    Measure("peak GPU memory, reserved (GiB)", _in(GIB, "peak_reserved_bytes"), 2),
+    Measure("peak RAM (GiB)", _in(GIB, "peak_rss_bytes"), 2),
+    Measure("blocks on disk (MiB)", _in(MIB, "store_bytes"), 1),
 )
+"""Of a comparison."""
+SCALE_MEASURES = (
+    Measure("Gaussians", lambda run: run.gaussians, 0),
+    Measure("peak RAM (MiB)", _in(MIB, "peak_rss_bytes"), 0),
+    Measure("peak GPU memory (MiB)", _in(MIB, "peak_device_bytes"), 0),
+    Measure("blocks on disk (GiB)", _in(GIB, "store_bytes"), 2),
+    Measure("visit (s)", lambda run: run.memory.visit_seconds, 1),
+    Measure("of it, layers (s)", lambda run: run.memory.layer_seconds, 1),
+)
+_BY_TITLE = {measure.title: measure for measure in MEASURES}
+_QUALITY = (
+    "PSNR, merged (dB)",
+    "SSIM, merged",
+    "PSNR, composited (dB)",
+    "Gaussians",
+    "steps",
+    "training (s)",
+)
+_MEMORY = ("peak RAM (GiB)", "peak GPU memory (GiB)")
+_OF_OPTIONS = ("PSNR, merged (dB)", "SSIM, merged", "Gaussians", "steps", "training (s)")
+COLUMNS: dict[str, tuple[str, tuple[Measure, ...]]] = {
+    "study of blocks": ("blocks", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
+    "study of gaussians": ("limit", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
+    "study of options": ("changed", tuple(map(_BY_TITLE.get, _OF_OPTIONS))),
+    "study of scale": ("tiles", SCALE_MEASURES),
+}
+"""The title of the first column, and the measures that follow, by kind of results."""
 
 
 def cell(runs: Sequence[Run], measure: Measure) -> str:
-    """The measure of a method's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
+    """The measure of an arm's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
     values = [measure.value(run) for run in runs]
     if not values or any(value is None for value in values):
         return NOTHING
@@ -63,14 +95,63 @@ def cell(runs: Sequence[Run], measure: Measure) -> str:
     return text if len(values) == 1 else f"{text} ± {stdev(values):,.{measure.digits}f}"
 
 
-def budget_of(seconds: float | None, steps: int | None) -> str:
-    """A run's budget in words."""
-    return f"{steps:,} steps" if seconds is None else f"{seconds:g} s of training"
+def rows(results: Results) -> Rows:
+    """A row for each arm; of a comparison a row for each measure. Columns that know nothing are left out."""
+    if results.kind not in COLUMNS:
+        titles = ["", *results.methods]
+        return [titles, *([m.title, *(cell(arm.runs, m) for arm in results.arms)] for m in MEASURES)]
+    first, measures = COLUMNS[results.kind]
+    measures = [m for m in measures if any(cell(arm.runs, m) != NOTHING for arm in results.arms)]
+    options, several = results.kind == "study of options", len(results.methods) > 1
+    titles = ["method"] * several + [first] + ["difference (dB)"] * options
+    body = []
+    for arm in results.arms:
+        name = arm.variant if options or arm.value is None else f"{arm.value:,}"
+        begin = [arm.method] * several + [name] + [_difference(arm, results)] * options
+        body.append([*begin, *(cell(arm.runs, measure) for measure in measures)])
+    return [[*titles, *(measure.title for measure in measures)], *body]
 
 
-def seeds_in_words(seeds: Sequence[int]) -> str:
-    """ "seed 0" or "seeds 0, 1"."""
-    return ("seed " if len(seeds) == 1 else "seeds ") + ", ".join(map(str, seeds))
+def notes(results: Results) -> list[str]:
+    """What a reader of the table has to know, a sentence each."""
+    found = [] if results.settings is None else [_protocol(results)]
+    found.append(about_machine(results.machine))
+    if footings := [run.memory for run in results.runs if run.memory is not None]:
+        base = min(footing.base_rss_bytes for footing in footings) / MIB
+        found.append(f"Of the RAM, {base:,.0f} MiB are Python, torch and kernels, before any scene.")
+    if results.settings is not None:
+        found.append("Evaluation, saving and compiling are left out of the training time.")
+    if len(results.seeds) > 1:
+        found.append("Numbers are means over the seeds ± their standard deviation.")
+    if results.kind == "study of options":
+        found.append("Differences are those of merged PSNR, taken seed by seed.")
+    reasons = {}
+    for run in results.runs if results.kind == "comparison" else ():
+        reasons |= {"LPIPS": run.lpips_reason, "peak GPU memory": run.peak_device_note}
+        if run.ordering_gap_note:
+            found.append(f"{run.method}: no ordering gap ({run.ordering_gap_note}).")
+    found += [f"{name} is missing: {reason}." for name, reason in reasons.items() if reason]
+    found += results.notes
+    found += [f"{left.method} is left out: {left.reason}." for left in results.left_out]
+    for failure in results.failures:
+        what = "" if failure.variant == "default" else f" {failure.variant},"
+        found.append(f"{failure.method},{what} seed {failure.seed} failed ({failure.log}): {failure.reason}")
+    return list(dict.fromkeys([*found, f"Command: `{results.command}`, {results.date[:10]}."]))
+
+
+def _protocol(results: Results) -> str:
+    s = results.settings
+    budget = f"{s.steps:,} steps" if s.seconds is None else f"{s.seconds:g} s of training"
+    seeds = ("seed " if len(results.seeds) == 1 else "seeds ") + ", ".join(map(str, results.seeds))
+    conditions = [f"{budget} a run", seeds]
+    if results.kind != "comparison" and len(results.methods) == 1:
+        conditions.insert(0, results.methods[0])
+    if results.kind != "study of blocks" and set(results.methods) != {"abcd-monolithic"}:
+        conditions.append(f"{s.blocks} blocks")
+    conditions += [] if s.densify else ["the number of Gaussians fixed"]
+    conditions += [f"at most {s.max_gaussians:,} Gaussians"] if s.max_gaussians else []
+    held_out = f"every {HELD_OUT_EVERY}th view of the list sorted by name, from the first on"
+    return f"Scene {s.scene} at 1/{s.downscale} of its size; held out: {held_out}; {', '.join(conditions)}."
 
 
 def about_machine(machine: Machine) -> str:
@@ -81,28 +162,66 @@ def about_machine(machine: Machine) -> str:
     )
 
 
-def markdown(rows: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
-    """A table, its first row the titles, and below it a list of notes."""
-    titles, *body = rows
-    lines = ["| " + " | ".join(row) + " |" for row in body]
-    head = "| " + " | ".join(titles) + " |"
-    rule = "| --- |" + " ---: |" * (len(titles) - 1)
-    return "\n".join([head, rule, *lines, "", *(f"- {note}" for note in notes), ""])
+def write_table(results: Results, path: Path) -> None:
+    """What was found, the tables and the notes, as Markdown."""
+    parts = [*results.findings]
+    parts += [markdown(rows(results))] if results.arms else []
+    parts += [markdown(_of_outcomes(results.outcomes), align="---")] if results.outcomes else []
+    for curve in results.curves:
+        parts += [markdown(_of_curve(curve)), *([f"{curve.note}."] if curve.note else [])]
+    parts.append("\n".join(f"- {note}" for note in notes(results)))
+    path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
-def print_rows(rows: Sequence[Sequence[str]], notes: Sequence[str], console: Console) -> None:
+def markdown(table: Sequence[Sequence[str]], align: str = "---:") -> str:
+    """A table, its first row the titles; `align` is that of all columns but the first."""
+    cells = [[text.replace("|", "\\|").replace("\n", " ") for text in row] for row in table]
+    titles, *body = ("| " + " | ".join(row) + " |" for row in cells)
+    return "\n".join([titles, "| --- |" + f" {align} |" * (len(cells[0]) - 1), *body])
+
+
+def print_table(results: Results, console: Console) -> None:
     """The same in the terminal."""
-    titles, *body = rows
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    print_rows(rows(results), [*results.findings, *notes(results)], console)
+
+
+def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: Console) -> None:
+    """A table in the terminal, its first row the titles, and below it a list of remarks."""
+    titles, *body = table
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for i, title in enumerate(titles):
-        table.add_column(title, justify="right" if i else "left", no_wrap=True)
+        shown.add_column(title, justify="right" if i else "left", no_wrap=True)
     for row in body:
-        table.add_row(*row)
+        shown.add_row(*row)
     width = console.width
     # Wider than a narrow terminal rather than with numbers cut off.
-    needed = Measurement.get(console, console.options.update(width=1000), table).maximum
+    needed = Measurement.get(console, console.options.update(width=1000), shown).maximum
     console.width = max(width, needed)
-    console.print(table)
+    console.print(shown)
     console.width = width
-    for note in notes:
-        console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
+    for remark in remarks:
+        console.print(f"- {remark}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _difference(arm: Arm, results: Results) -> str:
+    default = find_default(results)
+    found = None if default is None or arm is default else find_difference(arm, default)
+    if found is None:
+        return NOTHING
+    return f"{found.mean:+.2f}" + ("" if found.deviation is None else f" ± {found.deviation:.2f}")
+
+
+def _of_outcomes(outcomes: Sequence[Outcome]) -> Rows:
+    table = [["", "fails elsewhere", "done here", "what each method did", ""]]
+    for found in outcomes:
+        said = "<br>".join(f"{method}: {words}" for method, words in found.said.items())
+        verdict = ("pass" if found.passed else "**fail**") + (", one block is better" if found.worse else "")
+        table.append([found.id, found.fails, f"{found.done}<br>*pass:* {found.rule}", said, verdict])
+    return table
+
+
+def _of_curve(curve: Curve) -> Rows:
+    values = curve.lines[0].x
+    table = [[f"{curve.title}: held-out PSNR (dB) by {curve.x_label}", *(f"{x:g}" for x in values)]]
+    table += [[line.name, *(f"{value:.2f}" for value in line.psnr)] for line in curve.lines]
+    return table if curve.level is None else [*table, ["one block", *[f"{curve.level:.2f}"] * len(values)]]

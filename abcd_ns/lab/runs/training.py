@@ -59,67 +59,50 @@ class Training:
 
     def __init__(self, trainer: Trainer, settings: Settings) -> None:
         self.trainer, self.pipeline = trainer, trainer.pipeline
-        self.layer_seconds = 0.0
+        self.layer_seconds, self._steps = 0.0, 0
         self.coordinator = getattr(trainer.pipeline, "coordinator", None)
-        if self.coordinator is None:
-            self._follow_steps(settings)
-        else:
-            self._follow_events(settings)
-
-    def _follow_events(self, settings: Settings) -> None:
-        coordinator = self.coordinator
-        self.stopwatch = coordinator.stopwatch
+        ours = self.coordinator is not None
+        self.stopwatch = self.coordinator.stopwatch if ours else Stopwatch()
+        self._budget = Budget(settings.steps, settings.seconds)
         self.recorder = CurveRecorder(
             settings.moments,
             self.stopwatch,
-            lambda: coordinator.progress,
-            lambda: coordinator.state.step,
-            self._score_aloud,
+            lambda: self.progress,
+            lambda: self.steps,
+            self._score_aloud if ours else lambda: mean_psnr(self.pipeline),
             lambda: self.gaussians,
         )
+        if ours:
+            self.coordinator.announce.subscribe(self._listen)
+        else:
+            self._follow_steps()
 
-        def listen(event: Event) -> None:
-            if isinstance(event, StepTaken):
-                self.recorder.look()
-            elif isinstance(event, VisitEnded):
-                self.layer_seconds += event.layer_seconds
-
-        coordinator.announce.subscribe(listen)
+    def _listen(self, event: Event) -> None:
+        if isinstance(event, StepTaken):
+            self.recorder.look()
+        elif isinstance(event, VisitEnded):
+            self.layer_seconds += event.layer_seconds
 
     def _score_aloud(self) -> float:
         found = mean_psnr(self.pipeline)
         self.coordinator.announce(HeldOutScored(found, None))
         return found
 
-    def _follow_steps(self, settings: Settings) -> None:
+    def _follow_steps(self) -> None:
         """For a trainer that is not ABCD's: count the time here, and stop when it is up."""
-        trainer, budget = self.trainer, Budget(settings.steps, settings.seconds)
-        self.stopwatch = Stopwatch()
-
-        def progress() -> float:
-            return budget.progress(trainer.step + 1, self.stopwatch.seconds)
-
-        self.recorder = CurveRecorder(
-            settings.moments,
-            self.stopwatch,
-            progress,
-            lambda: trainer.step + 1,
-            lambda: mean_psnr(self.pipeline),
-            lambda: self.gaussians,
-        )
 
         def begin_step(step: int) -> None:  # noqa: ARG001 - nerfstudio passes it
             self.stopwatch.start()
 
-        def end_step(step: int) -> None:  # noqa: ARG001
+        def end_step(step: int) -> None:
+            self._steps = step + 1  # the trainer's own count is one higher once it has been stopped
             self.recorder.look()
-            if progress() >= 1:
+            if self.progress >= 1:
                 self.stopwatch.pause()
-                self.steps_taken = trainer.step + 1
-                trainer.stop_training = True
+                self.trainer.stop_training = True
 
         location = TrainingCallbackLocation
-        trainer.callbacks += [
+        self.trainer.callbacks += [
             TrainingCallback([location.BEFORE_TRAIN_ITERATION], begin_step),
             TrainingCallback([location.AFTER_TRAIN_ITERATION], end_step),
         ]
@@ -131,9 +114,16 @@ class Training:
         self.pipeline.model.draws_with().warm_up()
 
     @property
+    def progress(self) -> float:
+        """The share of the run that is done."""
+        if self.coordinator is None:
+            return self._budget.progress(self.steps, self.stopwatch.seconds)
+        return self.coordinator.progress
+
+    @property
     def steps(self) -> int:
-        """Optimisation steps taken by a run that is over."""
-        return self.steps_taken if self.coordinator is None else self.coordinator.state.step
+        """Optimisation steps taken."""
+        return self._steps if self.coordinator is None else self.coordinator.state.step
 
     @property
     def blocks(self) -> int:

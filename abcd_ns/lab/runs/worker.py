@@ -15,7 +15,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.evaluate import (
     draw_held_out,
@@ -25,22 +24,17 @@ from abcd_ns.lab.runs.evaluate import (
     squared_gap,
 )
 from abcd_ns.lab.runs.job import Job, evenly
-from abcd_ns.lab.runs.records import decode, encode, read_json, write_json
 from abcd_ns.lab.runs.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.training import Training
+from abcd_ns.lab.runs.work import memory_of_run, work
 from abcd_ns.nerfstudio.machine import (
     describe_versions,
     disk_bytes,
-    peak_device_bytes,
-    peak_rss_bytes,
     without_home,
 )
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
-
-RUN_FILE = "run.json"
-"""Written when all is done, beside the job."""
 
 
 def run(job: Job, folder: Path) -> Run:
@@ -63,7 +57,7 @@ def run(job: Job, folder: Path) -> Run:
     training.warm_up()
     trainer.train()
     total = time.time() - psutil.Process().create_time() - training.recorder.seconds
-    memory = _memory()
+    memory = memory_of_run()
     scores, gaps = score_held_out(training, job, folder / "pictures")
     return _record(job, training, total, scores, gaps, folder, memory)
 
@@ -92,16 +86,6 @@ def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[V
 def save_png(path: Path, picture: Tensor) -> None:
     """Write a picture, float [h, w, 3] in 0..1, with 8 bits a channel."""
     Image.fromarray((picture * 255).round().byte().cpu().numpy()).save(path)
-
-
-def _memory() -> dict[str, int | str | None]:
-    allocated, reserved = peak_device_bytes()
-    return {
-        "peak_rss_bytes": peak_rss_bytes(),
-        "peak_device_bytes": allocated,
-        "peak_device_note": "no CUDA device" if allocated is None else None,
-        "peak_reserved_bytes": reserved,
-    }
 
 
 def _record(
@@ -143,16 +127,8 @@ def _record(
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the job in the file named by the only argument; exit code 0, or 2 for an error of the user's."""
-    (path,) = map(Path, sys.argv[1:] if args is None else args)
-    job = decode(Job, read_json(path), str(path))
-    try:
-        found = run(job, path.resolve().parent)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    write_json(path.with_name(RUN_FILE), encode(found))
-    return 0
+    """Do the job in the file named by the only argument; exit code 0, or 2 for an error of the user's."""
+    return work(Job, run, args)
 
 
 if __name__ == "__main__":

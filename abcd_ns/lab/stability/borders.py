@@ -13,7 +13,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.health.health_rules import SHOWS
 from abcd_ns.engine.types import View
 from abcd_ns.lab.stability.lab import BUDGET, LIMITED, METHODS, Lab, Stage, Trained, make_stage
-from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.world import Wall, World, camera
 
 BAND = 4
@@ -55,6 +55,13 @@ def band_ratio(lab: Lab, trained: Trained, bands: list[Tensor], stage: Stage) ->
     return float(errors[inside].mean() / errors[~inside].mean())
 
 
+@scenario(
+    "A14",
+    'seams, "chunk bleeding" and "ghosting" at borders (LoD of Gaussians, VastGaussian #49)',
+    "a textured floor over four blocks, seen by held-out cameras",
+    f"the error within {BAND} px of a border is at most {SEAM} times the interior's",
+    cost=2,
+)
 def seams(lab: Lab) -> Finding:
     """A14: a textured floor over four blocks."""
     held_out = above(16, turn=1.0)[::3]
@@ -85,6 +92,13 @@ def alpha_in_air(lab: Lab, trained: Trained, tree: BlockTree, views: list[View])
     return torch.stack(alphas).mean()
 
 
+@scenario(
+    "A15",
+    "floaters in the air between cameras and scene (BlockGaussian)",
+    f"{FLOATERS} points in the air before a wall, in a cell of their own",
+    f"less than {ALPHA:.0%} alpha in that cell in held-out views; Gaussians left there are counted",
+    cost=2,
+)
 def floaters(lab: Lab) -> Finding:
     """A15: points in the air between cameras and a wall, in a cell of their own."""
     views = [
@@ -114,23 +128,3 @@ def floaters(lab: Lab) -> Finding:
     worse = numbers["alpha abcd"] > numbers["alpha abcd-monolithic"]
     passed = numbers["alpha abcd"] < ALPHA
     return Finding(passed, said, numbers, worse=worse)
-
-
-SCENARIOS = (
-    Scenario(
-        "A14",
-        'seams, "chunk bleeding" and "ghosting" at borders (LoD of Gaussians, VastGaussian #49)',
-        "a textured floor over four blocks, seen by held-out cameras",
-        f"the error within {BAND} px of a border is at most {SEAM} times the interior's",
-        seams,
-        cost=2,
-    ),
-    Scenario(
-        "A15",
-        "floaters in the air between cameras and scene (BlockGaussian)",
-        f"{FLOATERS} points in the air before a wall, in a cell of their own",
-        f"less than {ALPHA:.0%} alpha in that cell in held-out views; Gaussians left there are counted",
-        floaters,
-        cost=2,
-    ),
-)

@@ -15,7 +15,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health.health_rules import unsound
 from abcd_ns.lab.stability.emptiness import equal
 from abcd_ns.lab.stability.lab import Lab, make_stage
-from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.world import TABLE, camera, ring
 
 SIZES = ((1, 1), (7, 5), (33, 17), (101, 67), (48, 36), (16, 64))
@@ -55,6 +55,12 @@ def wrong_rays(tree, center: Tensor, seed: int) -> int:
     return int((rank[cells].diff(dim=1) < 0).any(dim=1).sum())
 
 
+@scenario(
+    "A10",
+    "blocks drawn in the wrong order near borders",
+    "cameras in a block, on faces, edges and corners, and one step of float64 beside each",
+    "0 rays that meet the blocks in another order than the image's",
+)
 def odd_places(lab: Lab) -> Finding:
     """A10: cameras in blocks, on faces, edges and corners, and one step of float64 beside them."""
     points = torch.randn((600, 3), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -65,6 +71,12 @@ def odd_places(lab: Lab) -> Finding:
     return Finding(wrong == 0, said, {"wrong": wrong, "rays": RAYS * len(centers)})
 
 
+@scenario(
+    "A18",
+    "odd, tiny and mixed image sizes; distortion",
+    "one run on 1 x 1, 7 x 5, 33 x 17, 101 x 67 and others; OPENCV lenses with k = 0 and with absurd k",
+    "the run ends with finite values; k = 0 is left alone; an absurd k is an error that says so",
+)
 def odd_sizes(lab: Lab) -> Finding:
     """A18: pictures of 1 to 6,767 pixels in one run; lenses with no and with absurd distortion."""
     views = [replace(camera_of(v.index, size), index=v.index) for v, size in zip(ring(6), SIZES, strict=True)]
@@ -97,6 +109,13 @@ def lenses() -> tuple[bool, bool]:
     return not plain.distorted, False
 
 
+@scenario(
+    "A20",
+    "same seed, other result: 24.2 to 28.1 dB over 45 runs (Inria #89)",
+    "one run twice on one thread, then on two and three",
+    "all bit-equal, on a CPU",
+    cost=4,
+)
 def repeated(lab: Lab) -> Finding:
     """A20: the same run twice, and with another number of threads."""
     stage, threads, same = make_stage(views=ring(8), points=300), torch.get_num_threads(), {}
@@ -129,6 +148,12 @@ class WrongGradient(TorchRasterizer):
         return super().draw(replace(gaussians, quats=turned), shots, **options)
 
 
+@scenario(
+    "A21",
+    "picture right, gradient wrong: 14 dB instead of 25 (a ROCm port)",
+    "the self-check at the start, of a backend whose rotations get the opposite gradient",
+    "refused, and the wrong gradient named",
+)
 def wrong_gradient(lab: Lab) -> Finding:  # noqa: ARG001 - nothing is trained
     """A21: the check at the start, of a sound backend and of one with a wrong gradient."""
     sound = self_check(TorchRasterizer("never"), "cpu")
@@ -138,36 +163,3 @@ def wrong_gradient(lab: Lab) -> Finding:  # noqa: ARG001 - nothing is trained
         said = {"abcd": f'"{str(error).split(", so")[0]}"'}
         return Finding(sound == 0.0, said, {"difference of a sound one": sound})
     return Finding(False, {"abcd": "accepted"}, {"difference of a sound one": sound})
-
-
-SCENARIOS = (
-    Scenario(
-        "A10",
-        "blocks drawn in the wrong order near borders",
-        "cameras in a block, on faces, edges and corners, and one step of float64 beside each",
-        "0 rays that meet the blocks in another order than the image's",
-        odd_places,
-    ),
-    Scenario(
-        "A18",
-        "odd, tiny and mixed image sizes; distortion",
-        "one run on 1 x 1, 7 x 5, 33 x 17, 101 x 67 and others; OPENCV lenses with k = 0 and with absurd k",
-        "the run ends with finite values; k = 0 is left alone; an absurd k is an error that says so",
-        odd_sizes,
-    ),
-    Scenario(
-        "A20",
-        "same seed, other result: 24.2 to 28.1 dB over 45 runs (Inria #89)",
-        "one run twice on one thread, then on two and three",
-        "all bit-equal, on a CPU",
-        repeated,
-        cost=4,
-    ),
-    Scenario(
-        "A21",
-        "picture right, gradient wrong: 14 dB instead of 25 (a ROCm port)",
-        "the self-check at the start, of a backend whose rotations get the opposite gradient",
-        "refused, and the wrong gradient named",
-        wrong_gradient,
-    ),
-)

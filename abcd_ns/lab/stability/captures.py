@@ -9,7 +9,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.initialize import random_points
 from abcd_ns.engine.types import View
 from abcd_ns.lab.stability.lab import METHODS, Lab, Method, Stage, make_stage
-from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.world import TABLE, Ball, World
 
 FEW = 3
@@ -85,6 +85,13 @@ def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:
     return Finding(passed, said, numbers, worse)
 
 
+@scenario(
+    "A11",
+    "sparse, unbalanced views; a random start costs 4 to 5 dB (RAIN-GS)",
+    f"{FEW} of 16 cameras; points at random places",
+    "PSNR falls by no more than one block's does, and 0.3 dB",
+    cost=6,
+)
 def sparse(lab: Lab) -> Finding:
     """A11: few views; a random start."""
     stage = table()
@@ -92,6 +99,13 @@ def sparse(lab: Lab) -> Finding:
     return lost(lab, {f"{FEW} views": stage.only(FEW), "a random start": random})
 
 
+@scenario(
+    "A12",
+    "noisy poses, changing exposure (H3DGS #55, VastGaussian)",
+    f"poses off by {TURN_DEGREES} degrees and {SHIFT:.0%}; every other photo 1.5 times as bright",
+    "PSNR falls by no more than one block's does, and 0.3 dB",
+    cost=5,
+)
 def inexact(lab: Lab) -> Finding:
     """A12: poses that are off, exposures that differ."""
     stage = table()
@@ -99,35 +113,14 @@ def inexact(lab: Lab) -> Finding:
     return lost(lab, {"noisy poses": noisy, "two exposures": with_gains(stage)})
 
 
+@scenario(
+    "A16",
+    "sky and far background lost (H3DGS #39, Inria #300)",
+    f"a textured shell {FAR:g} times as far away as the cameras stand",
+    "PSNR falls by no more than one block's does, and 0.3 dB",
+    cost=2,
+)
 def far_shell(lab: Lab) -> Finding:
     """A16: half of each picture is a shell 50 times as far away as the cameras stand."""
     world = World((*TABLE.surfaces[:-1], Ball((0.0, 0.0, 0.0), FAR)))
     return lost(lab, {"a far shell": make_stage(world)})
-
-
-SCENARIOS = (
-    Scenario(
-        "A11",
-        "sparse, unbalanced views; a random start costs 4 to 5 dB (RAIN-GS)",
-        f"{FEW} of 16 cameras; points at random places",
-        "PSNR falls by no more than one block's does, and 0.3 dB",
-        sparse,
-        cost=6,
-    ),
-    Scenario(
-        "A12",
-        "noisy poses, changing exposure (H3DGS #55, VastGaussian)",
-        f"poses off by {TURN_DEGREES} degrees and {SHIFT:.0%}; every other photo 1.5 times as bright",
-        "PSNR falls by no more than one block's does, and 0.3 dB",
-        inexact,
-        cost=5,
-    ),
-    Scenario(
-        "A16",
-        "sky and far background lost (H3DGS #39, Inria #300)",
-        f"a textured shell {FAR:g} times as far away as the cameras stand",
-        "PSNR falls by no more than one block's does, and 0.3 dB",
-        far_shell,
-        cost=2,
-    ),
-)

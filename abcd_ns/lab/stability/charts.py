@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
-from abcd_ns.lab.runs.style import COLORS, MARKERS, STYLE, lay_grid, save
-from abcd_ns.lab.stability.curves import Curve, Line
+from abcd_ns.lab.runs.results import Curve, Line, Results
+from abcd_ns.lab.runs.style import COLORS, in_style, lay_grid, plot, save, tick_at
 
 LOGARITHMIC = {"blocks", "visit-steps", "staleness", "views"}
 """Curves whose x doubles from point to point."""
@@ -17,10 +16,10 @@ LEAST_SPAN = 2.0
 ONE_BLOCK = "abcd-monolithic"
 
 
-def draw_curves(curves: tuple[Curve, ...], out: Path) -> list[Path]:
+@in_style
+def draw_curves(results: Results, out: Path) -> list[Path]:
     """Write each curve's chart as png and svg into `out`; returns their paths."""
-    with matplotlib.rc_context(STYLE):
-        return [path for curve in curves for path in save(_draw(curve), out, curve.name)]
+    return [path for curve in results.curves for path in save(_draw(curve), out, curve.name)]
 
 
 def _draw(curve: Curve) -> Figure:
@@ -31,12 +30,8 @@ def _draw(curve: Curve) -> Figure:
     if curve.level is not None:
         label = f"{ONE_BLOCK}  {curve.level:.2f}"
         axes.axhline(curve.level, color=COLORS[ONE_BLOCK], linewidth=1.2, linestyle=(0, (5, 3)), label=label)
-    values = sorted({x for line in curve.lines for x in line.x})
-    if curve.name in LOGARITHMIC:
-        axes.set_xscale("log", base=2)
-    axes.xaxis.set_major_locator(FixedLocator(values))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    values = [x for line in curve.lines for x in line.x]
+    tick_at(axes, values, lambda value: f"{value:g}", 2 if curve.name in LOGARITHMIC else None)
     axes.margins(x=0.08, y=0.12)
     low, high = axes.get_ylim()
     lack = max(LEAST_SPAN - (high - low), 0.0) / 2
@@ -52,15 +47,4 @@ def _draw(curve: Curve) -> Figure:
 
 def _draw_line(axes: Axes, line: Line) -> None:
     method, _, differs = line.name.partition(",")
-    axes.plot(
-        line.x,
-        line.psnr,
-        color=COLORS[method],
-        marker=MARKERS[method],
-        markersize=5,
-        markeredgecolor="white",
-        markeredgewidth=0.5,
-        linewidth=1.4,
-        linestyle=(0, (2, 1.5)) if differs else "-",
-        label=line.name,
-    )
+    plot(axes, line.x, line.psnr, method, linestyle=(0, (2, 1.5)) if differs else "-", label=line.name)

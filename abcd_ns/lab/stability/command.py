@@ -5,7 +5,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from datetime import datetime, timezone
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,34 +16,38 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.progress import TimeRemainingColumn as TimeLeft
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.stability.catalogue import SCENARIOS
-from abcd_ns.lab.stability.curves import Curve, Study, studies
+from abcd_ns.lab.runs.checks import Flag, check_ranges, words
+from abcd_ns.lab.runs.experiment import new_results, print_paths, write_report
+from abcd_ns.lab.runs.findings import findings_of, headline
+from abcd_ns.lab.runs.results import Curve, Outcome
+from abcd_ns.lab.runs.runner import claim
+from abcd_ns.lab.stability import borders, cameras, captures, emptiness, freshness, growth, sizes, values
+from abcd_ns.lab.stability.charts import draw_curves
+from abcd_ns.lab.stability.curves import Study, studies
 from abcd_ns.lab.stability.lab import Lab
-from abcd_ns.lab.stability.outcome import Outcome, Scenario
+from abcd_ns.lab.stability.outcome import Scenario
 from abcd_ns.lab.stability.real import read_stage, real_scenarios
-from abcd_ns.lab.stability.report import (
-    RESULTS_FILE,
-    SCHEMA,
-    Report,
-    headline,
-    print_outcome,
-    write_report,
-)
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+from abcd_ns.nerfstudio.machine import describe_machine
+
+KIND = "stability report"
+_MODULES = (values, sizes, emptiness, growth, cameras, captures, freshness, borders)
+_FOUND = {one.id: one for module in _MODULES for one in vars(module).values() if isinstance(one, Scenario)}
+SCENARIOS = {id: _FOUND[id] for id in sorted(_FOUND, key=lambda id: int(id[1:]))}
+"""By id, A1 to A22."""
 
 
 def stability(
     *,
     out: Path,
-    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None,
+    data: Annotated[Path | None, words("DIR")] = None,
     downscale: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
-    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="A1 A3 ...", help_behavior_hint="")] = (),
-    quick: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")] = False,
+    only: Annotated[tuple[str, ...], words("A1 A3 ...")] = (),
+    quick: Flag = False,
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
 ) -> int:
     """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
 
-    All methods draw the same number of views. OUT gets stability.json, table.md and charts of held-out PSNR
+    All methods draw the same number of views. OUT gets results.json, table.md and charts of held-out PSNR
     against the number of blocks, steps a visit, the age of layers, views, noise of poses and
     exposure. Needs no GPU and no data; some 10 minutes on two cores.
 
@@ -58,31 +62,27 @@ def stability(
     Raises:
         UserError: an option cannot be used, or OUT holds something else.
     """
-    claim(out)
-    if downscale < 1:
-        raise UserError(f"--downscale is {downscale}; it must be at least 1.")
-    if seed < 0:
-        raise UserError(f"--seed is {seed}; it must be at least 0.")
-    console = Console()
-    known = dict(SCENARIOS)
+    check_ranges({"downscale": downscale})
+    check_ranges({"seed": seed}, low=0)
+    claim(out, KIND, {})
+    console, known = Console(), dict(SCENARIOS)
     if data is not None:
         stage = read_stage(data, downscale)
         known |= {scenario.id: scenario for scenario in real_scenarios(stage, data.resolve().name)}
     chosen = choose(only, known)
     wanted = () if only or quick else studies()
-    began = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    made = (_command(data, out), describe_machine(), describe_versions())
-    paths: list[Path] = []
+    blank, paths = new_results(KIND, _command(data, out), describe_machine()), []
 
     def keep(outcomes: Sequence[Outcome], curves: Sequence[Curve]) -> None:
-        paths[:] = write_report(Report(SCHEMA, began, *made, tuple(outcomes), tuple(curves)), out)
+        results = replace(blank, outcomes=tuple(outcomes), curves=tuple(curves))
+        results = replace(results, findings=findings_of(results))
+        paths[:] = write_report(results, out, draw_curves)
 
     with tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder, _bar(console) as progress:
         meter = Meter(progress, sum(scenario.cost for scenario in chosen) + sum(map(len, wanted)))
         lab = Lab(Path(folder), quick=quick, seed=seed, tick=meter.step)
         outcomes = carry_out(lab, chosen, wanted, meter, keep)
-    for path in paths:
-        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
+    print_paths(paths, console)
     console.print(headline(outcomes), highlight=False, soft_wrap=True)
     return 0 if all(outcome.passed for outcome in outcomes) else 1
 
@@ -104,19 +104,6 @@ def choose(only: Sequence[str], known: dict[str, Scenario]) -> list[Scenario]:
         hint = "; R1 to R5 need --data" if name.startswith("R") else ""
         raise UserError(f"--only {name}: there is no such scenario{hint}; there are {', '.join(known)}.")
     return [scenario for name, scenario in known.items() if not wanted or name in wanted]
-
-
-def claim(out: Path) -> None:
-    """Make `out` a folder of this command.
-
-    Raises:
-        UserError: it is a file, or holds something else.
-    """
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out} is a file; name a folder.")
-    if out.is_dir() and any(out.iterdir()) and not (out / RESULTS_FILE).exists():
-        raise UserError(f"--out {out} is not empty and holds no stability report; name another folder.")
-    out.mkdir(parents=True, exist_ok=True)
 
 
 class Meter:
@@ -162,9 +149,7 @@ def carry_out(
         keep(outcomes, curves)
     for study in wanted:
         meter.begin(f"chart: {study.title}")
-        for curve in study.make(lab):
-            meter.advance()
-            curves += [] if curve is None else [curve]
+        curves.append(study.make(lab, meter.advance))
         meter.console.print(f"      chart: {study.title}", highlight=False)
         keep(outcomes, curves)
     return outcomes
@@ -186,6 +171,15 @@ def examine(lab: Lab, scenario: Scenario) -> Outcome:
         {name: float(value) for name, value in found.numbers.items()},
         round(time.perf_counter() - began, 1),
     )
+
+
+def print_outcome(outcome: Outcome, console: Console) -> None:
+    """A scenario's lines in the terminal."""
+    word = "pass" if outcome.passed else "FAIL"
+    head = f"{outcome.id:>4}  {word}  {outcome.fails}  ({outcome.seconds:.0f} s)"
+    console.print(head, highlight=False, soft_wrap=True)
+    for method, said in outcome.said.items():
+        console.print(f"            {method}: {said}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _bar(console: Console) -> Progress:

@@ -1,10 +1,11 @@
 """Held-out PSNR against one thing at a time: what the charts show."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.lab.runs.results import Curve, Line
 from abcd_ns.lab.stability.captures import PAIR, table, with_gains, with_noisy_poses
 from abcd_ns.lab.stability.freshness import BLOCKS, train_stale
 from abcd_ns.lab.stability.lab import Lab, Method, Stage
@@ -22,29 +23,6 @@ Train = Callable[[Lab], float]
 
 
 @dataclass(frozen=True)
-class Line:
-    """One method's values."""
-
-    name: str
-    """The method, and after a comma how it differs."""
-    x: tuple[float, ...]
-    psnr: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Curve:
-    """One chart."""
-
-    name: str
-    title: str
-    x_label: str
-    lines: tuple[Line, ...]
-    note: str = ""
-    level: float | None = None
-    """One block, where it does not depend on x; dB."""
-
-
-@dataclass(frozen=True)
 class Study:
     """A curve to be made, point by point."""
 
@@ -59,22 +37,20 @@ class Study:
     def __len__(self) -> int:
         return len(self.points) + (self.level is not None)
 
-    def make(self, lab: Lab) -> Iterator[Curve | None]:
-        """Yields None after each training but the last, then the curve."""
-        level = None if self.level is None else self.level(lab)
-        if level is not None:
-            yield None
+    def make(self, lab: Lab, advance: Callable[[], None] = lambda: None) -> Curve:
+        """The curve; `advance` is called after each training."""
+
+        def trained(train: Train) -> float:
+            score = train(lab)
+            advance()
+            return score
+
+        level = None if self.level is None else trained(self.level)
         found: dict[str, list[tuple[float, float]]] = {}
-        for number, (line, x, train) in enumerate(self.points, start=1):
-            found.setdefault(line, []).append((x, train(lab)))
-            if number < len(self.points):
-                yield None
+        for line, x, train in self.points:
+            found.setdefault(line, []).append((x, trained(train)))
         lines = tuple(Line(name, *map(tuple, zip(*pairs, strict=True))) for name, pairs in found.items())
-        yield Curve(self.name, self.title, self.x_label, lines, self.note, level)
-
-
-def _score(lab: Lab, stage: Stage, method: Method, name: str | None = None, **options) -> float:
-    return lab.compared(stage, method, name, **options)
+        return Curve(self.name, self.title, self.x_label, lines, self.note, level)
 
 
 def studies() -> tuple[Study, ...]:
@@ -86,7 +62,7 @@ def studies() -> tuple[Study, ...]:
 
 def _call(stage: Stage, method: Method, **options) -> Train:
     """Training and scoring that still waits for its lab."""
-    return partial(_score, stage=stage, method=method, **options)
+    return partial(Lab.compared, stage=stage, method=method, **options)
 
 
 def _of_training(stage: Stage, one_block: Train) -> tuple[Study, ...]:

@@ -10,7 +10,7 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.stability.lab import STILL, Lab, Stage, make_stage, merged
-from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.world import TABLE, Ball, World, camera, ring
 
 CLUSTERS = ((-20.0, 0), (-30.0, 1), (-40.0, 2))
@@ -24,6 +24,12 @@ def equal(a: Gaussians, b: Gaussians) -> bool:
     return len(a) == len(b) and all(torch.equal(value, getattr(b, name)) for name, value in a.items())
 
 
+@scenario(
+    "A4",
+    "no Gaussian left: crashes (Inria #472, splatfacto-w #12)",
+    "a block without Gaussians, a view of nothing, and a block whose Gaussians all go",
+    "every operation works with none; the other blocks stay bit-equal; the run ends",
+)
 def nobody_left(lab: Lab) -> Finding:
     """A4: a block that is empty from the start, a view of nothing, and a block that loses all it has."""
     world = World(TABLE.surfaces[:-1])
@@ -91,6 +97,12 @@ def few_cameras() -> tuple[Stage, BlockTree]:
     return stage, tree
 
 
+@scenario(
+    "A9",
+    "blocks silently untrained (VastGaussian #32, H3DGS #67, #77)",
+    "blocks that 0, 1 and 2 cameras see",
+    "each block's state is said; the unobserved one is bit-equal and not densified",
+)
 def observed(lab: Lab) -> Finding:
     """A9: train, and ask each block how it stands."""
     stage, tree = few_cameras()
@@ -111,21 +123,3 @@ def observed(lab: Lab) -> Finding:
     below = merged(mono).means[:, 2] < -15.0
     said["abcd-monolithic"] = f"says nothing of the {int(below.sum())} Gaussians that few cameras see"
     return Finding(passed, said, {"unseen block bit-equal": float(same), **visits})
-
-
-SCENARIOS = (
-    Scenario(
-        "A4",
-        "no Gaussian left: crashes (Inria #472, splatfacto-w #12)",
-        "a block without Gaussians, a view of nothing, and a block whose Gaussians all go",
-        "every operation works with none; the other blocks stay bit-equal; the run ends",
-        nobody_left,
-    ),
-    Scenario(
-        "A9",
-        "blocks silently untrained (VastGaussian #32, H3DGS #67, #77)",
-        "blocks that 0, 1 and 2 cameras see",
-        "each block's state is said; the unobserved one is bit-equal and not densified",
-        observed,
-    ),
-)

@@ -9,7 +9,7 @@ from abcd_ns.engine.space.partition import build_grid
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.lab.stability.captures import table
 from abcd_ns.lab.stability.lab import BUDGET, STILL, Lab, Stage, make_stage
-from abcd_ns.lab.stability.outcome import Finding, Scenario, db
+from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.stability.stale import stale_coordinator
 from abcd_ns.lab.stability.world import ring
 
@@ -61,6 +61,13 @@ def train_stale(
     return rising, lab.score(coordinator, stage.held_out, stage.truth)
 
 
+@scenario(
+    "A13",
+    "old layers oscillate and diverge",
+    "layers drawn anew for each visit; once a sweep; once a sweep, damped",
+    f"fresh, and damped, the full objective rises in at most {VISITS_RISING:.0%} of visits",
+    cost=4,
+)
 def old_layers(lab: Lab) -> Finding:
     """A13: a refresh left out, and refreshes once a sweep with and without damping."""
     stage, numbers, said = make_stage(views=ring(12), points=400), {}, {}
@@ -77,6 +84,13 @@ def old_layers(lab: Lab) -> Finding:
     return Finding(damped and numbers["rising abcd"] <= VISITS_RISING, said, numbers)
 
 
+@scenario(
+    "A19",
+    "the number of blocks and of steps a visit decide the quality",
+    f"{', '.join(map(str, BLOCKS))} blocks and a grid that cuts the balls, on a budget of 600 views",
+    f"worst within {CLIFF_DB} dB of the best; the charts show visits of 1 to 64 steps too",
+    cost=6,
+)
 def blocks_and_cuts(lab: Lab) -> Finding:
     """A19: the defaults with 1 to 27 blocks, and with a grid whose planes cut every ball."""
     stage = table()
@@ -90,23 +104,3 @@ def blocks_and_cuts(lab: Lab) -> Finding:
     said["abcd-monolithic"] = db(psnr["1 block"])
     numbers = {**{f"psnr {name}": value for name, value in psnr.items()}, "best to worst": gap}
     return Finding(gap <= CLIFF_DB, said, numbers, worse=behind > 0)
-
-
-SCENARIOS = (
-    Scenario(
-        "A13",
-        "old layers oscillate and diverge",
-        "layers drawn anew for each visit; once a sweep; once a sweep, damped",
-        f"fresh, and damped, the full objective rises in at most {VISITS_RISING:.0%} of visits",
-        old_layers,
-        cost=4,
-    ),
-    Scenario(
-        "A19",
-        "the number of blocks and of steps a visit decide the quality",
-        f"{', '.join(map(str, BLOCKS))} blocks and a grid that cuts the balls, on a budget of 600 views",
-        f"worst within {CLIFF_DB} dB of the best; the charts show visits of 1 to 64 steps too",
-        blocks_and_cuts,
-        cost=6,
-    ),
-)

@@ -10,7 +10,7 @@ from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, De
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_visit
 from abcd_ns.lab.stability.lab import Lab, make_stage
-from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.world import ring
 
 CAP = 300
@@ -21,6 +21,12 @@ ALLOWED_RISE = 0.02
 """Of the mean absolute error over all training photos, by one visit."""
 
 
+@scenario(
+    "A5",
+    "densification blows up; the cap is ignored at the start (desplat #5, gsplat #516)",
+    "photos of noise, growth at the least gradient, twice as many points as the cap; a block of 10^12",
+    "never over the cap, at any step; an error that names the fix before memory is taken",
+)
 def noise(lab: Lab) -> Finding:
     """A5: photos of noise, from twice as many points as there may be Gaussians; and a block too large."""
     stage, said, numbers, passed = make_stage(views=ring(12), points=2 * CAP), {}, {}, True
@@ -43,6 +49,13 @@ def noise(lab: Lab) -> Finding:
     return Finding(passed, said, numbers)
 
 
+@scenario(
+    "A6",
+    "an opacity reset costs 2.7 to 7.6 dB (gsplat #1012)",
+    f"a reset after every {RESET_EVERY} of a block's views, in visits and at their ends",
+    f"no visit leaves the error over all photos more than {ALLOWED_RISE:.0%} higher",
+    cost=2,
+)
 def resets(lab: Lab) -> Finding:
     """A6: opacity resets that fall into visits and on their ends; the objective after every visit."""
     stage, said, numbers = make_stage(views=ring(12), points=400), {}, {}
@@ -82,6 +95,13 @@ def splatfacto_refines(cameras: int, steps: int = 15_000) -> int:
     return sum(step % every == 0 and step % reset >= cameras + every for step in range(500, steps))
 
 
+@scenario(
+    "A7",
+    "never densifies from 2,900 images on (nerfstudio #2927, #3743)",
+    "the schedule for 1 to 15,000 cameras, and splatfacto's",
+    "at least one refinement in each visit of 30 views or more; shorter ones, of fewer than 8 cameras, "
+    "gather statistics over several",
+)
 def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no training
     """A7: the schedule alone, for captures of 1 to 15,000 photos."""
     least = {cameras: min(refinements(cameras, s, DensityConfig()) for s in range(6)) for cameras in CAMERAS}
@@ -94,30 +114,3 @@ def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no traini
         "splatfacto": f"none at all from {min(never):,} cameras on",
     }
     return Finding(passed, said, {f"least at {cameras}": count for cameras, count in least.items()})
-
-
-SCENARIOS = (
-    Scenario(
-        "A5",
-        "densification blows up; the cap is ignored at the start (desplat #5, gsplat #516)",
-        "photos of noise, growth at the least gradient, twice as many points as the cap; a block of 10^12",
-        "never over the cap, at any step; an error that names the fix before memory is taken",
-        noise,
-    ),
-    Scenario(
-        "A6",
-        "an opacity reset costs 2.7 to 7.6 dB (gsplat #1012)",
-        f"a reset after every {RESET_EVERY} of a block's views, in visits and at their ends",
-        f"no visit leaves the error over all photos more than {ALLOWED_RISE:.0%} higher",
-        resets,
-        cost=2,
-    ),
-    Scenario(
-        "A7",
-        "never densifies from 2,900 images on (nerfstudio #2927, #3743)",
-        "the schedule for 1 to 15,000 cameras, and splatfacto's",
-        "at least one refinement in each visit of 30 views or more; shorter ones, of fewer than 8 cameras, "
-        "gather statistics over several",
-        thousands,
-    ),
-)

@@ -27,7 +27,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import scaffold_size
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step, views_per_warm_up_step
 from abcd_ns.engine.train.training_loop import train_step
@@ -150,7 +150,7 @@ class Lab:
         budget: int,
         blocks: int = BLOCKS,
         tree: BlockTree | None = None,
-        kind: Callable[[Run], Coordinator] = Coordinator,
+        kind: Callable[[TrainingRun], Coordinator] = Coordinator,
         optimizers: tuple[dict[str, Parameter], Optimizers] | None = None,
         **training,
     ) -> Coordinator:
@@ -178,7 +178,7 @@ class Lab:
         params, adam = optimizers or nothing_live(start.sh_degree)
         scene = StoredScene(tree, store)
         steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views)))
-        return kind(Run(config, steps, scene, views, self.rasterizer, params, adam))
+        return kind(TrainingRun(config, steps, scene, views, self.rasterizer, params, adam))
 
     def train(
         self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options

@@ -1,4 +1,4 @@
-"""What a scenario is, and what came of it."""
+"""What a scenario is, and what it finds out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -37,19 +37,11 @@ class Scenario:
     """How long it takes, in trainings of a curve's point; for the time left."""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A scenario and its finding, as stability.json keeps it."""
-
-    id: str
-    fails: str
-    done: str
-    rule: str
-    passed: bool
-    worse: bool
-    said: dict[str, str]
-    numbers: dict[str, float]
-    seconds: float
+def scenario(
+    id: str, fails: str, done: str, rule: str, cost: int = 1
+) -> Callable[[Callable[[Lab], Finding]], Scenario]:
+    """Makes a scenario of the function that carries it out."""
+    return lambda run: Scenario(id, fails, done, rule, run, cost)
 
 
 def db(value: float) -> str:

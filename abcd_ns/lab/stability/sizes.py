@@ -18,7 +18,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE, SHOWS
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.lab.stability.lab import STILL, Lab, Stage, Trained, make_stage
-from abcd_ns.lab.stability.outcome import Finding, Scenario, db
+from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.stability.world import ring
 
 SIGMAS = (1.0, 3.0, 10.0)
@@ -65,6 +65,13 @@ def ordering_gap(lab: Lab, trained: Trained, views: list[View]) -> float:
     return min(float(torch.stack(gaps).mean()), 200.0)
 
 
+@scenario(
+    "A3",
+    "needles and giants: half of garden's splats, the worst 3857 frames wide (brush #479)",
+    "Gaussians with sigma = 1, 3 and 10 extents of their cell among the first ones",
+    f"shrunk by a block's refinements, none over 1.25 of what is allowed; ordering gap >= {GAP_DB:g} dB",
+    cost=2,
+)
 def giants(lab: Lab) -> Finding:
     """A3: three giants among the first Gaussians; two sweeps, so that each block is refined once."""
     stage = make_stage(views=ring(12), points=400)
@@ -93,6 +100,13 @@ def unseen_weights(lab: Lab, gaussians: Gaussians, views: list[View]) -> Tensor:
     return torch.stack([weights(gaussians, lab.rasterizer, shot) for shot in shots]).sum(dim=0)
 
 
+@scenario(
+    "A8",
+    "75% of the exported splats are transparent (gsplat #822)",
+    f"a third of the first Gaussians all but transparent, pruning off; {EMPTY_CELLS} empty cells",
+    "no exported Gaussian below 1/255; empty cells stay empty. Those that only the training views do not "
+    "see are counted and stay: a new view may see them",
+)
 def transparent(lab: Lab) -> Finding:
     """A8: what an export holds that nobody can see; and cells that begin empty."""
     stage, numbers, said = make_stage(views=ring(12), points=500), {}, {}
@@ -119,6 +133,12 @@ def transparent(lab: Lab) -> Finding:
     return Finding(numbers["invisible abcd"] == 0 and numbers["grown abcd"] == 0, said, numbers)
 
 
+@scenario(
+    "A17",
+    "one outlier spoils the octree (GaussianSplats3D #299); UTM offsets eat float32",
+    "a point at 1e7 m; coordinates that begin at 0, 5e5 and 5e6 m",
+    "blocks as even as without it, at most 0.1 dB lost; 0.05 dB between offsets",
+)
 def far_away(lab: Lab) -> Finding:
     """A17: a point at 1e7; and captures in coordinates of national grids."""
     stage, numbers, said = make_stage(views=ring(12), points=400), {}, {}
@@ -163,30 +183,3 @@ def surveyed(stage: Stage, offset: float) -> Stage:
     points = torch.from_numpy(similarity.points(stage.points.double().numpy() + shift))
     count = len(stage.views)
     return replace(stage, views=placed[:count], held_out=placed[count:], points=points)
-
-
-SCENARIOS = (
-    Scenario(
-        "A3",
-        "needles and giants: half of garden's splats, the worst 3857 frames wide (brush #479)",
-        "Gaussians with sigma = 1, 3 and 10 extents of their cell among the first ones",
-        f"shrunk by a block's refinements, none over 1.25 of what is allowed; ordering gap >= {GAP_DB:g} dB",
-        giants,
-        cost=2,
-    ),
-    Scenario(
-        "A8",
-        "75% of the exported splats are transparent (gsplat #822)",
-        f"a third of the first Gaussians all but transparent, pruning off; {EMPTY_CELLS} empty cells",
-        "no exported Gaussian below 1/255; empty cells stay empty. Those that only the training views do not "
-        "see are counted and stay: a new view may see them",
-        transparent,
-    ),
-    Scenario(
-        "A17",
-        "one outlier spoils the octree (GaussianSplats3D #299); UTM offsets eat float32",
-        "a point at 1e7 m; coordinates that begin at 0, 5e5 and 5e6 m",
-        "blocks as even as without it, at most 0.1 dB lost; 0.05 dB between offsets",
-        far_away,
-    ),
-)

@@ -8,7 +8,7 @@ from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerSource
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.types import Gaussians
 
@@ -43,7 +43,7 @@ class OldNeighbours:
         every: visits between two looks at the scene; 1 is always fresh.
     """
 
-    def __init__(self, run: Run, every: int) -> None:
+    def __init__(self, run: TrainingRun, every: int) -> None:
         self._run, self._every = run, every
         self._seen: Snapshot | None = None
         self._taken_at = 0
@@ -58,7 +58,7 @@ class OldNeighbours:
 class DampedBlock(LiveBlock):
     """Keeps a share of what a visit did."""
 
-    def __init__(self, run: Run, damping: float) -> None:
+    def __init__(self, run: TrainingRun, damping: float) -> None:
         super().__init__(run)
         self._share = damping
 
@@ -73,7 +73,7 @@ class DampedBlock(LiveBlock):
         )  # moments are of the path, not of where it ends
 
 
-def stale_coordinator(run: Run, every: int, damping: float = 1.0) -> Coordinator:
+def stale_coordinator(run: TrainingRun, every: int, damping: float = 1.0) -> Coordinator:
     """Shows blocks to each other as they were some visits ago.
 
     The number of Gaussians must stay (strategy "off", `migrate` off is not needed).

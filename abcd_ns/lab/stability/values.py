@@ -28,7 +28,7 @@ from abcd_ns.lab.stability.lab import (
     make_stage,
     merged,
 )
-from abcd_ns.lab.stability.outcome import Finding, Scenario, db
+from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.stability.world import TABLE, Ball, World, ring
 
 ONE_IN = 200
@@ -69,6 +69,12 @@ def stored_soundly(trained: Trained) -> bool:
     return all(bool(torch.isfinite(value).all()) for tensors in loaded for value in tensors.values())
 
 
+@scenario(
+    "A1",
+    "NaN in a few splats; image and loss look fine (brush #522, gsplat #248)",
+    f"NaN in one gradient of {ONE_IN}, in every step and every parameter",
+    "mended and counted, never stored, PSNR within 0.1 dB of a run without",
+)
 def nan_gradients(lab: Lab) -> Finding:
     """A1: train twice, once with NaN in some gradients of every step."""
     stage, said, numbers, passed = make_stage(views=ring(12), points=400), {}, {}, True
@@ -87,6 +93,12 @@ def nan_gradients(lab: Lab) -> Finding:
     return Finding(passed, said, numbers)
 
 
+@scenario(
+    "A2",
+    "4 equal points give log(0), fewer than 4 crash (splatfacto)",
+    "runs from 0 to 4 points, 5 equal ones, 5 in a line",
+    "all values finite, a warning where there are too few, every run ends or says why it cannot go on",
+)
 def hardly_any_points(lab: Lab) -> Finding:
     """A2: runs that begin from next to nothing."""
     stage, said, passed, warned = make_stage(views=ring(6), points=60), {}, True, 0
@@ -112,6 +124,12 @@ def hardly_any_points(lab: Lab) -> Finding:
     return Finding(passed, said, {"runs": ended, "refused": len(refused), "warnings": warned})
 
 
+@scenario(
+    "A22",
+    "colours over 1 clipped; transmittance saturates",
+    "a colour of 1.6 through a layer of half floats; a block inside an opaque ball",
+    "the colour survives; the hidden block is visited once, then passed over, and said to be hidden",
+)
 def bright_and_hidden(lab: Lab) -> Finding:
     """A22: a colour of 1.6 through a layer, and a block that an opaque one hides."""
     stage = make_stage(TABLE, ring(4, size=(24, 18)), ring(1, turn=0.5, size=(24, 18)), points=40)
@@ -163,28 +181,3 @@ def box_around_origin(half: float) -> tuple[BlockTree, int]:
         for at in (-half, half):
             tree = tree.split(int(tree.assign(origin)), axis, at)
     return tree, int(tree.assign(origin))
-
-
-SCENARIOS = (
-    Scenario(
-        "A1",
-        "NaN in a few splats; image and loss look fine (brush #522, gsplat #248)",
-        f"NaN in one gradient of {ONE_IN}, in every step and every parameter",
-        "mended and counted, never stored, PSNR within 0.1 dB of a run without",
-        nan_gradients,
-    ),
-    Scenario(
-        "A2",
-        "4 equal points give log(0), fewer than 4 crash (splatfacto)",
-        "runs from 0 to 4 points, 5 equal ones, 5 in a line",
-        "all values finite, a warning where there are too few, every run ends or says why it cannot go on",
-        hardly_any_points,
-    ),
-    Scenario(
-        "A22",
-        "colours over 1 clipped; transmittance saturates",
-        "a colour of 1.6 through a layer of half floats; a block inside an opaque ball",
-        "the colour survives; the hidden block is visited once, then passed over, and said to be hidden",
-        bright_and_hidden,
-    ),
-)

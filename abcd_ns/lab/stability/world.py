@@ -113,13 +113,13 @@ class World:
 
 
 def look_at(eye: Tensor, target: Tensor) -> Float[Tensor, "4 4"]:
-    """World to camera, OpenCV convention, with the world's z up; float32."""
+    """World to camera, OpenCV convention, with the world's z up."""
     forward = F.normalize(target - eye, dim=0)
     right = F.normalize(torch.linalg.cross(forward, forward.new_tensor([0.0, 0.0, 1.0])), dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat = torch.eye(4, dtype=eye.dtype)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    return viewmat.float()
+    return viewmat
 
 
 def camera(
@@ -132,7 +132,7 @@ def camera(
     width, height = size
     K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
     pose = look_at(torch.tensor(eye, dtype=torch.float64), torch.tensor(target, dtype=torch.float64))
-    return View(pose, K, width, height, index)
+    return View(pose.float(), K, width, height, index)
 
 
 def ring(

@@ -4,15 +4,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean
 
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from abcd_ns.lab.runs.run import Run
-from abcd_ns.lab.runs.style import COLORS, MARKERS, STYLE, label_ends, lay_grid, save
-from abcd_ns.lab.study.findings import (
+from abcd_ns.lab.runs.findings import (
     GOAL_DB,
     KNEE_DB,
     find_default,
@@ -20,59 +18,64 @@ from abcd_ns.lab.study.findings import (
     find_gap,
     find_knee,
 )
-from abcd_ns.lab.study.results import Arm, StudyResults
+from abcd_ns.lab.runs.results import Arm, Results
+from abcd_ns.lab.runs.run import Run
+from abcd_ns.lab.runs.style import (
+    COLORS,
+    in_style,
+    label_ends,
+    lay_grid,
+    plot,
+    save,
+    scatter,
+    short,
+    tick_at,
+    write_beside,
+)
 
-BAND = "#ececec"
 KNEE_LINE = 0.065
 """Height of a line of text, as a share of the axis' height."""
 BETTER, WORSE, SAME = "#007A5A", "#D55E00", "#666666"
 ROW_INCHES, LINE_INCHES = 0.3, 0.17
 CHANCE = 0.25
 """How far the axis of differences reaches at least, dB: what chance does must not fill the chart."""
-COLUMNS = ("change", "PSNR", "Gaussians")
-"""Numbers beside the bars, right-aligned at COLUMN_POINTS from the axis."""
 COLUMN_POINTS = (40, 80, 140)
+"""Where the numbers beside the bars end, from the axis."""
 Value = Callable[[Run], float]
 
 
-def draw_study(results: StudyResults, out: Path) -> list[Path]:
+@in_style
+def draw_study(results: Results, out: Path) -> list[Path]:
     """Write the study's chart as png and svg into `out`; returns their paths. Nothing without a run."""
-    draw = {"blocks": _draw_blocks, "gaussians": _draw_gaussians, "options": _draw_options}[results.study]
-    with matplotlib.rc_context(STYLE):
-        figure = draw(results)
-        return [] if figure is None else save(figure, out, results.study)
+    study = results.kind.removeprefix("study of ")
+    draw = {"blocks": _draw_blocks, "gaussians": _draw_gaussians, "options": _draw_options}[study]
+    figure = draw(results) if results.arms else None
+    return [] if figure is None else save(figure, out, study)
 
 
 # -- blocks ------------------------------------------------------------------------------------------
 
 
-def _draw_blocks(results: StudyResults) -> Figure | None:
-    if not results.arms:
-        return None
-    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
+def _draw_blocks(results: Results) -> Figure:
+    figure, arms = Figure(figsize=(7.2, 3.6), layout="constrained"), results.arms
     grid = figure.add_gridspec(3, 2, width_ratios=(2.1, 1))
     main = figure.add_subplot(grid[:, 0])
-    color = COLORS[results.arms[0].method]
-    _draw_gap(main, results.arms)
-    ends = {
-        "composited": _draw_line(
-            main, results.arms, lambda run: run.psnr, color="#888888", marker="D", size=3
-        ),
-        "merged": _draw_line(main, results.arms, lambda run: run.psnr_merged, color=color, seeds=True),
-    }
-    _over_blocks(main, results.arms)
+    _draw_gap(main, arms)
+    grey = {"color": "#888888", "marker": "D", "markersize": 3}
+    handles = {"composited, block by block": _draw_line(main, arms, lambda run: run.psnr, **grey)}
+    if any(len(arm.runs) > 1 for arm in arms):
+        points = [(arm.value, run.psnr_merged) for arm in arms for run in arm.runs]
+        scatter(main, *zip(*points, strict=True), COLORS[arms[0].method])
+    handles["merged, as any viewer draws"] = _draw_line(main, arms, lambda run: run.psnr_merged)
     main.set_xlabel("blocks")
     main.set_ylabel("held-out PSNR (dB)")
     main.margins(y=0.12)
-    main.set_title(_title(results, results.arms[0].method), loc="left")
-    handles = [main.lines[-1], ends["composited"]]
-    main.legend(
-        handles, ["merged, as any viewer draws", "composited, block by block"], frameon=False, fontsize=8
-    )
+    main.set_title(_title(results, arms[0].method), loc="left")
+    names = sorted(handles, reverse=True)
+    main.legend([handles[name] for name in names], names, frameon=False, fontsize=8)
     for row, (title, value) in enumerate(_costs(results)):
         small = figure.add_subplot(grid[row, 1])
-        _draw_line(small, results.arms, value, color=color, size=3.5)
-        _over_blocks(small, results.arms)
+        _draw_line(small, arms, value, markersize=3.5)
         small.set_title(title, loc="left", fontsize=8)
         small.set_ylim(0, 1.15 * small.get_ylim()[1])
         small.yaxis.set_major_locator(MaxNLocator(3))
@@ -82,14 +85,13 @@ def _draw_blocks(results: StudyResults) -> Figure | None:
     return figure
 
 
-def _costs(results: StudyResults) -> list[tuple[str, Value]]:
+def _costs(results: Results) -> list[tuple[str, Value]]:
     """What a number of blocks costs, each with its title."""
     spent = ("steps", lambda run: run.steps)
-    if results.protocol.seconds is None:
+    if results.settings.seconds is None:
         spent = ("training (s)", lambda run: run.train_seconds)
-    runs = [run for arm in results.arms for run in arm.runs]
     memory = ("peak RAM (GiB)", lambda run: run.peak_rss_bytes / 2**30)
-    if all(run.peak_device_bytes is not None for run in runs):
+    if all(run.peak_device_bytes is not None for run in results.runs):
         memory = ("peak GPU memory (GiB)", lambda run: run.peak_device_bytes / 2**30)
     return [("Gaussians", lambda run: run.gaussians), spent, memory]
 
@@ -99,126 +101,62 @@ def _draw_gap(axes: Axes, arms: Sequence[Arm]) -> None:
     gap = find_gap(arms)
     if gap is None:
         return
-    axes.axhspan(gap.best.psnr - GOAL_DB, gap.best.psnr, color=BAND, zorder=0, linewidth=0)
-    at_right = arms[-1].psnr < arms[0].psnr  # where the line is farther below
-    axes.annotate(
-        f"best - {GOAL_DB:g} dB",
-        xy=(0.99 if at_right else 0.01, gap.best.psnr - GOAL_DB),
-        ha="right" if at_right else "left",
-        xycoords=("axes fraction", "data"),
-        xytext=(0, -2),
-        textcoords="offset points",
-        va="top",
-        fontsize=7,
-        color="#777777",
-    )
-    left, right = arms[0], arms[-1]
-    for arm, word, offset in ((gap.best, "best", 9), (gap.worst, "worst", -16)):
-        label = axes.annotate(
-            f"{word} {arm.psnr:.2f}",
-            xy=(arm.value, arm.psnr),
-            xytext=(-4 if arm is left else 4 if arm is right else 0, offset),
-            textcoords="offset points",
-            ha="left" if arm is left else "right" if arm is right else "center",
-            fontsize=8,
-            color=COLORS[arm.method],
-            zorder=5,
+    goal, left, right = gap.best.psnr - GOAL_DB, arms[0], arms[-1]
+    axes.axhspan(goal, gap.best.psnr, color="#ececec", zorder=0, linewidth=0)
+    at_right = right.psnr < left.psnr  # where the line is farther below
+    look = {"xycoords": ("axes fraction", "data"), "va": "top", "fontsize": 7, "color": "#777777"}
+    place, side = (0.99, "right") if at_right else (0.01, "left")
+    write_beside(axes, f"best - {GOAL_DB:g} dB", (place, goal), (0, -2), ha=side, **look)
+    for arm, word, above in ((gap.best, "best", 9), (gap.worst, "worst", -16)):
+        shift, side = (-4, "left") if arm is left else (4, "right") if arm is right else (0, "center")
+        at, color = (arm.value, arm.psnr), COLORS[arm.method]
+        label = write_beside(
+            axes, f"{word} {arm.psnr:.2f}", at, (shift, above), ha=side, color=color, zorder=5
         )
         label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
-def _draw_line(
-    axes: Axes,
-    arms: Sequence[Arm],
-    value: Value,
-    *,
-    color: str,
-    marker: str = "o",
-    size: float = 5.0,
-    seeds: bool = False,
-):
-    """Means over the seeds, by the arms' values; with `seeds`, each seed as a small dot. Returns the line."""
-    if seeds and any(len(arm.runs) > 1 for arm in arms):
-        points = [(arm.value, value(run)) for arm in arms for run in arm.runs]
-        axes.scatter(*zip(*points, strict=True), s=9, color=color, alpha=0.4, linewidths=0)
+def _draw_line(axes: Axes, arms: Sequence[Arm], value: Value, **look) -> Line2D:
+    """Means over the seeds, by the number of blocks."""
     heights = [fmean(value(run) for run in arm.runs) for arm in arms]
-    (line,) = axes.plot(
-        [arm.value for arm in arms],
-        heights,
-        color=color,
-        marker=marker,
-        markersize=size,
-        markeredgecolor="white",
-        markeredgewidth=0.5,
-        linewidth=1.4,
-    )
-    return line
-
-
-def _over_blocks(axes: Axes, arms: Sequence[Arm]) -> None:
-    axes.set_xscale("log", base=2)
-    axes.xaxis.set_major_locator(FixedLocator([arm.value for arm in arms]))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    line = plot(axes, [arm.value for arm in arms], heights, arms[0].method, **{"marker": "o", **look})
+    tick_at(axes, [arm.value for arm in arms], lambda value: f"{value:g}")
     lay_grid(axes)
+    return line
 
 
 # -- Gaussians ---------------------------------------------------------------------------------------
 
 
-def _draw_gaussians(results: StudyResults) -> Figure | None:
-    if not results.arms:
-        return None
+def _draw_gaussians(results: Results) -> Figure:
     figure = Figure(figsize=(6.2, 3.7), layout="constrained")
     axes = figure.add_subplot()
     ends = {}
     for method in results.methods:
         arms = results.of(method)
-        color = COLORS[method]
         if any(len(arm.runs) > 1 for arm in arms):
             points = [(run.gaussians, run.psnr_merged) for arm in arms for run in arm.runs]
-            axes.scatter(*zip(*points, strict=True), s=9, color=color, alpha=0.4, linewidths=0)
-        axes.plot(
-            [arm.gaussians for arm in arms],
-            [arm.psnr for arm in arms],
-            color=color,
-            marker=MARKERS[method],
-            markersize=5,
-            markeredgecolor="white",
-            markeredgewidth=0.5,
-            linewidth=1.4,
-        )
+            scatter(axes, *zip(*points, strict=True), COLORS[method])
+        plot(axes, [arm.gaussians for arm in arms], [arm.psnr for arm in arms], method)
         ends[method] = (arms[-1].gaussians, arms[-1].psnr)
-    axes.set_xscale("log")
+    tick_at(axes, [arm.value for arm in results.arms], short, base=10)
     axes.margins(x=0.06, y=0.15)
     # The largest limit stays in sight, unless growth ended far below it.
-    reached, largest = (max(get(arm) for arm in results.arms) for get in (_end, _limit))
+    reached = max(arm.gaussians for arm in results.arms)
+    largest = max(arm.value for arm in results.arms)
     axes.set_xlim(right=max(axes.get_xlim()[1], 1.1 * min(largest, 1.6 * reached)))
     low, high = axes.get_ylim()
     axes.set_ylim(low - KNEE_LINE * len(results.methods) * (high - low), high)  # room for the knees' names
     for row, method in enumerate(results.methods):
         _mark_knee(axes, results.of(method), row)
-    counts = sorted({arm.value for arm in results.arms})
-    axes.xaxis.set_major_locator(FixedLocator(counts))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
     axes.yaxis.set_major_locator(MaxNLocator(7))
     axes.set_xlabel("Gaussians at the end (marked: the limits)")
     axes.set_ylabel("held-out PSNR (dB)")
-    axes.set_title(
-        _title(results) + f"\nring: knee, the fewest within {KNEE_DB:g} dB of the best", loc="left"
-    )
+    ring = f"ring: knee, the fewest within {KNEE_DB:g} dB of the best"
+    axes.set_title(f"{_title(results)}\n{ring}", loc="left")
     lay_grid(axes)
     label_ends(axes, ends, 1.04 * axes.get_xlim()[1])
     return figure
-
-
-def _end(arm: Arm) -> float:
-    return arm.gaussians
-
-
-def _limit(arm: Arm) -> int:
-    return arm.value
 
 
 def _mark_knee(axes: Axes, arms: Sequence[Arm], row: int) -> None:
@@ -231,29 +169,15 @@ def _mark_knee(axes: Axes, arms: Sequence[Arm], row: int) -> None:
     axes.vlines(knee.gaussians, low, knee.psnr, color=color, linewidth=0.8, linestyle=(0, (3, 3)), zorder=1)
     axes.set_ylim(low, high)
     far = axes.transAxes.inverted().transform(axes.transData.transform((knee.gaussians, low)))[0] > 0.8
-    axes.annotate(
-        f"knee {_short(knee.gaussians)}",
-        xy=(knee.gaussians, 0.02 + KNEE_LINE * row),
-        xycoords=("data", "axes fraction"),
-        xytext=(-4 if far else 4, 0),
-        textcoords="offset points",
-        ha="right" if far else "left",
-        color=color,
-        fontsize=8,
-    )
-
-
-def _short(count: float) -> str:
-    """32000 as 32k."""
-    if count >= 1e6:
-        return f"{count / 1e6:.3g}M"
-    return f"{count / 1e3:.3g}k" if count >= 1000 else f"{count:.0f}"
+    look = {"xycoords": ("data", "axes fraction"), "ha": "right" if far else "left", "color": color}
+    at = (knee.gaussians, 0.02 + KNEE_LINE * row)
+    write_beside(axes, f"knee {short(knee.gaussians)}", at, (-4 if far else 4, 0), **look)
 
 
 # -- options -----------------------------------------------------------------------------------------
 
 
-def _draw_options(results: StudyResults) -> Figure | None:
+def _draw_options(results: Results) -> Figure | None:
     default = find_default(results)
     if default is None:
         return None
@@ -267,7 +191,7 @@ def _draw_options(results: StudyResults) -> Figure | None:
     axes = figure.add_subplot()
     axes.use_sticky_edges = False  # bars that end at 0 leave room beyond it
     axes.axvline(0, color="#444444", linewidth=0.9)
-    _write_columns(axes, len(rows) - 0.35, COLUMNS, "#444444")
+    _write_columns(axes, len(rows) - 0.35, ("change", "PSNR", "Gaussians"), "#444444")
     for row, (arm, difference) in enumerate(rows):
         noise = difference.deviation or 0.0
         color = SAME if abs(difference.mean) <= noise else BETTER if difference.mean > 0 else WORSE
@@ -292,26 +216,17 @@ def _draw_options(results: StudyResults) -> Figure | None:
 
 
 def _write_columns(axes: Axes, row: float, texts: Sequence[str], color: str) -> None:
+    look = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "center", "color": color}
     for text, place in zip(texts, COLUMN_POINTS, strict=True):
-        axes.annotate(
-            text,
-            xy=(1, row),
-            xycoords=("axes fraction", "data"),
-            xytext=(place, 0),
-            textcoords="offset points",
-            ha="right",
-            va="center",
-            fontsize=8,
-            color=color,
-        )
+        write_beside(axes, text, (1, row), (place, 0), **look)
 
 
-def _title(results: StudyResults, method: str | None = None) -> str:
-    p = results.protocol
-    parts = [p.scene, f"1/{p.downscale} size", *([method] if method else [])]
-    if results.study != "blocks":
-        parts.append(f"{p.blocks} blocks")
-    parts.append(f"{p.steps:,} steps" if p.seconds is None else f"{p.seconds:g} s")
-    if len(p.seeds) > 1:
-        parts.append(f"mean of {len(p.seeds)} seeds")
+def _title(results: Results, method: str | None = None) -> str:
+    s = results.settings
+    parts = [s.scene, f"1/{s.downscale} size", *([method] if method else [])]
+    if results.kind != "study of blocks":
+        parts.append(f"{s.blocks} blocks")
+    parts.append(f"{s.steps:,} steps" if s.seconds is None else f"{s.seconds:g} s")
+    if len(results.seeds) > 1:
+        parts.append(f"mean of {len(results.seeds)} seeds")
     return ", ".join(parts)

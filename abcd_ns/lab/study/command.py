@@ -1,111 +1,134 @@
 """`abcd study`: vary one thing and see what it does."""
 
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
-from abcd_ns.lab.runs.job import HELD_OUT_EVERY
-from abcd_ns.lab.runs.run import Failure, Run
-from abcd_ns.lab.runs.runner import claim, run_jobs
+from abcd_ns.errors import UserError
+from abcd_ns.lab.runs import experiment
+from abcd_ns.lab.runs.checks import Flag, check_numbers, make_settings, words
+from abcd_ns.lab.runs.job import AS_IT_IS, METHODS, Change, Job, Plan, Variant
 from abcd_ns.lab.study.charts import draw_study
-from abcd_ns.lab.study.findings import findings_of
-from abcd_ns.lab.study.plan import (
-    AbcdMethod,
-    Conditions,
-    StudyPlan,
-    plan_blocks,
-    plan_gaussians,
-    plan_options,
-)
-from abcd_ns.lab.study.results import SCHEMA, Arm, StudyProtocol, StudyResults, write_study
-from abcd_ns.lab.study.tables import print_table, write_table
-from abcd_ns.nerfstudio.machine import Machine, describe_machine, describe_versions
 
-RESULTS_FILE, TABLE_FILE = "results.json", "table.md"
-
-
-def _words(metavar: str, *aliases: str):
-    """How --help shows an option without a default of its own."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="", aliases=aliases or None)
+AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic", "abcd-partition", "abcd-exact", "abcd-paper"]
+BLOCKS, LIMIT = "blocks", "training.density.max_gaussians"
+"""The options that the first two studies vary."""
+Number = Annotated[int, tyro.conf.arg(metavar="N")]
+Numbers = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Common:
+class Conditions:
     """What every study takes."""
 
     data: Annotated[Path, tyro.conf.arg(metavar="PATH")]
     """The scene: a folder with a COLMAP model or transforms.json, as for `ns-train abcd --data`."""
     out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
     """Folder for the results; absent, empty, or one of an earlier study of the same kind."""
-    seconds: Annotated[float | None, _words("S")] = None
+    seconds: Annotated[float | None, words("S")] = None
     """Budget of a run: seconds of training; evaluation, saving and compiling do not count."""
-    steps: Annotated[int | None, _words("N")] = None
+    steps: Annotated[int | None, words("N")] = None
     """Budget of a run: optimisation steps. Give either this or --seconds."""
     seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...", aliases=("--seed",))] = (0,)
     """Each run once for each. Several tell what is an effect and what is chance."""
-    downscale: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    downscale: Number = 1
     """Divides the photos' width and height."""
-    evals: Annotated[int, tyro.conf.arg(metavar="N")] = 4
+    evals: Number = 4
     """Times that held-out views are scored during a run, the end included."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")] = False
+    overwrite: Flag = False
     """Drop the runs that OUT holds."""
 
-    def conditions(self, **more: int) -> Conditions:
-        """These options, and those that only some studies have."""
-        names = ("data", "out", "seconds", "steps", "seeds", "downscale", "evals")
-        return Conditions(**{name: getattr(self, name) for name in names}, **more)
+    def _planned(
+        self,
+        study: str,
+        methods: Sequence[str],
+        variants: Sequence[Variant],
+        varied: Sequence[Any],
+        *,
+        blocks: int = 8,
+        max_gaussians: int = 0,
+        notes: Sequence[str] = (),
+    ) -> Plan:
+        """All runs, every option and the scene looked at; `varied` is what the command line says of them."""
+        # Here and not above: nerfstudio takes seconds to import, and `--help` has no use for it.
+        from abcd_ns.lab.runs.configs import check_options, check_scene
+
+        names = ("data", "out", "seeds", "seconds", "steps", "downscale", "evals")
+        given = {name: getattr(self, name) for name in names}
+        given |= {"blocks": blocks, "max_gaussians": max_gaussians, "densify": True, "pictures": 0}
+        settings = make_settings(**given)
+        jobs = tuple(Job(m, seed, settings, v) for seed in self.seeds for m in methods for v in variants)
+        line = ["abcd", "study", study, "--data", settings.scene, *varied]
+        line += [*settings.words(study != "blocks"), "--seeds", *self.seeds, "--out", self.out.name]
+        for job in jobs:
+            check_options(job)
+        check_scene(jobs[0])
+        command = shlex.join(map(str, line))
+        return Plan(f"study of {study}", settings, self.out, jobs, command, tuple(notes))
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlocksStudy(Common):
+class BlocksStudy(Conditions):
     """Held-out quality, time and memory against the number of blocks. The goal: no cliff, the worst number
     within 0.5 dB of the best."""
 
-    blocks: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (1, 2, 4, 8, 16, 27)
+    blocks: Numbers = (1, 2, 4, 8, 16, 27)
     """Numbers of blocks to try."""
     method: AbcdMethod = "abcd"
     """What is trained."""
-    max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    max_gaussians: Number = 0
     """In the whole scene, so that no number of blocks wins by having more; 0 for no limit."""
 
-    def plan(self) -> StudyPlan:
-        """All runs, checked."""
-        return plan_blocks(self.conditions(max_gaussians=self.max_gaussians), self.method, self.blocks)
+    def plan(self) -> Plan:
+        """All runs, checked.
+
+        Raises:
+            UserError: an option cannot be used.
+        """
+        check_numbers("--blocks", self.blocks, 1, several=True)
+        varied = ["--method", self.method, "--blocks", *sorted(self.blocks)]
+        variants = [_one(BLOCKS, number) for number in sorted(self.blocks)]
+        return self._planned("blocks", [self.method], variants, varied, max_gaussians=self.max_gaussians)
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussiansStudy(Common):
+class GaussiansStudy(Conditions):
     """How few Gaussians a scene needs: held-out quality against the limit on their number, and the knee of
     each curve, the smallest limit within 0.2 dB of the best measured. A limit below the number of initial
     points begins with a random choice of them."""
 
-    max_gaussians: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (
-        2000,
-        4000,
-        8000,
-        16000,
-        32000,
-    )
+    max_gaussians: Numbers = (2000, 4000, 8000, 16000, 32000)
     """Limits to try, for the whole scene."""
     methods: Annotated[tuple[AbcdMethod, ...], tyro.conf.arg(metavar="METHOD ...")] = (
         "abcd",
         "abcd-monolithic",
     )
     """Of the abcd methods; a curve for each."""
-    blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 8
+    blocks: Number = 8
     """Blocks of all but abcd-monolithic."""
 
-    def plan(self) -> StudyPlan:
-        """All runs, checked."""
-        return plan_gaussians(self.conditions(blocks=self.blocks), self.methods, self.max_gaussians)
+    def plan(self) -> Plan:
+        """All runs, checked.
+
+        Raises:
+            UserError: an option cannot be used.
+        """
+        check_numbers("--max-gaussians", self.max_gaussians, 1, several=True)
+        if not self.methods or len(set(self.methods)) < len(self.methods):
+            raise UserError("--methods: give at least one, and none twice.")
+        methods = [method for method in METHODS if method in self.methods]
+        varied = ["--methods", *methods, "--max-gaussians", *sorted(self.max_gaussians)]
+        variants = [_one(LIMIT, limit) for limit in sorted(self.max_gaussians)]
+        return self._planned("gaussians", methods, variants, varied, blocks=self.blocks)
 
 
 @dataclass(frozen=True, kw_only=True)
-class OptionsStudy(Common):
+class OptionsStudy(Conditions):
     """An ablation: the method as it is, and once more for each change of an option. Names are those of
     `ns-train abcd --help` under --pipeline; several options that change at
     once stand in quotes, as in --vary training.warmup=0 "partition=grid blocks=27"."""
@@ -114,18 +137,40 @@ class OptionsStudy(Common):
     """Changes to try, a row for each; all are checked before the first run."""
     method: AbcdMethod = "abcd"
     """What is changed."""
-    blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 8
+    blocks: Number = 8
     """Blocks of all but abcd-monolithic, unless varied."""
-    max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    max_gaussians: Number = 0
     """In the whole scene, unless varied; 0 for no limit."""
 
-    def plan(self) -> StudyPlan:
-        """All runs, checked."""
-        given = self.conditions(blocks=self.blocks, max_gaussians=self.max_gaussians)
-        return plan_options(given, self.method, self.vary)
+    def plan(self) -> Plan:
+        """All runs, checked.
+
+        Raises:
+            UserError: an option cannot be used, or is none of the method's.
+        """
+        from abcd_ns.lab.runs.configs import registered
+        from abcd_ns.lab.runs.options import parse_variant, read_value, value_of
+
+        if not self.vary:
+            raise UserError("Give at least one change of an option with --vary NAME=VALUE.")
+        pipeline, notes = registered(self.method).pipeline, []
+        variants = [parse_variant(text, pipeline) for text in self.vary]
+        folders = [variant.folder for variant in variants]
+        shared = {BLOCKS: self.blocks, LIMIT: self.max_gaussians}
+        for variant in variants:
+            if folders.count(variant.folder) > 1:
+                raise UserError(f"--vary {variant.name!r} is given twice.")
+            paths = [change.path for change in variant.changes]
+            usual = [shared[path] if path in shared else value_of(pipeline, path) for path in paths]
+            if usual == [read_value(change, pipeline) for change in variant.changes]:
+                shows = "its difference shows how well a run repeats itself."
+                notes.append(f"{variant.name} is the default: {shows}")
+        given = {"blocks": self.blocks, "max_gaussians": self.max_gaussians, "notes": notes}
+        varied = ["--method", self.method, "--vary", *(variant.name for variant in variants)]
+        return self._planned("options", [self.method], [AS_IT_IS, *variants], varied, **given)
 
 
-Wanted = (
+Study = (
     Annotated[BlocksStudy, tyro.conf.subcommand("blocks")]
     | Annotated[GaussiansStudy, tyro.conf.subcommand("gaussians")]
     | Annotated[OptionsStudy, tyro.conf.subcommand("options")]
@@ -133,7 +178,7 @@ Wanted = (
 
 
 @tyro.conf.configure(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
-def study(wanted: Annotated[Wanted, tyro.conf.arg(name="")]) -> int:
+def study(wanted: Annotated[Study, tyro.conf.arg(name="")]) -> int:
     """Vary one thing and see what it does: the number of blocks, the limit on Gaussians, or any options.
 
     Each run has a process of its own, one after the other, under the protocol of `abcd compare`. OUT gets
@@ -155,72 +200,16 @@ def study(wanted: Annotated[Wanted, tyro.conf.arg(name="")]) -> int:
     return carry_out(wanted.plan(), Console(), wanted.overwrite)
 
 
-def carry_out(plan: StudyPlan, console: Console, overwrite: bool = False) -> int:
+def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     """Do all runs of the plan and write what came of them; exit code 1 if a run failed."""
-    machine = describe_machine()
-    claim(plan.out, plan, machine, overwrite)
-    _announce(plan, console)
-    results = gather(plan, run_jobs(plan, console), machine)
-    report(results, plan.out, console)
-    return 1 if results.failures else 0
-
-
-def gather(plan: StudyPlan, outcomes: list[Run | Failure], machine: Machine) -> StudyResults:
-    """The outcomes, in the order of the plan's jobs, as results with their findings."""
-    found = list(zip(plan.jobs, outcomes, strict=True))
-    arms = []
-    for method in plan.methods:
-        for variant in plan.variants:
-            runs = tuple(
-                outcome
-                for job, outcome in found
-                if (job.method, job.variant) == (method, variant) and isinstance(outcome, Run)
-            )
-            value = None if plan.study == "options" else int(variant.changes[0].value)
-            arms += [Arm(method, variant.name, value, runs)] if runs else []
-    base = {
-        "schema": SCHEMA,
-        "study": plan.study,
-        "protocol": describe_protocol(plan),
-        "machine": machine,
-        "versions": describe_versions(),
-        "arms": tuple(arms),
-        "failures": tuple(outcome for outcome in outcomes if isinstance(outcome, Failure)),
-        "notes": plan.notes,
-    }
-    return StudyResults(**base, findings=findings_of(StudyResults(**base)))
-
-
-def describe_protocol(plan: StudyPlan) -> StudyProtocol:
-    """What results.json says of how the study was made."""
-    names = ("scene", "downscale", "seconds", "steps", "blocks", "evals", "max_gaussians")
-    return StudyProtocol(
-        held_out=f"every {HELD_OUT_EVERY}th view of the list sorted by name, from the first on",
-        methods=plan.methods,
-        varied=tuple(variant.name for variant in plan.variants),
-        seeds=plan.seeds,
-        date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        command=plan.command,
-        **{name: getattr(plan.settings, name) for name in names},
-    )
-
-
-def report(results: StudyResults, out: Path, console: Console) -> None:
-    """Write results.json, table and chart, and print the table."""
-    write_study(out / RESULTS_FILE, results)
-    write_table(results, out / TABLE_FILE)
-    paths = [out / RESULTS_FILE, out / TABLE_FILE, *draw_study(results, out)]
-    if results.arms:
-        print_table(results, console)
-    for path in paths:
-        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
-
-
-def _announce(plan: StudyPlan, console: Console) -> None:
     count, settings = len(plan.jobs), plan.settings
-    if settings.seconds is None:
-        text = f"{count} runs of {settings.steps:,} steps."
-    else:
+    text = f"{count} runs of {settings.steps or 0:,} steps."
+    if settings.seconds is not None:
         minutes = count * settings.seconds / 60
         text = f"{count} runs of {settings.seconds:g} s: {minutes:.0f} min of training and some of start-up."
     console.print(text, highlight=False)
+    return experiment.carry_out(plan, console, draw_study, overwrite)
+
+
+def _one(path: str, value: int) -> Variant:
+    return Variant((Change(path, str(value)),))

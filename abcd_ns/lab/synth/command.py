@@ -1,9 +1,7 @@
 """`abcd synth OUT`: draw a scene of walled courts into a COLMAP data set."""
 
-import json
 import os
 import shutil
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +12,8 @@ from PIL import Image
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.records import read_json, write_json
+from abcd_ns.lab.runs.runner import take_folder
 from abcd_ns.lab.synth.cameras import Camera, Lens, court_cameras
 from abcd_ns.lab.synth.colmap_writer import write_model
 from abcd_ns.lab.synth.court import Layout, Site
@@ -24,41 +24,51 @@ from abcd_ns.progress_bar import ProgressBar
 
 FORMAT = 1
 """Raised whenever the same settings would draw another scene."""
-_MARKER = "synth.json"
-
-
-class SynthError(UserError):
-    """A setting or an output folder that the user has to change; the message is one sentence."""
+MARKER = "synth.json"
+LIMITS = {
+    "courts": (1, 10_000),
+    "views_per_court": (2, 10_000),
+    "width": (16, 8192),
+    "height": (16, 8192),
+    "seed": (0, 2**31 - 1),
+    "points_per_court": (1, 10_000_000),
+    "supersample": (1, 8),
+}
+"""The least and the most that each may be."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All that decides what is drawn; see `synth`."""
+    """All that decides what is drawn."""
 
-    courts: int
-    layout: Layout
-    views_per_court: int
-    width: int
-    height: int
-    seed: int
-    points_per_court: int
-    supersample: int
+    courts: int = 2
+    """Number of courts."""
+    layout: Layout = "grid"
+    """Courts in a near-square grid or in one row."""
+    views_per_court: int = 24
+    """Pictures taken inside each court."""
+    width: int = 320
+    """Of the pictures, in pixels."""
+    height: int = 240
+    """Of the pictures, in pixels."""
+    seed: int = 0
+    """Chooses colours, objects, openings, sun and camera poses."""
+    points_per_court: int = 4000
+    """Sparse points to write per court, fewer where views overlap little."""
+    supersample: int = 2
+    """Rays per pixel along each axis."""
 
-    def __post_init__(self) -> None:
-        limits = {
-            "courts": (1, 10_000),
-            "views_per_court": (2, 10_000),
-            "width": (16, 8192),
-            "height": (16, 8192),
-            "seed": (0, 2**31 - 1),
-            "points_per_court": (1, 10_000_000),
-            "supersample": (1, 8),
-        }
-        for name, (low, high) in limits.items():
+    def check(self) -> None:
+        """Whether all of them can be drawn.
+
+        Raises:
+            UserError: one is out of range.
+        """
+        for name, (low, high) in LIMITS.items():
             value = getattr(self, name)
             if not low <= value <= high:
                 flag = "--" + name.replace("_", "-")
-                raise SynthError(f"{flag} is {value}; it must lie between {low} and {high}.")
+                raise UserError(f"{flag} is {value}; it must lie between {low} and {high}.")
 
     @property
     def command(self) -> str:
@@ -67,18 +77,10 @@ class Settings:
         return "abcd synth OUT " + " ".join(flags)
 
 
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def synth(
     out: Annotated[Path, tyro.conf.Positional],
-    /,
-    *,
-    courts: int = 2,
-    layout: Layout = "grid",
-    views_per_court: int = 24,
-    width: int = 320,
-    height: int = 240,
-    seed: int = 0,
-    points_per_court: int = 4000,
-    supersample: int = 2,
+    settings: Annotated[Settings, tyro.conf.arg(name="")],
     overwrite: bool = False,
 ) -> None:
     """Draw a scene of walled courts side by side, as a COLMAP data set.
@@ -88,32 +90,23 @@ def synth(
 
     Args:
         out: Folder for images/, sparse/0/ and SOURCE.md; must be empty, absent or an earlier result.
-        courts: Number of courts.
-        layout: Courts in a near-square grid or in one row.
-        views_per_court: Pictures taken inside each court.
-        width: Of the pictures, in pixels.
-        height: Of the pictures, in pixels.
-        seed: Chooses colours, objects, openings, sun and camera poses.
-        points_per_court: Sparse points to write per court, fewer where views overlap little.
-        supersample: Rays per pixel along each axis.
+        settings: All that decides what is drawn.
         overwrite: Replace an earlier result of this command that has other settings or is incomplete.
 
     Raises:
-        SynthError: a setting is out of range, or `out` holds something else.
+        UserError: a setting is out of range, or `out` holds something else.
     """
-    settings = Settings(
-        courts, layout, views_per_court, width, height, seed, points_per_court, supersample
-    )  # fmt: skip
+    settings.check()
     console = Console(stderr=True)
     if not _prepare(out, settings, overwrite):
         console.print(f"{out} already holds this scene; nothing to do.", highlight=False, soft_wrap=True)
         return
-    _mark(out, settings, complete=False)
+    write_json(out / MARKER, _marker(settings, complete=False))
     cameras, points = _draw(out, settings, console)
     (out / "SOURCE.md").write_text(_source(settings, len(cameras), len(points.xyz)), encoding="utf-8")
-    _mark(out, settings, complete=True)
+    write_json(out / MARKER, _marker(settings, complete=True))
     console.print(
-        f"{out}: {len(cameras)} pictures and {len(points.xyz)} points of {courts} courts.",
+        f"{out}: {len(cameras)} pictures and {len(points.xyz)} points of {settings.courts} courts.",
         highlight=False,
         soft_wrap=True,
     )
@@ -143,60 +136,31 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[list[Camera]
             parts.append(court_points(world, cameras, own, nearby, lens, settings.points_per_court))
     points = SparsePoints.cat(parts)
     if not len(points.xyz):
-        raise SynthError("No point is seen by two views; raise --views-per-court or --points-per-court.")
+        raise UserError("No point is seen by two views; raise --views-per-court or --points-per-court.")
     write_model(out / "sparse" / "0", cameras, lens, points)
     return cameras, points
 
 
 def _prepare(out: Path, settings: Settings, overwrite: bool) -> bool:
     """Make `out` an empty folder of ours. False if it holds this very scene already."""
-    if out.exists() and not out.is_dir():
-        raise SynthError(f"{out} is a file; name a folder.")
-    earlier = _read_marker(out)
-    if earlier is None:
-        if out.is_dir() and any(out.iterdir()):
-            raise SynthError(f"{out} is not empty and holds no scene of this command; name another folder.")
-        out.mkdir(parents=True, exist_ok=True)
+    path = out / MARKER
+    if not take_folder(out, path, "scene of this command"):
         return True
+    earlier = read_json(path)
     if earlier == _marker(settings, complete=True) and not overwrite:
         return False
     if not overwrite:
         state = "another scene" if earlier.get("complete") else "an unfinished scene"
-        raise SynthError(f"{out} holds {state}; pass --overwrite to replace it, or name another folder.")
-    for path in _own_paths(out):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        raise UserError(f"{out} holds {state}; pass --overwrite to replace it, or name another folder.")
+    for name in ("images", "sparse"):  # what this command writes; --overwrite removes no more
+        shutil.rmtree(out / name, ignore_errors=True)
+    for name in ("SOURCE.md", MARKER):
+        (out / name).unlink(missing_ok=True)
     return True
-
-
-def _own_paths(out: Path) -> Iterator[Path]:
-    """What this command writes into a folder; --overwrite removes no more."""
-    return (out / name for name in ("images", "sparse", "SOURCE.md", _MARKER))
 
 
 def _marker(settings: Settings, complete: bool) -> dict:
     return {"format": FORMAT, "complete": complete, "settings": asdict(settings)}
-
-
-def _mark(out: Path, settings: Settings, complete: bool) -> None:
-    text = json.dumps(_marker(settings, complete), indent=2) + "\n"
-    (out / _MARKER).write_text(text, encoding="utf-8")
-
-
-def _read_marker(out: Path) -> dict | None:
-    """What an earlier run left in `out`; None if there was none."""
-    path = out / _MARKER
-    if not path.is_file():
-        return None
-    try:
-        marker = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise SynthError(f"{path} is not readable as JSON; delete it or name another folder.") from error
-    if not isinstance(marker, dict) or "settings" not in marker:
-        raise SynthError(f"{path} was not written by this command; name another folder.")
-    return marker
 
 
 def _source(settings: Settings, pictures: int, points: int) -> str:

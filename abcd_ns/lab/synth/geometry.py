@@ -39,10 +39,6 @@ class Soup:
         normals = np.einsum("ij,tcj->tci", turn, self.normals.astype(np.float64))
         return replace(self, corners=corners.astype(np.float32), normals=normals.astype(np.float32))
 
-    def with_uv_shift(self, u: float, v: float = 0.0) -> "Soup":
-        """The same solid with another part of its texture."""
-        return replace(self, uv=self.uv + np.float32([u, v]))
-
     @staticmethod
     def cat(parts: Sequence["Soup"]) -> "Soup":
         """All parts in one soup, in order. `parts` must not be empty."""

@@ -1,7 +1,10 @@
-"""Made-up runs for tests of what `abcd compare` writes. No number here was ever measured."""
+"""Made-up runs for tests of what experiments write. No number here was ever measured."""
 
-from abcd_ns.lab.compare.results import SCHEMA, LeftOut, Protocol, Results
-from abcd_ns.lab.runs.job import METHODS
+import dataclasses
+
+from abcd_ns.lab.runs.findings import findings_of
+from abcd_ns.lab.runs.job import Settings
+from abcd_ns.lab.runs.results import SCHEMA, Arm, LeftOut, Results
 from abcd_ns.lab.runs.run import CurvePoint, Failure, Run, ViewScore
 from abcd_ns.nerfstudio.machine import Machine, Versions
 
@@ -42,31 +45,23 @@ def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, speed: 
     return Run(**{**values, **fields})
 
 
-def made_up_results(*runs: Run, seeds: tuple[int, ...] = (0,), **fields) -> Results:
-    """Results with these runs."""
-    protocol = Protocol(
-        scene="made-up",
-        downscale=4,
-        held_out="every 8th view",
-        seconds=60.0,
-        steps=None,
-        methods=METHODS,
-        seeds=seeds,
-        blocks=8,
-        evals=6,
-        max_gaussians=0,
-        densify=True,
-        pictures=3,
-        date="2026-01-01T00:00:00+00:00",
-        command="abcd compare",
-    )
-    values = {
-        "schema": SCHEMA,
-        "protocol": protocol,
-        "machine": MACHINE,
-        "versions": VERSIONS,
-        "runs": runs,
-        "failures": (Failure("abcd-ablated", 0, "it broke", "runs/abcd-ablated/seed-0/log.txt"),),
-        "left_out": (LeftOut("splatfacto", "it needs a CUDA device"),),
-    }
-    return Results(**{**values, **fields})
+def made_up_settings(**fields) -> Settings:
+    """Those of a run of a minute."""
+    values = {"data": "made-up", "downscale": 4, "blocks": 8, "seconds": 60.0, "steps": None, "evals": 6}
+    return Settings(**{**values, "max_gaussians": 0, "densify": True, "pictures": 3, **fields})
+
+
+def made_up(kind: str, *arms: Arm, **fields) -> Results:
+    """Results with these arms, and what they say."""
+    values = {"settings": made_up_settings(), "seeds": (0,), "arms": arms, **fields}
+    results = Results(SCHEMA, kind, "2026-01-01T00:00:00+00:00", "abcd", MACHINE, VERSIONS, **values)
+    return dataclasses.replace(results, findings=findings_of(results))
+
+
+def made_up_results(*runs: Run, **fields) -> Results:
+    """A comparison with these runs."""
+    methods = dict.fromkeys(run.method for run in runs)
+    arms = [Arm(m, "default", None, tuple(run for run in runs if run.method == m)) for m in methods]
+    failure = Failure("abcd-ablated", 0, "it broke", "runs/abcd-ablated/seed-0/log.txt")
+    left = LeftOut("splatfacto", "it needs a CUDA device")
+    return made_up("comparison", *arms, **{"failures": (failure,), "left_out": (left,), **fields})

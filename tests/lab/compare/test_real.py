@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from abcd_ns.lab.compare.command import carry_out
-from abcd_ns.lab.compare.protocol import Options, make_plan
-from abcd_ns.lab.compare.results import read_results
+from abcd_ns.lab.compare.command import Options, carry_out, make_plan
+from abcd_ns.lab.runs.results import read_results
 from tests.reference.colmap_scene import HELD_OUT, write_scene
 
 STEPS = 20
@@ -109,6 +108,6 @@ def test_reports_are_there_and_a_second_call_trains_nothing(compared):
 def test_nothing_in_the_results_names_a_folder_of_this_machine(compared):
     _, plan, _ = compared
     text = (plan.out / "results.json").read_text()
-    assert json.loads(text)["protocol"]["scene"] == "scene"
+    assert json.loads(text)["settings"]["data"] == "scene"
     assert str(plan.out.parent) not in text
     assert f"{Path.home()}/" not in text

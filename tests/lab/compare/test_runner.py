@@ -11,21 +11,25 @@ import pytest
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.command import carry_out, without_impossible
-from abcd_ns.lab.compare.protocol import Options, Plan, make_plan
-from abcd_ns.lab.compare.results import read_results
+from abcd_ns.lab.compare.command import Options, carry_out, impossible, make_plan
 from abcd_ns.lab.runs import runner
+from abcd_ns.lab.runs.experiment import run_jobs
+from abcd_ns.lab.runs.job import Job, Plan
 from abcd_ns.lab.runs.records import encode
+from abcd_ns.lab.runs.results import read_results
 from abcd_ns.lab.runs.run import Failure, Run
-from abcd_ns.lab.runs.runner import claim, last_line, run_jobs
+from abcd_ns.lab.runs.runner import last_line
 from tests.lab.compare.fake_worker import FakeWorker
 from tests.lab.compare.records import MACHINE
 
 
 @pytest.fixture
 def worker(tmp_path, monkeypatch) -> FakeWorker:
+    fake = FakeWorker(tmp_path / "worker")
     monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
-    return FakeWorker(tmp_path / "worker")
+    monkeypatch.setattr(runner, "command_of", lambda job: fake.command)  # noqa: ARG005
+    monkeypatch.setattr("abcd_ns.lab.runs.experiment.describe_machine", lambda: MACHINE)
+    return fake
 
 
 @pytest.fixture
@@ -36,35 +40,43 @@ def plan(tmp_path) -> Plan:
     return make_plan(Options(data=str(scene), out=str(out), steps=10, methods=("abcd-monolithic", "abcd")))
 
 
-def run(plan: Plan, worker: FakeWorker) -> list[Run | Failure]:
-    claim(plan.out, plan, MACHINE, overwrite=False)
-    return run_jobs(plan, Console(file=StringIO()), worker.command)
+def run(plan: Plan, overwrite: bool = False) -> list[Run | Failure]:
+    """What comes of the plan's jobs, in their order."""
+    *_, results = run_jobs(plan, Console(file=StringIO()), overwrite)
+    found = {(one.method, one.seed): one for one in (*results.runs, *results.failures)}
+    return [found[job.method, job.seed] for job in plan.jobs]
+
+
+def with_settings(plan: Plan, **changed) -> Plan:
+    settings = dataclasses.replace(plan.settings, **changed)
+    jobs = tuple(dataclasses.replace(job, settings=settings) for job in plan.jobs)
+    return dataclasses.replace(plan, settings=settings, jobs=jobs)
 
 
 def test_finished_runs_are_reused(plan, worker):
-    first = run(plan, worker)
+    first = run(plan)
     assert [outcome.method for outcome in first] == worker.calls() == ["abcd-monolithic", "abcd"]
-    assert run(plan, worker) == first
+    assert run(plan) == first
     assert worker.calls() == []
 
 
 def test_an_interrupted_comparison_goes_on_where_it_was(plan, worker):
-    run(dataclasses.replace(plan, methods=("abcd-monolithic",)), worker)
+    run(dataclasses.replace(plan, jobs=plan.jobs[:1]))
     half = plan.jobs[1].folder(plan.out)  # what a killed worker leaves
     half.mkdir(parents=True)
     (half / "job.json").write_text(json.dumps(encode(plan.jobs[1])))
     (half / "leftover").write_text("")
     worker.calls()
-    assert [outcome.method for outcome in run(plan, worker)] == ["abcd-monolithic", "abcd"]
+    assert [outcome.method for outcome in run(plan)] == ["abcd-monolithic", "abcd"]
     assert worker.calls() == ["abcd"]
     assert not (half / "leftover").exists()
 
 
 def test_a_spoilt_run_is_run_again(plan, worker):
-    run(plan, worker)
+    run(plan)
     worker.calls()
     (plan.jobs[0].folder(plan.out) / "run.json").write_text('{"psnr": NaN}')
-    run(plan, worker)
+    run(plan)
     assert worker.calls() == ["abcd-monolithic"]
 
 
@@ -78,18 +90,17 @@ def test_a_spoilt_run_is_run_again(plan, worker):
 )
 def test_a_failed_run_is_reported_and_the_others_go_on(plan, worker, behaviour, reason):
     worker.behave(abcd_monolithic=behaviour)
-    failure, finished = run(plan, worker)
+    failure, finished = run(plan)
     assert isinstance(failure, Failure)
     assert (failure.method, failure.reason) == ("abcd-monolithic", reason)
     assert (plan.out / failure.log).read_text().startswith("starting")
     assert isinstance(finished, Run)
     worker.behave()
-    assert [type(outcome) for outcome in run(plan, worker)] == [Run, Run]
+    assert [type(outcome) for outcome in run(plan)] == [Run, Run]
 
 
-def test_a_comparison_with_a_failure_still_writes_everything(plan, worker, monkeypatch):
+def test_a_comparison_with_a_failure_still_writes_everything(plan, worker):
     worker.behave(abcd="raises")
-    monkeypatch.setattr("abcd_ns.lab.compare.command.run_jobs", lambda p, c: run_jobs(p, c, worker.command))
     stream = StringIO()
     assert carry_out(plan, Console(file=stream, width=100)) == 1
     results = read_results(plan.out / "results.json")
@@ -101,45 +112,48 @@ def test_a_comparison_with_a_failure_still_writes_everything(plan, worker, monke
     assert "PSNR" in stream.getvalue()
 
 
-def test_nothing_but_failures_is_reported_too(plan, worker, monkeypatch):
+def test_nothing_but_failures_is_reported_too(plan, worker):
     worker.behave(abcd="raises", abcd_monolithic="raises")
-    monkeypatch.setattr("abcd_ns.lab.compare.command.run_jobs", lambda p, c: run_jobs(p, c, worker.command))
     assert carry_out(plan, Console(file=StringIO())) == 1
     assert len(read_results(plan.out / "results.json").failures) == 2
     assert not (plan.out / "speed_accuracy.png").exists()
 
 
+@pytest.mark.usefixtures("worker")
 @pytest.mark.parametrize(
     ("field", "value"),
     [("steps", 11), ("blocks", 2), ("downscale", 2), ("densify", False), ("data", "other")],
 )
-def test_another_protocol_is_refused_by_name(plan, worker, field, value):
-    run(plan, worker)
-    other = dataclasses.replace(plan, settings=dataclasses.replace(plan.settings, **{field: value}))
+def test_another_protocol_is_refused_by_name(plan, field, value):
+    run(plan)
     with pytest.raises(UserError, match=rf"holds runs with {field} .*, not {value}") as caught:
-        claim(plan.out, other, MACHINE, overwrite=False)
+        run(with_settings(plan, **{field: value}))
     assert "\n" not in str(caught.value)
 
 
-def test_runs_of_another_machine_are_refused(plan, worker):
-    run(plan, worker)
+def test_runs_of_another_machine_are_refused(plan, worker, monkeypatch):
+    run(plan)
+    other = dataclasses.replace(MACHINE, cores=64)
+    monkeypatch.setattr("abcd_ns.lab.runs.experiment.describe_machine", lambda: other)
+    worker.calls()
     with pytest.raises(UserError, match="holds runs with cores 2, not 64"):
-        claim(plan.out, plan, dataclasses.replace(MACHINE, cores=64), overwrite=False)
+        run(plan)
+    assert worker.calls() == []
 
 
 def test_overwrite_drops_the_runs(plan, worker):
-    run(plan, worker)
+    run(plan)
     worker.calls()
-    other = dataclasses.replace(plan, settings=dataclasses.replace(plan.settings, steps=11))
-    claim(plan.out, other, MACHINE, overwrite=True)
-    run(other, worker)
+    other = with_settings(plan, steps=11)
+    run(other, overwrite=True)
     assert worker.calls() == ["abcd-monolithic", "abcd"]
 
 
 def test_more_seeds_and_methods_may_join(plan, worker):
-    run(plan, worker)
+    run(plan)
     worker.calls()
-    run(dataclasses.replace(plan, seeds=(0, 1)), worker)
+    more = [dataclasses.replace(job, seed=1) for job in plan.jobs]
+    run(dataclasses.replace(plan, jobs=(*plan.jobs, *more)))
     assert worker.calls() == ["abcd-monolithic", "abcd"]
 
 
@@ -148,27 +162,29 @@ def test_a_folder_of_something_else_is_left_alone(plan, overwrite):
     plan.out.mkdir()
     (plan.out / "thesis.tex").write_text("mine")
     with pytest.raises(UserError, match="is not empty and holds no comparison"):
-        claim(plan.out, plan, MACHINE, overwrite)
+        run(plan, overwrite)
     assert [path.name for path in plan.out.iterdir()] == ["thesis.tex"]
 
 
 def test_a_file_is_no_folder(plan):
     plan.out.write_text("")
     with pytest.raises(UserError, match="is a file"):
-        claim(plan.out, plan, MACHINE, overwrite=False)
+        run(plan)
 
 
-def test_splatfacto_is_left_out_with_a_reason_where_it_cannot_run(plan, monkeypatch):
-    wanted = dataclasses.replace(plan, methods=("abcd", "splatfacto"))
+def test_splatfacto_is_left_out_with_a_reason_where_it_cannot_run(plan, worker, monkeypatch):
+    jobs = tuple(Job("splatfacto", seed, plan.settings) for seed in (0, 1))
+    wanted = dataclasses.replace(plan, jobs=(*jobs, plan.jobs[1]))
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    reduced, (left,) = without_impossible(wanted)
-    assert reduced.methods == ("abcd",)
+    assert carry_out(wanted, Console(file=StringIO())) == 0
+    assert worker.calls() == ["abcd"]
+    (left,) = read_results(plan.out / "results.json").left_out
     assert (left.method, "CUDA" in left.reason) == ("splatfacto", True)
-    assert without_impossible(plan) == (plan, ())
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    assert without_impossible(wanted) == (wanted, ())
-    limited = dataclasses.replace(wanted, settings=dataclasses.replace(wanted.settings, max_gaussians=9))
-    assert without_impossible(limited)[0].methods == ("abcd",)
+    assert impossible(jobs[0]) is None
+    limited = dataclasses.replace(plan.settings, max_gaussians=9)
+    assert "limit" in impossible(Job("splatfacto", 0, limited)).reason
+    assert impossible(Job("abcd", 0, limited)) is None
 
 
 @pytest.mark.parametrize(

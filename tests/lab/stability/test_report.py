@@ -9,14 +9,15 @@ from rich.progress import Progress
 
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
-from abcd_ns.lab.stability.catalogue import SCENARIOS
+from abcd_ns.lab.runs.experiment import write_report
+from abcd_ns.lab.runs.findings import headline
+from abcd_ns.lab.runs.results import Curve, Line, Outcome, Results, read_results
 from abcd_ns.lab.stability.charts import draw_curves
-from abcd_ns.lab.stability.command import Meter, carry_out, choose, claim
-from abcd_ns.lab.stability.curves import Curve, Line, studies
+from abcd_ns.lab.stability.command import KIND, SCENARIOS, Meter, carry_out, choose
+from abcd_ns.lab.stability.curves import studies
 from abcd_ns.lab.stability.lab import Lab
-from abcd_ns.lab.stability.outcome import Finding, Outcome, Scenario, against_one_block
-from abcd_ns.lab.stability.report import SCHEMA, Report, headline, markdown, read_report, write_report
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+from abcd_ns.lab.stability.outcome import Finding, Scenario, against_one_block
+from tests.lab.compare.records import made_up
 
 GOOD = Outcome(
     "A1", "NaN | in splats", "NaN put in", "mended", True, False, {"abcd": "fine"}, {"lost": 0.1}, 2.0
@@ -32,30 +33,29 @@ CURVE = Curve(
 
 
 @pytest.fixture
-def report() -> Report:
-    machine, versions = describe_machine(), describe_versions()
-    return Report(
-        SCHEMA, "2026-01-02T03:04:05+00:00", "abcd stability", machine, versions, (GOOD, BAD), (CURVE,)
-    )
+def report() -> Results:
+    return made_up(KIND, settings=None, outcomes=(GOOD, BAD), curves=(CURVE,))
 
 
 def test_what_is_written_is_read_back(report, tmp_path):
-    paths = write_report(report, tmp_path)
-    assert {path.name for path in paths} == {"stability.json", "table.md", "blocks.png", "blocks.svg"}
-    assert read_report(tmp_path / "stability.json") == report
+    paths = write_report(report, tmp_path, draw_curves)
+    assert {path.name for path in paths} == {"results.json", "table.md", "blocks.png", "blocks.svg"}
+    assert read_results(tmp_path / "results.json") == report
 
 
-def test_failures_and_losses_to_one_block_are_said(report):
-    text = markdown(report)
+def test_failures_and_losses_to_one_block_are_said(report, tmp_path):
+    write_report(report, tmp_path, draw_curves)
+    text = (tmp_path / "table.md").read_text()
     assert "1 of 2 scenarios pass; these fail: A2; one block does better, by however little, in A2." in text
     assert "**fail**, one block is better" in text
     assert "NaN \\| in splats" in text
     assert "| abcd-ablated | 20.00 | 15.00 |" in text
+    assert "| one block | 25.50 | 25.50 |" in text
     assert headline([GOOD]) == "1 of 1 scenarios pass."
 
 
 def test_charts_name_every_method_and_the_level(report, tmp_path):
-    (svg,) = (path for path in draw_curves(report.curves, tmp_path) if path.suffix == ".svg")
+    (svg,) = (path for path in draw_curves(report, tmp_path) if path.suffix == ".svg")
     text = svg.read_text()
     assert all(word in text for word in ("abcd-ablated", "abcd-monolithic  25.50", "number of blocks"))
 
@@ -77,12 +77,10 @@ def test_only_known_scenarios_are_chosen():
         choose(["R1"], SCENARIOS)
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path):
+def test_a_folder_of_something_else_is_refused(tmp_path, capsys):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(UserError, match="not empty and holds no stability report"):
-        claim(tmp_path)
-    with pytest.raises(UserError, match="is a file"):
-        claim(tmp_path / "thesis.tex")
+    assert cli.main(["stability", "--out", str(tmp_path), "--only", "A7"]) == 2
+    assert "is not empty and holds no stability report" in " ".join(capsys.readouterr().err.split())
 
 
 def test_what_is_done_is_kept_when_the_rest_breaks_off(tmp_path):
@@ -115,7 +113,7 @@ def test_the_command_writes_a_report(tmp_path, capsys):
     code = cli.main(["stability", "--out", str(tmp_path / "out"), "--only", "A7", "A21"])
     printed = capsys.readouterr().out
     assert code == 0, printed
-    report = read_report(tmp_path / "out" / "stability.json")
+    report = read_results(tmp_path / "out" / "results.json")
     assert [outcome.id for outcome in report.outcomes] == ["A7", "A21"]
     assert "2 of 2 scenarios pass." in printed
 

@@ -7,7 +7,7 @@ engine/test_coordinator, A21 engine/test_rasterizer_self_check.
 
 import pytest
 
-from abcd_ns.lab.stability.catalogue import SCENARIOS
+from abcd_ns.lab.stability.command import SCENARIOS
 from abcd_ns.lab.stability.lab import Lab
 
 SLOW = {"A3", "A6", "A8", "A9", "A11", "A12", "A13", "A14", "A15", "A16", "A19"}

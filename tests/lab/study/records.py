@@ -3,10 +3,9 @@
 import math
 import random
 
+from abcd_ns.lab.runs.results import Arm, Results
 from abcd_ns.lab.runs.run import Run
-from abcd_ns.lab.study.findings import findings_of
-from abcd_ns.lab.study.results import SCHEMA, Arm, StudyProtocol, StudyResults
-from tests.lab.compare.records import MACHINE, VERSIONS, made_up_run
+from tests.lab.compare.records import made_up, made_up_run
 
 
 def made_up_arm(variant: str, value: int | None, psnrs: dict[int, float], method="abcd", **fields) -> Arm:
@@ -15,29 +14,12 @@ def made_up_arm(variant: str, value: int | None, psnrs: dict[int, float], method
     return Arm(method, variant, value, tuple(runs))
 
 
-def made_up_study(study: str, *arms: Arm, seeds: tuple[int, ...] = (0,), **fields) -> StudyResults:
+def made_up_study(study: str, *arms: Arm, **fields) -> Results:
     """A study with these arms, and what it says."""
-    protocol = StudyProtocol(
-        scene="made-up",
-        downscale=4,
-        held_out="every 8th view",
-        seconds=60.0,
-        steps=None,
-        methods=tuple(dict.fromkeys(arm.method for arm in arms)) or ("abcd",),
-        varied=tuple(dict.fromkeys(arm.variant for arm in arms)),
-        seeds=seeds,
-        blocks=8,
-        evals=4,
-        max_gaussians=0,
-        date="2026-01-01T00:00:00+00:00",
-        command="abcd study",
-    )
-    values = {"schema": SCHEMA, "study": study, "protocol": protocol, "machine": MACHINE}
-    values |= {"versions": VERSIONS, "arms": arms, **fields}
-    return StudyResults(**values, findings=findings_of(StudyResults(**values)))
+    return made_up(f"study of {study}", *arms, **fields)
 
 
-def blocks_study(seeds: tuple[int, ...] = (0,)) -> StudyResults:
+def blocks_study(seeds: tuple[int, ...] = (0,)) -> Results:
     """A plausible study of blocks: slightly worse, smaller in memory and slower with more of them."""
     chance = random.Random(0)
     arms = []
@@ -60,7 +42,7 @@ def _blocks_run(seed: int, count: int, psnr: float) -> Run:
     )
 
 
-def gaussians_study(seeds: tuple[int, ...] = (0,)) -> StudyResults:
+def gaussians_study(seeds: tuple[int, ...] = (0,)) -> Results:
     """A plausible study of limits: two methods, both levelling off."""
     chance = random.Random(1)
     arms = []
@@ -72,7 +54,7 @@ def gaussians_study(seeds: tuple[int, ...] = (0,)) -> StudyResults:
     return made_up_study("gaussians", *arms, seeds=seeds)
 
 
-def options_study(seeds: tuple[int, ...] = (0,)) -> StudyResults:
+def options_study(seeds: tuple[int, ...] = (0,)) -> Results:
     """A plausible ablation."""
     chance = random.Random(2)
     changes = {

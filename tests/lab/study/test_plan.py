@@ -11,7 +11,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.job import Change, Variant
 from abcd_ns.lab.runs.options import change_options, option_names, parse_variant
-from abcd_ns.lab.study.plan import Conditions, plan_blocks, plan_gaussians, plan_options
+from abcd_ns.lab.study.command import BlocksStudy, GaussiansStudy, OptionsStudy
 from tests.reference.colmap_scene import write_scene
 
 PIPELINE = methods.abcd.config.pipeline
@@ -22,8 +22,8 @@ def scene(tmp_path_factory) -> Path:
     return write_scene(tmp_path_factory.mktemp("study") / "scene")
 
 
-def given(scene: Path, **more) -> Conditions:
-    return Conditions(**{"data": scene, "out": Path("out"), "steps": 10, **more})
+def given(scene: Path, **more) -> dict:
+    return {"data": scene, "out": Path("out"), "steps": 10, **more}
 
 
 # Options by name
@@ -97,7 +97,7 @@ def test_every_option_of_training_can_be_named():
 
 
 def test_every_variant_runs_with_every_seed_in_its_own_folder(scene):
-    plan = plan_blocks(given(scene, seeds=(0, 1)), "abcd", (4, 1, 2))
+    plan = BlocksStudy(**given(scene, seeds=(0, 1)), blocks=(4, 1, 2)).plan()
     assert [(job.seed, job.variant.name) for job in plan.jobs] == [
         (seed, f"blocks={count}") for seed in (0, 1) for count in (1, 2, 4)
     ]
@@ -107,7 +107,7 @@ def test_every_variant_runs_with_every_seed_in_its_own_folder(scene):
 
 @pytest.mark.parametrize(("position", "blocks"), [(0, 1), (1, 27)])
 def test_a_job_trains_with_what_is_changed_and_in_its_folder(scene, position, blocks, tmp_path):
-    job = plan_blocks(given(scene), "abcd", (1, 27)).jobs[position]
+    job = BlocksStudy(**given(scene), blocks=(1, 27)).plan().jobs[position]
     config = trainer_config(job, tmp_path)
     assert config.pipeline.blocks == blocks
     config.set_timestamp()
@@ -116,7 +116,7 @@ def test_a_job_trains_with_what_is_changed_and_in_its_folder(scene, position, bl
 
 
 def test_limits_go_to_every_method(scene):
-    plan = plan_gaussians(given(scene, blocks=4), ("abcd", "abcd-monolithic"), (500, 100))
+    plan = GaussiansStudy(**given(scene, blocks=4), max_gaussians=(500, 100)).plan()
     assert plan.methods == ("abcd-monolithic", "abcd")
     configs = [trainer_config(job, Path("out")).pipeline for job in plan.jobs]
     assert [(c.blocks, c.training.density.max_gaussians) for c in configs] == [
@@ -128,7 +128,7 @@ def test_limits_go_to_every_method(scene):
 
 
 def test_an_ablation_begins_with_the_method_as_it_is(scene):
-    plan = plan_options(given(scene), "abcd", ("training.warmup=0", "training.warmup=0.2"))
+    plan = OptionsStudy(**given(scene), vary=("training.warmup=0", "training.warmup=0.2")).plan()
     assert [variant.name for variant in plan.variants] == [
         "default",
         "training.warmup=0",
@@ -154,13 +154,13 @@ def test_an_ablation_begins_with_the_method_as_it_is(scene):
 )
 def test_conditions_out_of_range_are_refused(scene, more, message):
     with pytest.raises(UserError, match=message):
-        plan_blocks(given(scene, **more), "abcd", (1, 2))
+        BlocksStudy(**given(scene, **more), blocks=(1, 2)).plan()
 
 
 @pytest.mark.parametrize("blocks", [(), (0, 1), (2, 2), (3,)])
 def test_numbers_of_blocks_must_be_several_and_different(scene, blocks):
     with pytest.raises(UserError, match=r"--blocks.* give "):
-        plan_blocks(given(scene), "abcd", blocks)
+        BlocksStudy(**given(scene), blocks=blocks).plan()
 
 
 @pytest.mark.parametrize(
@@ -175,13 +175,13 @@ def test_numbers_of_blocks_must_be_several_and_different(scene, blocks):
 )
 def test_changes_that_cannot_be_trained_are_refused(scene, vary, message):
     with pytest.raises(UserError, match=message):
-        plan_options(given(scene), "abcd", vary)
+        OptionsStudy(**given(scene), vary=vary).plan()
 
 
 def test_a_scene_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "scene").mkdir()
     with pytest.raises(UserError):
-        plan_blocks(given(tmp_path / "scene"), "abcd", (1, 2))
+        BlocksStudy(**given(tmp_path / "scene"), blocks=(1, 2)).plan()
 
 
 def test_a_wrong_name_on_the_command_line_is_one_line_and_nothing_is_written(scene, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """What a study says of its runs: findings, table, chart; and runs that are reused or fail."""
 
-import dataclasses
 import xml.etree.ElementTree as ET
 from io import StringIO
 from pathlib import Path
@@ -10,15 +9,13 @@ from rich.console import Console
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs import runner
-from abcd_ns.lab.runs.runner import claim, run_jobs
+from abcd_ns.lab.runs.findings import find_difference, find_gap, find_knee
+from abcd_ns.lab.runs.job import Plan
+from abcd_ns.lab.runs.results import read_results, write_results
+from abcd_ns.lab.runs.tables import notes, rows, write_table
 from abcd_ns.lab.study.charts import draw_study
-from abcd_ns.lab.study.command import carry_out
-from abcd_ns.lab.study.findings import find_difference, find_gap, find_knee
-from abcd_ns.lab.study.plan import Conditions, StudyPlan, plan_blocks, plan_options
-from abcd_ns.lab.study.results import read_study, write_study
-from abcd_ns.lab.study.tables import notes, rows, write_table
+from abcd_ns.lab.study.command import BlocksStudy, OptionsStudy, carry_out
 from tests.lab.compare.fake_worker import FakeWorker
-from tests.lab.compare.records import MACHINE
 from tests.lab.study.records import (
     blocks_study,
     gaussians_study,
@@ -140,6 +137,10 @@ def test_the_written_table_begins_with_what_was_found(make, tmp_path):
 # Charts
 
 
+def name_of(study) -> str:
+    return study.kind.removeprefix("study of ")
+
+
 def texts_of(svg: Path) -> list[str]:
     nodes = ET.fromstring(svg.read_bytes()).iter("{http://www.w3.org/2000/svg}text")
     return ["".join(node.itertext()) for node in nodes]
@@ -152,7 +153,7 @@ def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         paths = draw_study(study, tmp_path / name)
-        assert [path.name for path in paths] == [f"{study.study}.png", f"{study.study}.svg"]
+        assert [path.name for path in paths] == [f"{name_of(study)}.png", f"{name_of(study)}.svg"]
         drawn.append(paths[1].read_bytes())
     assert drawn[0] == drawn[1]
     texts = texts_of(paths[1])
@@ -160,7 +161,7 @@ def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp
         "blocks": ["held-out PSNR (dB)", "blocks", "27", "Gaussians", "peak RAM (GiB)", "best - 0.5 dB"],
         "gaussians": ["held-out PSNR (dB)", "32k", "knee 16k"],
         "options": ["training.warmup=0", "change", "PSNR", "Gaussians"],
-    }[study.study]
+    }[name_of(study)]
     assert [text for text in wanted if text not in texts] == []
 
 
@@ -194,7 +195,7 @@ def test_a_single_run_has_a_chart_too(study, tmp_path):
 def worker(tmp_path, monkeypatch) -> FakeWorker:
     fake = FakeWorker(tmp_path / "worker")
     monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
-    monkeypatch.setattr("abcd_ns.lab.study.command.run_jobs", lambda p, c: run_jobs(p, c, fake.command))
+    monkeypatch.setattr(runner, "command_of", lambda job: fake.command)  # noqa: ARG005
     return fake
 
 
@@ -204,45 +205,45 @@ def scene(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def conditions(scene, tmp_path) -> Conditions:
-    return Conditions(scene, tmp_path / "out", steps=10)
+def conditions(scene, tmp_path) -> dict:
+    return {"data": scene, "out": tmp_path / "out", "steps": 10}
 
 
-def carried_out(plan: StudyPlan) -> tuple[int, str]:
+def carried_out(plan: Plan) -> tuple[int, str]:
     stream = StringIO()
     return carry_out(plan, Console(file=stream, width=100)), stream.getvalue()
 
 
 def test_a_study_writes_all_it_found(conditions, worker):
     worker.behave({"blocks=1": {"psnr_merged": 25.0}, "blocks=2": {"psnr_merged": 24.75}})
-    plan = plan_blocks(conditions, "abcd", (1, 2))
+    plan = BlocksStudy(**conditions, blocks=(1, 2)).plan()
     code, printed = carried_out(plan)
     assert code == 0
     assert worker.calls() == ["abcd blocks=1", "abcd blocks=2"]
-    results = read_study(plan.out / "results.json")
+    results = read_results(plan.out / "results.json")
     assert [(arm.value, arm.psnr) for arm in results.arms] == [(1, 25.0), (2, 24.75)]
     assert "Gap: 0.25 dB" in results.findings[0]
     assert results.findings[0] in printed
-    assert "--blocks 1 2" in results.protocol.command
+    assert "--blocks 1 2" in results.command
     for name in ("table.md", "blocks.png", "blocks.svg"):
         assert (plan.out / name).stat().st_size > 0
 
 
 def test_more_numbers_and_seeds_may_join_and_what_is_there_is_reused(conditions, worker):
-    carried_out(plan_blocks(conditions, "abcd", (1, 2)))
+    carried_out(BlocksStudy(**conditions, blocks=(1, 2)).plan())
     worker.calls()
-    more = dataclasses.replace(conditions, seeds=(0, 1))
-    _, printed = carried_out(plan_blocks(more, "abcd", (1, 2, 4)))
+    more = BlocksStudy(**conditions, seeds=(0, 1), blocks=(1, 2, 4))
+    _, printed = carried_out(more.plan())
     assert worker.calls() == ["abcd blocks=4", "abcd blocks=1", "abcd blocks=2", "abcd blocks=4"]
     assert printed.count("reused") == 2
 
 
 def test_a_failed_run_is_named_and_the_others_are_reported(conditions, worker):
     worker.behave({"training.batch=1": "raises"})
-    plan = plan_options(conditions, "abcd", ("training.batch=1", "training.warmup=0"))
+    plan = OptionsStudy(**conditions, vary=("training.batch=1", "training.warmup=0")).plan()
     code, _ = carried_out(plan)
     assert code == 1
-    results = read_study(plan.out / "results.json")
+    results = read_results(plan.out / "results.json")
     assert [arm.variant for arm in results.arms] == ["default", "training.warmup=0"]
     assert [failure.variant for failure in results.failures] == ["training.batch=1"]
     text = (plan.out / "table.md").read_text()
@@ -252,7 +253,7 @@ def test_a_failed_run_is_named_and_the_others_are_reported(conditions, worker):
 
 def test_where_the_default_failed_there_is_no_difference(conditions, worker):
     worker.behave(abcd="raises")
-    plan = plan_options(conditions, "abcd", ("training.batch=1",))
+    plan = OptionsStudy(**conditions, vary=("training.batch=1",)).plan()
     assert carried_out(plan)[0] == 1
     assert "the default's runs failed" in (plan.out / "table.md").read_text()
     assert not (plan.out / "options.png").exists()
@@ -263,36 +264,35 @@ def test_where_the_default_failed_there_is_no_difference(conditions, worker):
     [({"steps": 11}, "holds runs with steps 10, not 11"), ({"downscale": 2}, "downscale")],
 )
 def test_another_protocol_is_refused(conditions, worker, change, message):
-    plan = plan_blocks(conditions, "abcd", (1, 2))
-    claim(plan.out, plan, MACHINE, overwrite=False)
-    other = plan_blocks(dataclasses.replace(conditions, **change), "abcd", (1, 2))
+    carried_out(BlocksStudy(**conditions, blocks=(1, 2)).plan())
+    worker.calls()
     with pytest.raises(UserError, match=message):
-        claim(other.out, other, MACHINE, overwrite=False)
+        carried_out(BlocksStudy(**{**conditions, **change}, blocks=(1, 2)).plan())
     assert worker.calls() == []
 
 
+@pytest.mark.usefixtures("worker")
 def test_another_kind_of_study_is_refused(conditions):
-    plan = plan_blocks(conditions, "abcd", (1, 2))
-    claim(plan.out, plan, MACHINE, overwrite=False)
-    other = plan_options(conditions, "abcd", ("blocks=2",))
+    carried_out(BlocksStudy(**conditions, blocks=(1, 2)).plan())
+    other = OptionsStudy(**conditions, vary=("blocks=2",)).plan()
     with pytest.raises(UserError, match="holds no study of options"):
-        claim(other.out, other, MACHINE, overwrite=True)
+        carry_out(other, Console(file=StringIO()), overwrite=True)
 
 
 @pytest.mark.parametrize("make", STUDIES)
 def test_results_come_back_as_they_were_written(make, tmp_path):
     study = make((0, 1))
-    write_study(tmp_path / "results.json", study)
-    assert read_study(tmp_path / "results.json") == study
+    write_results(tmp_path / "results.json", study)
+    assert read_results(tmp_path / "results.json") == study
 
 
 @pytest.mark.cli
 def test_a_study_that_really_trains(scene, tmp_path):
     """Two numbers of blocks, under a limit below the scene's 300 points."""
-    conditions = Conditions(scene, tmp_path / "out", steps=12, evals=2, max_gaussians=150)
-    code, printed = carried_out(plan_blocks(conditions, "abcd", (1, 3)))
+    given = {"data": scene, "out": tmp_path / "out", "steps": 12, "evals": 2, "max_gaussians": 150}
+    code, printed = carried_out(BlocksStudy(**given, blocks=(1, 3)).plan())
     assert code == 0, printed
-    results = read_study(tmp_path / "out" / "results.json")
+    results = read_results(tmp_path / "out" / "results.json")
     for arm, blocks in zip(results.arms, (1, 3), strict=True):
         (run,) = arm.runs
         assert (run.blocks, run.steps, run.gaussians) == (blocks, 12, 150)

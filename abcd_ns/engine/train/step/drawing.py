@@ -14,7 +14,7 @@ from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.space.influence import share_shown
 from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.schedule import (
     endless_order,
@@ -41,7 +41,7 @@ class StepDrawing:
     """
 
     def __init__(
-        self, run: Run, source: LayerSource, target: Callable[[Sample], Target] | None = None
+        self, run: TrainingRun, source: LayerSource, target: Callable[[Sample], Target] | None = None
     ) -> None:
         self._run, self._source, self._target = run, source, target
         self._backgrounds = Backgrounds(run.config, run.device)

@@ -11,7 +11,7 @@ from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import at_rest, count_at_rest
 from abcd_ns.engine.train.density.control import DensityClock, Infos, added
 from abcd_ns.engine.train.memory import check_room
-from abcd_ns.engine.train.run import Run
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.splitting import is_full
 from abcd_ns.engine.train.step.workers.share import Part
@@ -20,7 +20,7 @@ from abcd_ns.engine.train.step.workers.share import Part
 class LiveBlock:
     """What is live in a run's parameters, with what density control has gathered of it."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: TrainingRun) -> None:
         self._run = run
         self.growth: dict[str, Tensor] = {}
         self.clocks = Clocks()

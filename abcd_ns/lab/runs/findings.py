@@ -1,15 +1,18 @@
-"""What a study says: the gap between best and worst, the knee of a curve, differences to the default."""
+"""What an experiment says: the gap of best and worst, the knee of a curve, differences to the default."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
-from abcd_ns.lab.study.results import Arm, StudyResults
+from abcd_ns.lab.runs.results import Arm, Outcome, Results
 
 GOAL_DB = 0.5
 """Between the best and the worst number of blocks, no more than this: no cliff."""
 KNEE_DB = 0.2
 """How far below the best a smaller budget of Gaussians may be and still count as enough."""
+
+GOAL_GROWTH = 0.05
+"""Growth of peak memory that is allowed from the smallest scene to the largest."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,12 @@ def find_knee(arms: Sequence[Arm]) -> Arm | None:
     return min((arm for arm in arms if best - arm.psnr <= KNEE_DB), key=lambda arm: arm.value)
 
 
+def find_growth(results: Results, name: str) -> float | None:
+    """A field of ABCD's runs, largest scene by smallest, less 1; None where fewer than two are known."""
+    sizes = [getattr(arm.runs[0], name) for arm in results.of("abcd")]
+    return sizes[-1] / sizes[0] - 1 if len(sizes) > 1 and sizes[0] and sizes[-1] else None
+
+
 def find_difference(arm: Arm, default: Arm) -> Difference | None:
     """The arm against the default; None where no seed has both."""
     theirs = {run.seed: run.psnr_merged for run in default.runs}
@@ -64,17 +73,24 @@ def find_difference(arm: Arm, default: Arm) -> Difference | None:
     return Difference(tuple(pairs)) if pairs else None
 
 
-def find_default(results: StudyResults) -> Arm | None:
+def find_default(results: Results) -> Arm | None:
     """The arm of the method as it is; None where its runs failed."""
     return next((arm for arm in results.arms if arm.variant == "default"), None)
 
 
-def findings_of(results: StudyResults) -> tuple[str, ...]:
-    """What the study says, a sentence each."""
-    return {"blocks": _of_blocks, "gaussians": _of_gaussians, "options": _of_options}[results.study](results)
+def findings_of(results: Results) -> tuple[str, ...]:
+    """What the experiment says, a sentence each."""
+    find = {
+        "study of blocks": _of_blocks,
+        "study of gaussians": _of_gaussians,
+        "study of options": _of_options,
+        "study of scale": _of_scale,
+        "stability report": _of_outcomes,
+    }.get(results.kind)
+    return find(results) if find else ()
 
 
-def _of_blocks(results: StudyResults) -> tuple[str, ...]:
+def _of_blocks(results: Results) -> tuple[str, ...]:
     gap = find_gap(results.arms)
     if gap is None:
         return ()
@@ -85,7 +101,7 @@ def _of_blocks(results: StudyResults) -> tuple[str, ...]:
     )
 
 
-def _of_gaussians(results: StudyResults) -> tuple[str, ...]:
+def _of_gaussians(results: Results) -> tuple[str, ...]:
     found = []
     for method in results.methods:
         arms = results.of(method)
@@ -105,7 +121,7 @@ def _of_gaussians(results: StudyResults) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _of_options(results: StudyResults) -> tuple[str, ...]:
+def _of_options(results: Results) -> tuple[str, ...]:
     default = find_default(results)
     if default is None:
         return ("There is nothing to compare with: the default's runs failed.",)
@@ -122,6 +138,32 @@ def _of_options(results: StudyResults) -> tuple[str, ...]:
     if len(default.runs) < 2:
         text += " One seed: differences of a few tenths of a dB may be chance."
     return (text,)
+
+
+def _of_scale(results: Results) -> tuple[str, ...]:
+    arms, ram = results.of("abcd"), find_growth(results, "peak_rss_bytes")
+    if ram is None:
+        return ()
+    device = find_growth(results, "peak_device_bytes")
+    more = "" if device is None else f", GPU memory by {device:.1%}"
+    return (
+        f"From {arms[0].value} to {arms[-1].value} blocks of ABCD, peak RAM grows by {ram:.1%}{more}; "
+        f"allowed: {GOAL_GROWTH:.0%}.",
+    )
+
+
+def _of_outcomes(results: Results) -> tuple[str, ...]:
+    return (headline(results.outcomes),) if results.outcomes else ()
+
+
+def headline(outcomes: Sequence[Outcome]) -> str:
+    """One sentence about all of them."""
+    passed = sum(outcome.passed for outcome in outcomes)
+    failed = [outcome.id for outcome in outcomes if not outcome.passed]
+    worse = [outcome.id for outcome in outcomes if outcome.worse]
+    text = f"{passed} of {len(outcomes)} scenarios pass"
+    text += f"; these fail: {', '.join(failed)}" if failed else ""
+    return text + (f"; one block does better, by however little, in {', '.join(worse)}." if worse else ".")
 
 
 def _blocks(arm: Arm) -> str:

@@ -1,0 +1,149 @@
+"""results.json: everything that an experiment found, with what is needed to do it again."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+from abcd_ns.lab.runs.job import Settings
+from abcd_ns.lab.runs.records import encode, read_record, write_json
+from abcd_ns.lab.runs.run import Failure, Run
+from abcd_ns.nerfstudio.machine import Machine, Versions
+
+SCHEMA = 2
+"""Raised whenever a field changes its name or meaning."""
+RESULTS_FILE = "results.json"
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One method with one thing set, and its runs."""
+
+    method: str
+    variant: str
+    """What is set: `blocks=4`, or "default"."""
+    value: int | None
+    """What it is set to, where that is a whole number."""
+    runs: tuple[Run, ...]
+    """One for each seed that did not fail."""
+
+    @property
+    def psnr(self) -> float:
+        """Held out, merged, dB; mean over the seeds."""
+        return fmean(run.psnr_merged for run in self.runs)
+
+    @property
+    def gaussians(self) -> float:
+        """At the end, mean over the seeds."""
+        return fmean(run.gaussians for run in self.runs)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A method that was asked for and cannot run here."""
+
+    method: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One way in which methods fail, and what came of it here."""
+
+    id: str
+    fails: str
+    """What happens elsewhere."""
+    done: str
+    """What is done here to make it happen."""
+    rule: str
+    """What passes."""
+    passed: bool
+    worse: bool
+    """Whether ABCD did worse than one block, whatever the rule says."""
+    said: dict[str, str]
+    """By method, what it did, in a few words."""
+    numbers: dict[str, float]
+    """What the rule was applied to, by name."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """One method's values."""
+
+    name: str
+    """The method, and after a comma how it differs."""
+    x: tuple[float, ...]
+    psnr: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Held-out PSNR against one thing."""
+
+    name: str
+    title: str
+    x_label: str
+    lines: tuple[Line, ...]
+    note: str = ""
+    level: float | None = None
+    """One block, where it does not depend on x; dB."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """The whole of results.json."""
+
+    schema: int
+    kind: str
+    """Of the experiment: "comparison", "study of blocks"."""
+    date: str
+    """ISO 8601, UTC."""
+    command: str
+    """The command line that makes the same, without where its folders are."""
+    machine: Machine
+    versions: Versions
+    settings: Settings | None = None
+    """What all runs share, `data` being the name of the scene alone; None where nothing is held out."""
+    seeds: tuple[int, ...] = ()
+    arms: tuple[Arm, ...] = ()
+    """Those with a run."""
+    outcomes: tuple[Outcome, ...] = ()
+    curves: tuple[Curve, ...] = ()
+    failures: tuple[Failure, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+    findings: tuple[str, ...] = ()
+    """What the experiment says, a sentence each."""
+    notes: tuple[str, ...] = ()
+    """What a reader of the table has to know."""
+
+    def of(self, method: str) -> tuple[Arm, ...]:
+        """The method's arms, in their order."""
+        return tuple(arm for arm in self.arms if arm.method == method)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Those with a run."""
+        return tuple(dict.fromkeys(arm.method for arm in self.arms))
+
+    @property
+    def runs(self) -> tuple[Run, ...]:
+        """Of all arms."""
+        return tuple(run for arm in self.arms for run in arm.runs)
+
+
+def write_results(path: Path, results: Results) -> None:
+    """Write results.json.
+
+    Raises:
+        ValueError: a number is NaN or infinite.
+    """
+    write_json(path, encode(results))
+
+
+def read_results(path: Path) -> Results:
+    """Read results.json back.
+
+    Raises:
+        RecordError: it is absent, of another schema, or does not fit the schema.
+    """
+    return read_record(path, Results, SCHEMA)
