@@ -125,7 +125,8 @@ def make_coordinator(
 
 
 def training_config(**options) -> TrainingConfig:
-    """Options of TrainingConfig, and of its recipe and limits, each by its own name."""
+    """Options of TrainingConfig, and of its recipe and limits, each by its own name; visits are short."""
+    options = {"first_passes": 4, **options}
     parts = {}
     for name, kind in (("recipe", Recipe), ("limits", Limits)):
         fields = {field.name for field in dataclasses.fields(kind)} & set(options)
