@@ -62,7 +62,7 @@ def test_version(capsys):
 
 def test_help_is_quick_because_it_imports_nothing_heavy():
     code = (
-        "import sys; from abcd_ns.cli import cli; cli.main(['--help']);"
+        "import sys; from abcd_ns.cli import main; main.main(['--help']);"
         "print(sorted({'torch', 'tyro', 'numpy', 'nerfstudio', 'rich'} & set(sys.modules)))"
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

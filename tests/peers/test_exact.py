@@ -89,7 +89,7 @@ def test_several_steps_are_those_of_a_plain_loop_over_everything(tmp_path, views
         batch = blocks.next_batch()
         (sample,) = batch.samples
         adam["means"].param_groups[0]["lr"] = rates["means"] * blocks.config.means_lr_decay ** (step / 12)
-        raster = blocks._rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.sh_degree)
+        raster = blocks.run.rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.sh_degree)
         picture = composite(raster.layer, sample.background).clamp(0, 1)
         for optimizer in adam.values():
             optimizer.zero_grad()

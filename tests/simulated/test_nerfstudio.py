@@ -113,13 +113,13 @@ def test_the_other_methods_train(data, tmp_path, method):
     assert trainer.pipeline.coordinator.state.step == 4
 
 
-def test_photos_are_copied_once_while_there_is_room_and_else_as_bytes(trained, counts):
+def test_photos_are_copied_once_while_there_is_room_and_else_as_bytes(trained, counts, monkeypatch):
     manager = trained.pipeline.datamanager
     crop, rows = Crop(3, 2, 10, 8), range(len(manager.train_dataset))
     whole = manager.train_dataset.photos.image(0)
     expected = [manager.train_dataset.photos.image(row)[crop.slices].float() / 255 for row in rows]
-    manager._on_device.clear()  # there was room for all in training
-    manager.device_photo_bytes = whole.nbytes  # now for one
+    monkeypatch.setattr(manager, "_on_device", {})  # there was room for all in training
+    monkeypatch.setattr(manager, "device_photo_bytes", whole.nbytes)  # now for one
     for copies, size in (
         (len(rows), whole.nbytes + (len(rows) - 1) * 240),
         (len(rows) - 1, 240 * (len(rows) - 1)),

@@ -1,4 +1,4 @@
-"""The plainest caller of a coordinator: for tests, benchmarks, and anyone without nerfstudio."""
+"""The plainest caller of a trainer: for tests, benchmarks, and anyone without nerfstudio."""
 
 from collections.abc import Callable
 
@@ -6,14 +6,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.render.loss import psnrs
-from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop
 
 PhotoReader = Callable[[int, Crop], Float[Tensor, "h w 3"]]
 """Gives the pixels of a crop of a view's photo, 0..1, by the view's index."""
 
 
-def train(coordinator: Coordinator, photo: PhotoReader, steps: int | None = None) -> None:
+def train(coordinator: Trainer, photo: PhotoReader, steps: int | None = None) -> None:
     """Take `steps` optimisation steps, or go on until the coordinator's budget is used up."""
     taken = 0
     while not coordinator.finished and (steps is None or taken < steps):
@@ -21,7 +21,7 @@ def train(coordinator: Coordinator, photo: PhotoReader, steps: int | None = None
         taken += 1
 
 
-def train_step(coordinator: Coordinator, photo: PhotoReader) -> None:
+def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
     """Render a batch, take its loss' gradient, step every optimizer, report back."""
     batch = coordinator.next_batch()
     read = (photo(sample.view.index, sample.crop) for sample in batch.samples)

@@ -121,11 +121,13 @@ def test_with_no_seconds_to_wait_all_is_durable_at_once(scene):
 
 
 def test_the_thread_ends_when_all_is_written(scene):
-    scene.rest(scene.tree, {}, {"step": 1}, within=0.0)
+    scene.rest(scene.tree, {}, {"step": 1}, within=PATIENCE)
+    assert scene._writer._thread.is_alive()
+    scene.flush()
     deadline = time.monotonic() + PATIENCE
-    while any(thread.name == "store" for thread in threading.enumerate()) and time.monotonic() < deadline:
+    while scene._writer._thread is not None and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert all(thread.name != "store" for thread in threading.enumerate())
+    assert scene._writer._thread is None
 
 
 # Errors

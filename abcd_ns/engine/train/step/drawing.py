@@ -46,7 +46,7 @@ class StepDrawing:
         self._run, self._source, self._target = run, source, target
         self._backgrounds = Backgrounds(run.config, run.device)
         self._order: tuple[int, ...] = ()
-        self._crew: Crew | None = None
+        self.crew: Crew | None = None
         self.layers: VisitLayers | None = None
 
     # -- a visit -------------------------------------------------------------------------------------
@@ -70,14 +70,14 @@ class StepDrawing:
     def begin_visit(self, active: ActiveVisit) -> None:
         """Gather helpers and draw layers; the block is live."""
         self._order = self._order_of(active)
-        self._crew = self._gather_crew(active)
+        self.crew = self._gather_crew(active)
         self.layers = self._source.draw(active, self._left_to_draw(active, self._order))
 
     def end_visit(self) -> None:
         """Let go of helpers and layers."""
-        if self._crew is not None:
-            self._crew.dismiss()
-        self.layers, self._crew = None, None
+        if self.crew is not None:
+            self.crew.dismiss()
+        self.layers, self.crew = None, None
 
     def shown_in(self, views: Sequence[int]) -> dict[int, float]:
         """The influence that the block has on each of these views by now."""
@@ -115,9 +115,9 @@ class StepDrawing:
     def next_batch(self) -> Batch:
         """What to draw next; helpers begin at once."""
         active, step = self._run.active, self._run.state.step
-        if self._crew is not None:
+        if self.crew is not None:
             task = Task(active.done, step, self._degree)
-            self._crew.begin(live_gaussians(self._run.params), task)
+            self.crew.begin(live_gaussians(self._run.params), task)
         views = enumerate(self._views_of_step(active, self._order, active.done))
         return Batch(step, tuple(self._sample(view, place, step) for place, view in views))
 
@@ -139,11 +139,11 @@ class StepDrawing:
         strategy asks for. With helpers, all of them included."""
         run = self._run
         losses = batch.losses(pictures, photos, run.config)
-        members = 1 if self._crew is None else run.active.crew
+        members = 1 if self.crew is None else run.active.crew
         photometric = sum(losses[1:], start=losses[0]) / (len(losses) * members)
         known = [(s.view.index, loss.detach()) for s, loss in zip(batch.samples, losses, strict=True)]
-        if self._crew is not None:
-            photometric, drawn = photometric + self._crew.loss(), self._crew.drawn()
+        if self.crew is not None:
+            photometric, drawn = photometric + self.crew.loss(), self.crew.drawn()
             run.health.see(torch.tensor(max(part.shown for part in drawn), device=run.device))
             known += [(v, torch.tensor(loss, device=run.device)) for part in drawn for v, loss in part.losses]
         run.health.note(known)
@@ -153,7 +153,7 @@ class StepDrawing:
 
     def parts(self) -> list[Part]:
         """What helpers add to the step."""
-        return [] if self._crew is None else self._crew.parts()
+        return [] if self.crew is None else self.crew.parts()
 
     @property
     def _degree(self) -> int:
