@@ -25,7 +25,7 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.style import in_style, save
+from abcd_ns.lab.results.style import in_style, save
 from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
 
 BIN = Path(sys.executable).parent

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.pictures import draw_comparison, read_picture
-from abcd_ns.lab.runs.job import evenly
+from abcd_ns.lab.job import evenly
 from abcd_ns.lab.runs.runner import take_folder
 
 SCENE = {"courts": 2, "views_per_court": 20, "width": 192, "height": 144, "points_per_court": 3000}

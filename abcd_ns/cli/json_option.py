@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.records import encode, write_json
+from abcd_ns.lab.results.records import encode, write_json
 
 
 def check_json(path: Path | None) -> None:

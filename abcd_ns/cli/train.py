@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.records import read_toml
+from abcd_ns.lab.results.records import read_toml
 
 USAGE = """usage: abcd train FILE.toml [OPTIONS]
 

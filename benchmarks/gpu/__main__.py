@@ -26,7 +26,7 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.records import encode, read_json, write_json
+from abcd_ns.lab.results.records import encode, read_json, write_json
 from abcd_ns.lab.runs.runner import last_line
 from benchmarks.gpu.charts import draw, show
 from benchmarks.gpu.parts import NEED_DATA, PARTS, ROOT, Task

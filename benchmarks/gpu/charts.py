@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from abcd_ns.lab.runs.records import decode
-from abcd_ns.lab.runs.results import Results
-from abcd_ns.lab.runs.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
-from abcd_ns.lab.runs.tables import GIB, NOTHING, notes, print_rows, rows
+from abcd_ns.lab.results.records import decode
+from abcd_ns.lab.results.results import Results
+from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
+from abcd_ns.lab.results.tables import GIB, NOTHING, notes, print_rows, rows
 from abcd_ns.lab.scale.charts import draw_scale
 
 Record = dict[str, Any]

@@ -22,10 +22,10 @@ from rich.console import Console
 from abcd_ns.cli.doctor.hardware import look_at_hardware
 from abcd_ns.engine.render import make_rasterizer, self_check
 from abcd_ns.lab.compare.command import Options, impossible, make_plan
+from abcd_ns.lab.job import Change, Job, Variant
+from abcd_ns.lab.results.records import decode, encode, read_json, write_json
+from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.runs.job import Change, Job, Variant
-from abcd_ns.lab.runs.records import decode, encode, read_json, write_json
-from abcd_ns.lab.runs.run import Run
 from abcd_ns.lab.runs.runner import claim, finish_job
 from abcd_ns.lab.scale import command as scale
 from abcd_ns.lab.scale.worker import LandSettings

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.records import encode, read_json, write_json
+from abcd_ns.lab.results.records import encode, read_json, write_json
 from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part
 from benchmarks.gpu.charts import draw
 from benchmarks.gpu.parts import count_tests

@@ -7,11 +7,11 @@ import torch
 
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.findings import find_growth
-from abcd_ns.lab.runs.records import decode, encode, read_json
-from abcd_ns.lab.runs.results import Arm, Results, read_results
-from abcd_ns.lab.runs.run import Failure, Footing, Run
-from abcd_ns.lab.runs.tables import notes, rows, write_table
+from abcd_ns.lab.results.findings import find_growth
+from abcd_ns.lab.results.records import decode, encode, read_json
+from abcd_ns.lab.results.results import Arm, Results, read_results
+from abcd_ns.lab.results.run import Failure, Footing, Run
+from abcd_ns.lab.results.tables import notes, rows, write_table
 from abcd_ns.lab.scale.charts import draw_scale
 from abcd_ns.lab.scale.command import make_plan, scale
 from abcd_ns.lab.scale.land import Land, color_of

@@ -10,8 +10,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
 from abcd_ns.cli.report.story import Story, Visit
-from abcd_ns.lab.runs.style import COLORS, in_style, label_ends, lay_grid
-from abcd_ns.lab.runs.tables import GIB
+from abcd_ns.lab.results.style import COLORS, in_style, label_ends, lay_grid
+from abcd_ns.lab.results.tables import GIB
 
 WIDTH, HEIGHT = 4.9, 2.7
 """Inches. Narrow, so that letters can still be read where a page is as wide as a phone."""

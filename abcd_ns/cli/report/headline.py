@@ -6,7 +6,7 @@ from datetime import timedelta
 from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder
 from abcd_ns.cli.report.story import Story
-from abcd_ns.lab.runs.tables import GIB, NOTHING
+from abcd_ns.lab.results.tables import GIB, NOTHING
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor
 
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray, error_map
+from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap, score, squared_gap
-from abcd_ns.lab.runs.run import ViewScore
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 
 PAGE_PIXELS = 6_000_000

@@ -25,7 +25,7 @@ from abcd_ns.cli.report.run_folder import RunFolder
 from abcd_ns.cli.report.story import Story
 from abcd_ns.cli.report.svg import inline_svg, theme_css
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN
-from abcd_ns.lab.runs.tables import NOTHING, about_machine
+from abcd_ns.lab.results.tables import NOTHING, about_machine
 from abcd_ns.nerfstudio.machine import Versions, without_home
 
 GENERATOR = "abcd report"

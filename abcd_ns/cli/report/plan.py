@@ -16,7 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.lab.runs.style import in_style
+from abcd_ns.lab.results.style import in_style
 
 WIDTH, EDGE, FOOT, LOWEST, LARGEST = 4.9, 0.5, 1.0, 1.2, 5.0
 """Inches: width of the figure, its scales beside and below, the drawing's height at least and at most."""

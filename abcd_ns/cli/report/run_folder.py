@@ -16,9 +16,9 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.parameter_store import StoreError
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
+from abcd_ns.lab.results.records import read_record
 from abcd_ns.lab.runs.configs import registered
 from abcd_ns.lab.runs.options import set_options
-from abcd_ns.lab.runs.records import read_record
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STORE

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from abcd_ns.lab.runs.records import RecordError, decode
+from abcd_ns.lab.results.records import RecordError, decode
 from abcd_ns.nerfstudio.run.log_lines import (
     KINDS,
     SCHEMA,

@@ -8,7 +8,7 @@ from io import StringIO
 import matplotlib
 from matplotlib.figure import Figure
 
-from abcd_ns.lab.runs.style import STYLE
+from abcd_ns.lab.results.style import STYLE
 
 DARK = {
     "#000000": "#e4e7eb",

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from abcd_ns.lab.runs.results import Results
-from abcd_ns.lab.runs.run import CurvePoint, Run
-from abcd_ns.lab.runs.style import COLORS, MARKERS, in_style, label_ends, lay_grid, plot, save
+from abcd_ns.lab.results.results import Results
+from abcd_ns.lab.results.run import CurvePoint, Run
+from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, label_ends, lay_grid, plot, save
 
 Along = Callable[[CurvePoint], float]
 """What lies along the axis of x."""

@@ -13,12 +13,12 @@ from rich.console import Console
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy
 from abcd_ns.lab.compare.pictures import draw_pictures
+from abcd_ns.lab.job import METHODS, Job, Method, Plan
+from abcd_ns.lab.results.records import decode, read_toml
+from abcd_ns.lab.results.results import LeftOut, Results
+from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, make_settings, words
-from abcd_ns.lab.runs.job import METHODS, Job, Method, Plan
-from abcd_ns.lab.runs.records import decode, read_toml
-from abcd_ns.lab.runs.results import LeftOut, Results
-from abcd_ns.lab.runs.run import Failure, Run
 
 PICTURES = "pictures"
 

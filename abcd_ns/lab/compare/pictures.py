@@ -12,8 +12,8 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from PIL import Image
 
-from abcd_ns.lab.runs.run import Run
-from abcd_ns.lab.runs.style import STYLE
+from abcd_ns.lab.results.run import Run
+from abcd_ns.lab.results.style import STYLE
 
 ERROR_GAIN = 4
 """By how much errors are amplified; 1 / ERROR_GAIN is the largest that can be told from larger ones."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.job import Settings
+from abcd_ns.lab.job import Settings
 
 LOWEST = {"downscale": 1, "blocks": 1, "steps": 1, "evals": 1, "max_gaussians": 0, "pictures": 0}
 """The least that a number may be, by option; 1 for those that are not here."""

@@ -13,7 +13,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from abcd_ns import methods
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.job import HELD_OUT_EVERY, Job
+from abcd_ns.lab.job import HELD_OUT_EVERY, Job
 from abcd_ns.lab.runs.options import change_options
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.options import mirror

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.types import Layer
-from abcd_ns.lab.runs.run import ViewScore
+from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.nerfstudio.metrics import image_metrics
 from abcd_ns.nerfstudio.model import AbcdModel
 

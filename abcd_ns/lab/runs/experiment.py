@@ -7,12 +7,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from abcd_ns.lab.runs.findings import findings_of
-from abcd_ns.lab.runs.job import Job, Plan, Settings
-from abcd_ns.lab.runs.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Results, write_results
-from abcd_ns.lab.runs.run import Failure, Run
+from abcd_ns.lab.job import Job, Plan, Settings
+from abcd_ns.lab.results.findings import findings_of
+from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Results, write_results
+from abcd_ns.lab.results.run import Failure, Run
+from abcd_ns.lab.results.tables import TABLE_FILE, print_table, write_table
 from abcd_ns.lab.runs.runner import claim, finish_job
-from abcd_ns.lab.runs.tables import TABLE_FILE, print_table, write_table
 from abcd_ns.nerfstudio.machine import Machine, describe_machine, describe_versions
 
 Found = Sequence[tuple[Job, Run | Failure]]

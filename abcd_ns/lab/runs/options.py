@@ -12,7 +12,7 @@ from typing import Any, Literal, Union
 import msgspec
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.job import Change, Variant
+from abcd_ns.lab.job import Change, Variant
 
 PREFIX = "pipeline."
 """May stand before a name, as in `ns-train`'s options."""

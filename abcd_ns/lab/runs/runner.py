@@ -13,9 +13,9 @@ from typing import Any
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.job import Job
-from abcd_ns.lab.runs.records import RecordError, decode, encode, read_json, write_json
-from abcd_ns.lab.runs.run import Failure, Run
+from abcd_ns.lab.job import Job
+from abcd_ns.lab.results.records import RecordError, decode, encode, read_json, write_json
+from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.runs.work import RUN_FILE
 
 JOB_FILE, LOG_FILE = "job.json", "log.txt"

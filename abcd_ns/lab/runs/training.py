@@ -8,9 +8,9 @@ from nerfstudio.engine.trainer import Trainer
 
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitEnded
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
+from abcd_ns.lab.job import Settings
+from abcd_ns.lab.results.run import CurvePoint
 from abcd_ns.lab.runs.evaluate import mean_psnr
-from abcd_ns.lab.runs.job import Settings
-from abcd_ns.lab.runs.run import CurvePoint
 
 
 class CurveRecorder:

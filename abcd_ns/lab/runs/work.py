@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.job import Job
-from abcd_ns.lab.runs.records import decode, encode, read_json, write_json
-from abcd_ns.lab.runs.run import Run
+from abcd_ns.lab.job import Job
+from abcd_ns.lab.results.records import decode, encode, read_json, write_json
+from abcd_ns.lab.results.run import Run
 from abcd_ns.nerfstudio.machine import peak_device_bytes, peak_rss_bytes
 
 RUN_FILE = "run.json"

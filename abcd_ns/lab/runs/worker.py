@@ -15,6 +15,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from abcd_ns.lab.job import Job, evenly
+from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.evaluate import (
     draw_held_out,
@@ -23,8 +25,6 @@ from abcd_ns.lab.runs.evaluate import (
     score,
     squared_gap,
 )
-from abcd_ns.lab.runs.job import Job, evenly
-from abcd_ns.lab.runs.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.training import Training
 from abcd_ns.lab.runs.work import memory_of_run, work
 from abcd_ns.nerfstudio.machine import (

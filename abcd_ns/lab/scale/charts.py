@@ -5,9 +5,9 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from abcd_ns.lab.runs.results import Results
-from abcd_ns.lab.runs.style import COLORS, in_style, lay_grid, plot, save, short, tick_at, write_beside
-from abcd_ns.lab.runs.tables import MIB
+from abcd_ns.lab.results.results import Results
+from abcd_ns.lab.results.style import COLORS, in_style, lay_grid, plot, save, short, tick_at, write_beside
+from abcd_ns.lab.results.tables import MIB
 
 NAMES = {"abcd": "ABCD", "abcd-monolithic": "one block"}
 

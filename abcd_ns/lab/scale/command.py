@@ -10,11 +10,11 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.lab.job import Change, Plan, Variant
+from abcd_ns.lab.results.results import LeftOut
+from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, check_ranges
-from abcd_ns.lab.runs.job import Change, Plan, Variant
-from abcd_ns.lab.runs.results import LeftOut
-from abcd_ns.lab.runs.run import Failure, Run
 from abcd_ns.lab.scale.charts import draw_scale
 from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings
 

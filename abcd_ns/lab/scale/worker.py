@@ -24,8 +24,8 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.lab.runs.job import Job
-from abcd_ns.lab.runs.run import Footing, Run
+from abcd_ns.lab.job import Job
+from abcd_ns.lab.results.run import Footing, Run
 from abcd_ns.lab.runs.work import memory_of_run, work
 from abcd_ns.lab.scale.land import Land
 from abcd_ns.nerfstudio.machine import describe_versions, disk_bytes, peak_rss_bytes

@@ -6,8 +6,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from abcd_ns.lab.runs.results import Curve, Line, Results
-from abcd_ns.lab.runs.style import COLORS, in_style, lay_grid, plot, save, tick_at
+from abcd_ns.lab.results.results import Curve, Line, Results
+from abcd_ns.lab.results.style import COLORS, in_style, lay_grid, plot, save, tick_at
 
 LOGARITHMIC = {"blocks", "visit-steps", "staleness", "views"}
 """Curves whose x doubles from point to point."""

@@ -16,17 +16,26 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.progress import TimeRemainingColumn as TimeLeft
 
 from abcd_ns.errors import UserError
+from abcd_ns.lab.results.findings import findings_of, headline
+from abcd_ns.lab.results.results import Curve, Outcome
 from abcd_ns.lab.runs.checks import Flag, check_ranges, words
 from abcd_ns.lab.runs.experiment import new_results, print_paths, write_report
-from abcd_ns.lab.runs.findings import findings_of, headline
-from abcd_ns.lab.runs.results import Curve, Outcome
 from abcd_ns.lab.runs.runner import claim
-from abcd_ns.lab.stability import borders, cameras, captures, emptiness, freshness, growth, sizes, values
 from abcd_ns.lab.stability.charts import draw_curves
 from abcd_ns.lab.stability.curves import Study, studies
 from abcd_ns.lab.stability.lab import Lab
 from abcd_ns.lab.stability.outcome import Scenario
-from abcd_ns.lab.stability.real import read_stage, real_scenarios
+from abcd_ns.lab.stability.scenarios import (
+    borders,
+    cameras,
+    captures,
+    emptiness,
+    freshness,
+    growth,
+    sizes,
+    values,
+)
+from abcd_ns.lab.stability.scenarios.real import read_stage, real_scenarios
 from abcd_ns.nerfstudio.machine import describe_machine
 
 KIND = "stability report"

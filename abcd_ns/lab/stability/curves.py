@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.lab.runs.results import Curve, Line
-from abcd_ns.lab.stability.captures import PAIR, table, with_gains, with_noisy_poses
-from abcd_ns.lab.stability.freshness import BLOCKS, train_stale
+from abcd_ns.lab.results.results import Curve, Line
 from abcd_ns.lab.stability.lab import Lab, Method, Stage
+from abcd_ns.lab.stability.scenarios.captures import PAIR, table, with_gains, with_noisy_poses
+from abcd_ns.lab.stability.scenarios.freshness import BLOCKS, train_stale
 
 VIEWS = (3, 8, 16)
 VISIT_STEPS = (1, 4, 16, 64)

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from abcd_ns.lab.runs.findings import (
+from abcd_ns.lab.results.findings import (
     GOAL_DB,
     KNEE_DB,
     find_default,
@@ -18,9 +18,9 @@ from abcd_ns.lab.runs.findings import (
     find_gap,
     find_knee,
 )
-from abcd_ns.lab.runs.results import Arm, Results
-from abcd_ns.lab.runs.run import Run
-from abcd_ns.lab.runs.style import (
+from abcd_ns.lab.results.results import Arm, Results
+from abcd_ns.lab.results.run import Run
+from abcd_ns.lab.results.style import (
     COLORS,
     in_style,
     label_ends,

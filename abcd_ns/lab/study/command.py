@@ -10,9 +10,9 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.lab.job import AS_IT_IS, METHODS, Change, Job, Plan, Variant
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, check_numbers, make_settings, words
-from abcd_ns.lab.runs.job import AS_IT_IS, METHODS, Change, Job, Plan, Variant
 from abcd_ns.lab.study.charts import draw_study
 
 AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic", "abcd-partition", "abcd-exact", "abcd-paper"]

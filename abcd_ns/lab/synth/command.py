@@ -12,7 +12,7 @@ from PIL import Image
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.records import read_json, write_json
+from abcd_ns.lab.results.records import read_json, write_json
 from abcd_ns.lab.runs.runner import take_folder
 from abcd_ns.lab.synth.cameras import Camera, Lens, court_cameras
 from abcd_ns.lab.synth.colmap_writer import write_model

@@ -11,7 +11,7 @@ from abcd_ns.cli.report.held_out import HeldOut, Shown
 from abcd_ns.cli.report.run_folder import Checkpoint, RunFolder, default_config
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.lab.runs.run import ViewScore
+from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.nerfstudio.run.log_lines import KINDS
 from abcd_ns.nerfstudio.run.settings import SCHEMA, Settings, flat_options
 from tests.lab.compare.records import MACHINE, VERSIONS

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from abcd_ns.cli.report.story import Story, read_story
-from abcd_ns.lab.runs.records import RecordError
+from abcd_ns.lab.results.records import RecordError
 from tests.cli.report.runs import TRAINING, line, log_lines, write_log
 
 

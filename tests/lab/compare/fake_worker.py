@@ -4,7 +4,7 @@ import json
 import sys
 from pathlib import Path
 
-from abcd_ns.lab.runs.records import encode
+from abcd_ns.lab.results.records import encode
 from tests.lab.compare.records import made_up_run
 
 WORKER = """

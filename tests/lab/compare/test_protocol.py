@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, make_plan, read_options
+from abcd_ns.lab.job import METHODS, Settings
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.job import METHODS, Settings
 
 CONFIGS = [
     path

@@ -14,10 +14,10 @@ from rich.console import Console
 
 from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy, mean_curve
 from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
-from abcd_ns.lab.runs.job import METHODS, evenly
-from abcd_ns.lab.runs.run import ViewScore
-from abcd_ns.lab.runs.style import COLORS, MARKERS, spread
-from abcd_ns.lab.runs.tables import MEASURES, cell, notes, print_table, rows, write_table
+from abcd_ns.lab.job import METHODS, evenly
+from abcd_ns.lab.results.run import ViewScore
+from abcd_ns.lab.results.style import COLORS, MARKERS, spread
+from abcd_ns.lab.results.tables import MEASURES, cell, notes, print_table, rows, write_table
 from tests.lab.compare.records import made_up_results, made_up_run
 
 

@@ -9,9 +9,9 @@ from rich.progress import Progress
 
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
+from abcd_ns.lab.results.findings import headline
+from abcd_ns.lab.results.results import Curve, Line, Outcome, Results, read_results
 from abcd_ns.lab.runs.experiment import write_report
-from abcd_ns.lab.runs.findings import headline
-from abcd_ns.lab.runs.results import Curve, Line, Outcome, Results, read_results
 from abcd_ns.lab.stability.charts import draw_curves
 from abcd_ns.lab.stability.command import KIND, SCENARIOS, Meter, carry_out, choose
 from abcd_ns.lab.stability.curves import studies

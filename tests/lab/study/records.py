@@ -3,8 +3,8 @@
 import math
 import random
 
-from abcd_ns.lab.runs.results import Arm, Results
-from abcd_ns.lab.runs.run import Run
+from abcd_ns.lab.results.results import Arm, Results
+from abcd_ns.lab.results.run import Run
 from tests.lab.compare.records import made_up, made_up_run
 
 

@@ -8,8 +8,8 @@ import pytest
 from abcd_ns import methods
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
+from abcd_ns.lab.job import Change, Variant
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.job import Change, Variant
 from abcd_ns.lab.runs.options import change_options, option_names, parse_variant
 from abcd_ns.lab.study.command import BlocksStudy, GaussiansStudy, OptionsStudy
 from tests.reference.colmap_scene import write_scene

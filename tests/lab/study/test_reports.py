@@ -8,11 +8,11 @@ import pytest
 from rich.console import Console
 
 from abcd_ns.errors import UserError
+from abcd_ns.lab.job import Plan
+from abcd_ns.lab.results.findings import find_difference, find_gap, find_knee
+from abcd_ns.lab.results.results import read_results, write_results
+from abcd_ns.lab.results.tables import notes, rows, write_table
 from abcd_ns.lab.runs import runner
-from abcd_ns.lab.runs.findings import find_difference, find_gap, find_knee
-from abcd_ns.lab.runs.job import Plan
-from abcd_ns.lab.runs.results import read_results, write_results
-from abcd_ns.lab.runs.tables import notes, rows, write_table
 from abcd_ns.lab.study.charts import draw_study
 from abcd_ns.lab.study.command import BlocksStudy, OptionsStudy, carry_out
 from tests.lab.compare.fake_worker import FakeWorker

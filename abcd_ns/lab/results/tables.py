@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from abcd_ns.lab.runs.findings import find_default, find_difference
-from abcd_ns.lab.runs.job import HELD_OUT_EVERY
-from abcd_ns.lab.runs.results import Arm, Curve, Outcome, Results
-from abcd_ns.lab.runs.run import Run
+from abcd_ns.lab.job import HELD_OUT_EVERY
+from abcd_ns.lab.results.findings import find_default, find_difference
+from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results
+from abcd_ns.lab.results.run import Run
 from abcd_ns.nerfstudio.machine import Machine
 
 TABLE_FILE = "table.md"

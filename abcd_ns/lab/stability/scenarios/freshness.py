@@ -7,10 +7,10 @@ from itertools import pairwise
 from abcd_ns.engine.events import VisitEnded
 from abcd_ns.engine.space.partition import build_grid
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.lab.stability.captures import table
 from abcd_ns.lab.stability.lab import BUDGET, STILL, Lab, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
-from abcd_ns.lab.stability.stale import stale_coordinator
+from abcd_ns.lab.stability.scenarios.captures import table
+from abcd_ns.lab.stability.scenarios.stale import stale_coordinator
 from abcd_ns.lab.stability.world import ring
 
 BLOCKS = (1, 2, 4, 8, 27)

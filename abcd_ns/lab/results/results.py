@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from abcd_ns.lab.runs.job import Settings
-from abcd_ns.lab.runs.records import encode, read_record, write_json
-from abcd_ns.lab.runs.run import Failure, Run
+from abcd_ns.lab.job import Settings
+from abcd_ns.lab.results.records import encode, read_record, write_json
+from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.nerfstudio.machine import Machine, Versions
 
 SCHEMA = 2

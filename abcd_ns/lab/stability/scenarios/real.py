@@ -8,10 +8,17 @@ import torch
 from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.lab.stability.captures import GAINS, PAIR, SHIFT, TURN_DEGREES, with_gains, with_noisy_poses
 from abcd_ns.lab.stability.lab import Lab, Stage
 from abcd_ns.lab.stability.outcome import Finding, Scenario, against_one_block, db
-from abcd_ns.lab.stability.sizes import surveyed
+from abcd_ns.lab.stability.scenarios.captures import (
+    GAINS,
+    PAIR,
+    SHIFT,
+    TURN_DEGREES,
+    with_gains,
+    with_noisy_poses,
+)
+from abcd_ns.lab.stability.scenarios.sizes import surveyed
 
 BUDGET = 600
 """Views drawn in a run."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
-from abcd_ns.lab.runs.results import Arm, Outcome, Results
+from abcd_ns.lab.results.results import Arm, Outcome, Results
 
 GOAL_DB = 0.5
 """Between the best and the worst number of blocks, no more than this: no cliff."""

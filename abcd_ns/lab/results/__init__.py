@@ -1,0 +1,1 @@
+"""What experiments find: records of runs, one schema, and how they are read: tables, findings, charts."""

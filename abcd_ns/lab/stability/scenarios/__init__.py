@@ -1,0 +1,1 @@
+"""The ways to fail, by kind; each is declared where it is carried out."""
