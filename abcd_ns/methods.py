@@ -72,7 +72,7 @@ abcd_partition = MethodSpecification(
         _trainer(
             "abcd-partition",
             blocks=PEER_BLOCKS,
-            training=TrainingConfig(recipe=Recipe(layers=False, overlap=0.2), warmup=0.0),
+            training=TrainingConfig(recipe=Recipe(layers=False, overlap=0.2, migrate=False), warmup=0.0),
         )
     ),
     description="Partition, train, merge: overlapping blocks, each trained once and by itself.",

@@ -237,8 +237,7 @@ class BlocksAlone:
 
 
 def independent_trainer(run: TrainingRun) -> Coordinator:
-    """Trains each block in one visit, alone; `training.overlap` is above 0. No Gaussian migrates."""
-    run.config = replace(run.config, recipe=replace(run.config.recipe, migrate=False))
+    """Trains each block in one visit, alone: by a recipe with an overlap, without layers and migration."""
     return Coordinator(run, BlocksAlone(run))
 
 

@@ -22,7 +22,7 @@ GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e
 
 
 def independent(folder, start, views, **options) -> independent_trainer:
-    options = {"overlap": 0.2, "layers": False, "blocks": 4, **options}
+    options = {"overlap": 0.2, "layers": False, "migrate": False, "blocks": 4, **options}
     return make_coordinator(
         folder, start, views, kind=independent_trainer, content=independent_at_rest, **options
     )

@@ -185,6 +185,7 @@ def test_blocks_are_trained_apart(tmp_path, start, views, photos):
         "content": independent_at_rest,
         "layers": False,
         "overlap": 0.25,
+        "migrate": False,
     }
     coordinator = on_device(tmp_path, start, views, blocks=2, steps=6, density=GROWING, **options)
     train(coordinator, photos)

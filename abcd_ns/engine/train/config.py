@@ -85,8 +85,8 @@ class TrainingConfig:
             if not fits:
                 value = getattr(self, name.replace("-", "_"))
                 raise UserError(f"--pipeline.training.{name} must be {words}, not {value}.")
-        if recipe.overlap < 0 or (recipe.overlap > 0 and (recipe.layers or recipe.exact)):
+        if recipe.overlap < 0 or (recipe.overlap > 0 and (recipe.layers or recipe.exact or recipe.migrate)):
             raise UserError(
-                f"training.recipe.overlap is {recipe.overlap}: it must be 0, or more where layers and exact "
-                "are off, as in the method abcd-partition."
+                f"training.recipe.overlap is {recipe.overlap}: it must be 0, or more where layers, exact "
+                "and migrate are off, as in the method abcd-partition."
             )

@@ -12,7 +12,8 @@ class Recipe:
     """Composite each block with the frozen blocks around it. Off is the paper's ablation."""
     overlap: float = 0.0
     """Above 0: partition, train, merge. Each block is trained once, by itself, on its cell enlarged at each
-    face by this share of its extent, and keeps what lies in its cell at the end. Needs `layers` off."""
+    face by this share of its extent, and keeps what lies in its cell at the end. Needs `layers` and `migrate`
+    off."""
     exact: bool = False
     """Exact joint training: every step trains all blocks, one at a time on the device, each drawn twice.
     Slow; the reference for gradients. There are no visits, so what concerns them has no effect."""

@@ -152,6 +152,7 @@ EACH_ALONE = {
     "content": independent_at_rest,
     "layers": False,
     "overlap": 0.3,
+    "migrate": False,
 }
 
 
