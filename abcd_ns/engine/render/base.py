@@ -102,6 +102,7 @@ class Rasterizer(Protocol):
         sh_degree: int,
         antialiased: bool = False,
         absgrad: bool = False,
+        weigh: bool = False,
     ) -> tuple[Raster, ...]:
         """Draw `gaussians` for each shot, sorted by depth with what is frozen there.
 
@@ -111,6 +112,9 @@ class Rasterizer(Protocol):
             sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
             antialiased: scale opacities by gsplat's compensation factor.
             absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward.
+            weigh: give zeros for depths, from a leaf `info["weights"]` [v, n] that every Gaussian's depth is
+                taken from: after backward its gradient is the sum of the Gaussian's weights alpha T, each
+                times the gradient of the pixel's depth; and that changes no other gradient.
 
         Raises:
             ValueError: a window is of another crop, or of tiles that are no multiples of the rasterizer's; or

@@ -33,7 +33,7 @@ class TrainingConfig:
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
-    visit_views: int = 16
+    visit_views: int = 32
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
     first_passes: int = 8
     """Uses of each of these views in a visit of the first sweep."""
@@ -42,7 +42,7 @@ class TrainingConfig:
     many as leave a tenth of the time for drawing layers, by the Gaussians of a block and around it."""
     heal: bool = True
     """Where blocks are trained within layers: undo a visit that left its pictures worse than it found them,
-    shrink giants, drop what no picture can show. Values that are no numbers are mended in any case."""
+    shrink giants. Values that are no numbers are mended in any case."""
     commit_seconds: float = 60.0
     """A kill loses at most so many seconds of the run; what happens is written to disk beside the training.
     0 commits at the end of every visit, which waits for the disk."""

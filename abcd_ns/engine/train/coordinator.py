@@ -101,6 +101,8 @@ class Coordinator(Trainer):
             infos = rendered.infos if sound else ()
             clock = self.live.density_clock(taken, self.batch, self.visits.room())
             self.live.refine(infos, clock, self.steps.parts() if infos else ())
+            if self.live.is_due_to_shed(taken):
+                self.live.shed()
         self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
         if self._is_over(active):
             self.end_visit()
@@ -140,6 +142,8 @@ class Coordinator(Trainer):
         """Put the block to rest, and Gaussians that left it into the inbox; cut what has outgrown a block."""
         active = self.run.active
         if not active.is_whole:
+            if not active.sole:
+                self.live.shed()
             self.live.count_visit()
         state = self.health.end_visit(active, self.live.detached)
         if active.is_whole:

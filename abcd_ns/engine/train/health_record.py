@@ -23,8 +23,8 @@ class BlockHealth:
     transparent ones."""
     giants: int = 0
     """Gaussians that were shrunk."""
-    transparent: int = 0
-    """Gaussians that no picture can show and that were dropped."""
+    shed: int = 0
+    """Gaussians that filled too little of their views and were taken out."""
     rises: int = 0
     """Visits that left the loss of their views higher than they found it."""
     undone: int = 0
@@ -81,7 +81,7 @@ MENDED = {
     "moments": "moments that were no numbers set to zero",
     "values": "Gaussians that were no numbers replaced",
     "giants": "giants shrunk",
-    "transparent": "Gaussians that nothing can show dropped",
+    "shed": "Gaussians taken out that filled too little of their views",
     "undone": "visits undone that made their pictures worse",
 }
 """What the counts of a BlockHealth say."""

@@ -45,11 +45,8 @@ class TrainingRun:
         self.announce = Announcer()
         self.stopwatch = Stopwatch()
         self.state = RunState()
-        heals = {
-            "may_act": config.heal and config.recipe.layers,
-            "may_drop": config.density.strategy == "default",
-        }
-        self.health = Health(scene, params, optimizers, self.announce, **heals)
+        may_act = config.heal and config.recipe.layers
+        self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
         self.fit_density(scene.tree.num_blocks)
 
     def fit_density(self, blocks: int) -> None:

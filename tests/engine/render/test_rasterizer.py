@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
 from abcd_ns.engine.render.cpu.binning import bin_splats
 from abcd_ns.engine.render.projection import project
@@ -145,6 +146,32 @@ def test_absgrad_sums_absolute_pixel_gradients():
     assert raster.info["means2d"].absgrad.shape == (1, 6, 2)
     assert relative_error(raster.info["means2d"].absgrad[0], expected) < 1e-10
     assert (raster.info["means2d"].absgrad >= raster.info["means2d"].grad.abs() - 1e-12).all()
+
+
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_weighing_adds_up_what_gaussians_fill_and_changes_nothing_else(with_frozen):
+    """A weight is the gradient of the picture's sum by the colour, for which the naive twin is asked."""
+    gaussians, frozen = random_gaussians(12), random_gaussians(8, seed=7) if with_frozen else None
+    shot = Shot(VIEW, CROP, None if frozen is None else EAGER.project(frozen, VIEW, sh_degree=0))
+    counts = probe(CROP.height, CROP.width)[..., 0]
+    dark = replace(gaussians, features_dc=torch.zeros_like(gaussians.features_dc).requires_grad_())
+    naive = naive_rasterize(dark, VIEW, sh_degree=0, crop=CROP, frozen=frozen)
+    (expected,) = torch.autograd.grad((naive.color[..., 0] * counts).sum(), dark.features_dc)
+
+    plain, leaves = as_leaves(gaussians), as_leaves(gaussians)
+    (without,), (raster,) = (
+        EAGER.draw(g, [shot], sh_degree=0, weigh=weigh) for g, weigh in ((plain, False), (leaves, True))
+    )
+    without.color.sin().sum().backward()
+    (raster.color.sin().sum() + (raster.depth * counts).sum()).backward()
+    found = raster.info["weights"].grad
+    assert found.shape == (1, 12)
+    assert float(found.abs().max()) > 1
+    assert relative_error(found[0], expected.flatten(1)[:, 0] / SH_C0) < 1e-10
+    assert torch.equal(raster.color, without.color)
+    assert bool((raster.depth == 0).all())
+    for name in PARAM_NAMES:
+        assert torch.equal(getattr(leaves, name).grad, getattr(plain, name).grad), name
 
 
 def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():

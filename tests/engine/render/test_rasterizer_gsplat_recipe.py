@@ -80,6 +80,21 @@ def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen
     assert (info["width"], info["height"]) == (VIEW.width, VIEW.height)
 
 
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_weights_are_those_of_the_torch_backend(backend, with_frozen):
+    frozen, found = random_gaussians(15, seed=3) if with_frozen else None, []
+    for rasterizer in (backend, TorchRasterizer("never")):
+        seen = None if frozen is None else rasterizer.project(frozen, VIEW)
+        leaves, shot = as_leaves(random_gaussians(40)), Shot(VIEW, Crop(19, 5, 30, 31), seen)
+        (raster,) = rasterizer.draw(leaves, [shot], sh_degree=0, weigh=True)
+        (raster.color.square().sum() + (raster.depth * probe(31, 30)[..., 0]).sum()).backward()
+        found.append((raster.info["weights"].grad, leaves.means.grad, raster.depth))
+    assert float(found[1][0].abs().max()) > 1
+    assert relative_error(found[0][0], found[1][0]) < 1e-8
+    assert relative_error(found[0][1], found[1][1]) < 1e-8
+    assert bool((found[0][2] == 0).all())
+
+
 def test_nothing_to_draw(backend):
     raster = backend(
         as_leaves(Gaussians.empty(dtype=torch.float64)), VIEW, sh_degree=3, crop=Crop(3, 3, 5, 4)

@@ -106,6 +106,9 @@ def test_what_density_control_counts_is_that_of_all_views(make, photos):
     assert torch.equal(found["count"], wanted["count"])
     assert float(wanted["count"].sum()) > 0
     assert torch.allclose(found["grad2d"], wanted["grad2d"], rtol=1e-4)
+    assert bool((wanted["looks"] == 4).all())
+    assert torch.equal(found["looks"], wanted["looks"])
+    assert torch.allclose(found["weight"], wanted["weight"], rtol=1e-4, atol=1e-5)
     crew.dismiss()
 
 

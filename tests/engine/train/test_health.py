@@ -1,6 +1,5 @@
 """What goes wrong while a block is trained is noticed, told and mended; what is healthy is left as it is."""
 
-import dataclasses
 import math
 
 import pytest
@@ -8,7 +7,6 @@ import torch
 
 from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
 from abcd_ns.engine.gaussians.param_swap import attach
-from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health import health_rules
@@ -236,23 +234,6 @@ def test_giants_are_held_back_in_visits_that_refine_nothing(tmp_path, views, pho
     scene = whole_scene(coordinator)
     nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
     assert float((scene.scales.amax(dim=1).exp() / nearest).max()) < 1.2 * health_rules.GIANT_ANGLE
-
-
-def test_what_no_picture_can_show_is_dropped_and_no_picture_changes(tmp_path, views, photos, start):
-    start.opacities[::5] = -7.0
-    density = dataclasses.replace(GROWING, cull_alpha_thresh=0.0, refine_stop=0.0)
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, density=density)
-    ended, told, draw = listen(coordinator, VisitEnded), listen(coordinator, Mended), TorchRasterizer("never")
-    while not ended:
-        train_step(coordinator, photos)
-    left = torch.sigmoid(coordinator.scene.gaussians(ended[0].block).opacities)
-    assert {event.what for event in told} == {"transparent"}
-    assert float(left.min()) >= 1 / 255
-    scene = whole_scene(coordinator)
-    shows = torch.sigmoid(scene.opacities[:, 0]) >= 1 / 255
-    assert not bool(shows.all())
-    for view in views:
-        assert torch.equal(draw(scene, view, sh_degree=0).color, draw(scene[shows], view, sh_degree=0).color)
 
 
 def test_losses_that_scatter_are_no_rise():

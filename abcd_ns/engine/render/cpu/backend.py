@@ -98,6 +98,7 @@ class TorchRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool = False,
         absgrad: bool = False,
+        weigh: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
         check_degree(gaussians, sh_degree)
@@ -106,12 +107,17 @@ class TorchRasterizer(Rasterizer):
         own = torch.stack([project_packed(packed, shot.view, **options).planes for shot in shots])
         info = _info(own, shots)
         # Through info's tensor, so that it is in the graph.
-        graded = torch.cat((info["means2d"].transpose(1, 2), own[:, DEPTH:GRADED]), dim=1)
+        depths = own[:, DEPTH]
+        if weigh:
+            info["weights"] = depths = torch.zeros_like(depths, requires_grad=True)
+        rows = (info["means2d"].transpose(1, 2), depths[:, None], own[:, CONIC_XX:GRADED])
+        graded = torch.cat(rows, dim=1)
         graded, bounds = _side_by_side(graded), _side_by_side(own.detach())
         grid_of = torch.arange(len(shots), device=own.device).repeat_interleave(own.shape[2])
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
         if frozen:
-            graded = torch.cat((graded, *(planes[:GRADED] for _, planes in frozen)), dim=1)
+            others = [_without_depths(planes) if weigh else planes for _, planes in frozen]
+            graded = torch.cat((graded, *(planes[:GRADED] for planes in others)), dim=1)
             bounds = torch.cat((bounds, *(planes for _, planes in frozen)), dim=1)
             grid_of = torch.cat((grid_of, *(grid_of.new_full((p.shape[1],), k) for k, p in frozen)))
         sheet = TileSheet(tuple(TileGrid(shot.crop, self.tile_side) for shot in shots))
@@ -177,6 +183,10 @@ class TorchRasterizer(Rasterizer):
         self, candidates: Candidates, planes: Float[Tensor, "r n"], absgrad_target: Tensor | None = None
     ) -> Job:
         return Job(candidates.lists(self.chunk), planes.shape[1], self.kernels, absgrad_target)
+
+
+def _without_depths(planes: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:
+    return torch.cat((planes[:DEPTH], torch.zeros_like(planes[DEPTH:CONIC_XX]), planes[CONIC_XX:]))
 
 
 def _side_by_side(planes: Float[Tensor, "v r n"]) -> Float[Tensor, "r vn"]:

@@ -5,7 +5,8 @@ Importing this module imports gsplat, which compiles its CUDA extension at the f
 
 import weakref
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import gsplat
 import torch
@@ -73,6 +74,7 @@ class GsplatRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool = False,
         absgrad: bool = False,
+        weigh: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
         check_degree(gaussians, sh_degree)
@@ -80,7 +82,8 @@ class GsplatRasterizer(Rasterizer):
         # Windows mask what is frozen, or the Gaussians: no list has both.
         kinds = [(s.view.width, s.view.height, s.view.near, s.frozen is None) for s in shots]
         for places in _alike(kinds):
-            drawn = self._draw_alike(gaussians, [shots[k] for k in places], sh_degree, antialiased, absgrad)
+            alike = [shots[k] for k in places]
+            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, absgrad, weigh)
             rasters.update(zip(places, drawn, strict=True))
         for raster in rasters.values():
             raster.info["n_cameras"] = len(shots)
@@ -118,7 +121,13 @@ class GsplatRasterizer(Rasterizer):
         return Drawing.of(Packed.of_splats([(0, splats)]), [crop], self._cameras, windowed=windowed)
 
     def _draw_alike(
-        self, gaussians: Gaussians, shots: Sequence[Shot], sh_degree: int, antialiased: bool, absgrad: bool
+        self,
+        gaussians: Gaussians,
+        shots: Sequence[Shot],
+        sh_degree: int,
+        antialiased: bool,
+        absgrad: bool,
+        weigh: bool,
     ) -> list[Raster]:
         views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
         frozen = [
@@ -127,9 +136,12 @@ class GsplatRasterizer(Rasterizer):
         if len(gaussians) == 0 and not frozen:
             return _nothing(gaussians, shots)
         own = project(gaussians, views, self._cameras, sh_degree, antialiased)
-        everyone = Packed.of(own)
+        weights = torch.zeros_like(own.depths, requires_grad=weigh)
+        everyone = Packed.of(_showing(own, weights) if weigh else own)
         if frozen:
-            everyone = everyone.and_then(Packed.of_splats(frozen))
+            others = Packed.of_splats(frozen)
+            others = _showing(others, torch.zeros_like(others.depths)) if weigh else others
+            everyone = everyone.and_then(others)
         windows = [shot.z_window for shot in shots]
         windowed = any(window is not None for window in windows)
         drawing = Drawing.of(everyone, crops, self._cameras, windowed=windowed)
@@ -138,11 +150,19 @@ class GsplatRasterizer(Rasterizer):
             drawing = drawing.only(drawing.inside(windows, always))
         if absgrad and own.means2d.requires_grad:
             _forward_absgrad(own.means2d, drawing.means2d)
-        info = _info(own, views[0])
+        info = _info(own, views[0]) | ({"weights": weights} if weigh else {})
         return [
             Raster(features[..., :3], transmittance, features[..., 3], info)
             for features, transmittance in drawing.draw(absgrad)
         ]
+
+
+Seen = TypeVar("Seen", Projected, Packed)
+
+
+def _showing(seen: Seen, depths: Tensor) -> Seen:
+    """With these in place of the depths that are composited; those that are sorted by stay."""
+    return replace(seen, features=torch.cat((seen.features[..., :3], depths[..., None]), dim=-1))
 
 
 def _alike(kinds: Sequence[object]) -> list[list[int]]:

@@ -18,14 +18,16 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
+from abcd_ns.engine.train.density.shedding import WEIGHED, faded, price_at, weigh, worthless
 
 # Step numbers as gsplat sees them. It refines on multiples of REFINE, resets opacities on multiples of
 # `reset_every` (never, with these numbers) and prunes by size where step > reset_every.
 GATHER, REFINE = 1, 6
 BEFORE_RESET, AFTER_RESET = 7, 4
 
-COUNTED = ("grad2d", "count")
-"""What the default strategy adds up for each Gaussian, under gsplat's names."""
+GRADIENTS = ("grad2d", "count")
+"""What gsplat's default strategy adds up for each Gaussian, under its names."""
+COUNTED = (*GRADIENTS, *WEIGHED)
 REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
 """Shares of a visit after which a block among others is neither refined nor reset."""
@@ -67,6 +69,9 @@ class DensityConfig:
     """Mean norm of the screen-space gradient over which a Gaussian is cloned or split."""
     use_absgrad: bool = True
     """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum."""
+    price: float = 3.0
+    """Pixels that a Gaussian must fill (sum of alpha T) in all views of its block together, once growth ends;
+    those that fill less go (`default` strategy). 0 keeps all that show at all; -1 keeps everything."""
     max_gaussians: int = 0
     """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
     to begin with, a random choice of them begins."""
@@ -126,6 +131,11 @@ class DensityControl:
         """Whether the rasterizer must leave `absgrad` on `means2d`."""
         return self.config.strategy == "default" and self.config.use_absgrad
 
+    @property
+    def weighs(self) -> bool:
+        """Whether the rasterizer must leave `weights`."""
+        return self.config.strategy == "default" and self.config.price >= 0
+
     def before_backward(self, infos: Infos) -> None:
         """Keep the gradient of the projected means, by which the default strategy judges."""
         for info in infos:
@@ -179,7 +189,7 @@ class DensityControl:
             return {}
         views = [view for info in with_gradient for view in zip(*self._norms(info), strict=True)]
         norms, seen = (reduce(torch.add, parts) for parts in zip(*views, strict=True))
-        return dict(zip(COUNTED, (norms, seen), strict=True))
+        return {**dict(zip(GRADIENTS, (norms, seen), strict=True)), **weigh(with_gradient)}
 
     def _norms(self, info: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """What DefaultStrategy._update_state adds up: norms of the gradients in each view, and 1 where there
@@ -213,8 +223,6 @@ class DensityControl:
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth
         if self.config.strategy == "default":
-            if clock.progress >= self.config.refine_stop:
-                return growth
             infos = _with_gradient(infos)
             growth = added(growth, self.count(params["means"], infos))
             if not (self.refines(clock, infos) or self.resets(clock)):
@@ -227,6 +235,29 @@ class DensityControl:
                 self._step_mcmc(params, optimizers, clock)
                 return {}
             return self._step_default(params, optimizers, growth, infos, clock)
+
+    def shed(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        growth: dict[str, Tensor],
+        *,
+        views: int,
+        progress: float,
+    ) -> dict[str, Tensor]:
+        """Take out what fills too little of the block's `views`, at a share of the run.
+
+        Returns:
+            The block's statistics from now on.
+        """
+        if not self.weighs or any(name not in growth for name in WEIGHED):
+            return growth
+        price = price_at(self.config.price, progress, self.config.refine_stop)
+        drop = worthless(growth, views, price)
+        growth = faded(growth, views)
+        if bool(drop.any()):
+            gsplat_ops.remove(params, optimizers, growth, drop)
+        return growth
 
     def _step_default(
         self,

@@ -1,8 +1,8 @@
 """Notices what goes wrong in the live block, counts it, tells it, and mends what can be mended.
 
 In any run: gradients, moments and values that are no numbers. Where blocks are trained within layers, since
-there others have to live with the result: giants, Gaussians that nothing can show, and visits that left their
-pictures worse than they found them. A run in which nothing goes wrong is the same with or without all this,
+there others have to live with the result: giants, and visits that left their pictures worse than they found
+them. A run in which nothing goes wrong is the same with or without all this,
 on a CPU bit for bit: healthy tensors are read, never written.
 """
 
@@ -23,7 +23,6 @@ from abcd_ns.engine.store.settle import at_rest
 from abcd_ns.engine.train.health.health_rules import (
     GIANT_ANGLE,
     HIDDEN,
-    SHOWS,
     is_worse,
     loss_rise,
     stand_ins,
@@ -46,7 +45,6 @@ class Health:
 
     Args:
         may_act: where there are several blocks, also hold back giants, and undo visits.
-        may_drop: and drop Gaussians that nothing can show.
     """
 
     def __init__(
@@ -57,9 +55,8 @@ class Health:
         announce: Announcer,
         *,
         may_act: bool,
-        may_drop: bool,
     ) -> None:
-        self._may_act, self._may_drop = may_act, may_drop
+        self._may_act = may_act
         self._scene, self._params, self._optimizers, self._announce = scene, params, optimizers, announce
         self._active: ActiveVisit | None = None
         self._ledger: Ledger = {}
@@ -164,15 +161,11 @@ class Health:
         if rise is not None and is_worse(*rise):
             return self._undo(active, state, rise, record)
         record.damping = min(2 * record.damping, 1.0)
-        return self._drop_transparent(active, state) if self._may_drop else state
+        return state
 
-    def _drop_transparent(self, active: ActiveVisit, state: BlockState) -> BlockState:
-        """The block without the Gaussians that no picture can show: every picture stays as it is."""
-        shows = torch.sigmoid(state.gaussians.opacities[:, 0]) >= SHOWS
-        if bool(shows.all()):
-            return state
-        self._tell(active, "transparent", int((~shows).sum()))
-        return state[shows]
+    def count_shed(self, count: int) -> None:
+        """So many Gaussians of the live block were taken out, since they filled too little of its views."""
+        self._count("shed", count)
 
     def look_over(self) -> None:
         """Mend all that is no number in the live block; call when a visit ends, and before saving."""

@@ -37,6 +37,11 @@ class Sample:
     """Of the pixels that might have been drawn in this step, those that are: the crop's."""
 
     @property
+    def in_front(self) -> Float[Tensor, "h w"] | None:
+        """Transmittance of what lies before the block; None for nothing."""
+        return None if self.layers is None else self.layers.front.transmittance
+
+    @property
     def shot(self) -> Shot:
         """What the rasterizer is to draw."""
         return Shot(self.view, self.crop, self.near, None if self.near is None else self.window)

@@ -25,6 +25,7 @@ from abcd_ns.engine.train.schedule import (
     views_per_warm_up_step,
 )
 from abcd_ns.engine.train.step.batch import Backgrounds, Batch, Rendered, Sample, part_to_draw
+from abcd_ns.engine.train.step.weighing import weighed
 from abcd_ns.engine.train.step.workers.crew import Crew
 from abcd_ns.engine.train.step.workers.helper_process import can_fork
 from abcd_ns.engine.train.step.workers.share import DrawShare, Part, Share, Target, Task, share_of
@@ -188,7 +189,11 @@ class StepDrawing:
             sh_degree=sh_degree,
             antialiased=run.config.antialiased,
             absgrad=run.density.absgrad,
+            weigh=run.density.weighs,
         )
+        if run.density.weighs:
+            pairs = zip(rasters, samples, strict=True)
+            rasters = tuple(weighed(raster, sample.in_front, sample.share) for raster, sample in pairs)
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         if crew > 1:  # density control judges by gradients of the sum over all of a step's views
             infos = tuple({**info, "n_cameras": info["n_cameras"] * crew} for info in infos)

@@ -10,6 +10,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import at_rest, count_at_rest
 from abcd_ns.engine.train.density.control import DensityClock, Infos, added
+from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -82,6 +83,23 @@ class LiveBlock:
         if run.density.refines(clock, infos):
             self.clocks = replace(self.clocks, refined=clock.steps)
             self._hold_back_giants()
+
+    def shed(self) -> None:
+        """Take out Gaussians that fill too little of the block's views; tells how many."""
+        run, active, before = self._run, self._run.active, len(self)
+        views = run.state.views.get(active.geometry.block, len(active.geometry.views))
+        options = {"views": views, "progress": run.share_of_blocks}
+        self.growth = run.density.shed(run.params, run.optimizers, self.growth, **options)
+        run.health.count_shed(before - len(self))
+
+    def is_due_to_shed(self, taken: int) -> bool:
+        """Whether the one block of the scene has been drawn often enough since it last shed.
+
+        Args:
+            taken: the last step's views.
+        """
+        every, steps = PASSES * len(self._run.active.geometry.views), self.clocks.steps
+        return self._run.active.sole and steps // every > (steps - taken) // every
 
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
         """All that decides whether to refine after a step.

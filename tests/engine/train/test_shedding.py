@@ -1,0 +1,129 @@
+"""What fills too little of its views goes, and nothing else does."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.events import Mended
+from abcd_ns.engine.render import Shot
+from abcd_ns.engine.space.influence import weights
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.density.shedding import PASSES, faded, price_at, weigh, worthless
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import Gaussians
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
+"""Nothing grows, and the price is the full one from the beginning."""
+HIDDEN = 30
+
+
+def statistics(weight: list[float], looks: list[float]) -> dict[str, torch.Tensor]:
+    return {"weight": torch.tensor(weight), "looks": torch.tensor(looks), "grad2d": torch.ones(len(weight))}
+
+
+def some_hidden(seed: int = 1) -> Gaussians:
+    """The last HIDDEN of them are above all views."""
+    gaussians = random_gaussians(120, seed=seed, size=0.12)
+    gaussians.means[-HIDDEN:, 2] += 50.0
+    return gaussians
+
+
+@given(
+    weight=st.lists(st.floats(0, 100), min_size=1, max_size=20),
+    views=st.integers(1, 50),
+    price=st.floats(0, 20),
+    looks=st.integers(0, 200),
+)
+def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_price(weight, views, price, looks):
+    found = worthless(statistics(weight, [float(looks)] * len(weight)), views, price).tolist()
+    for value, goes in zip(weight, found, strict=True):
+        per_view = value / max(looks, 1)
+        if abs(per_view * views - price) > 1e-3:
+            assert goes == (looks >= views and per_view * views < price)
+
+
+def test_what_was_seen_long_ago_counts_for_less():
+    found = faded(statistics([8.0, 8.0], [10.0, 3.0]), views=5)
+    assert found["weight"].tolist() == [4.0, 8.0]
+    assert found["looks"].tolist() == [5.0, 3.0]
+    assert found["grad2d"].tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("progress", "ends", "expected"),
+    [(0.0, 0.5, 0.0), (0.25, 0.5, 1.5), (0.5, 0.5, 3.0), (1.0, 0.5, 3.0), (0.0, 0.0, 3.0)],
+)
+def test_the_price_rises_until_growth_ends(progress, ends, expected):
+    assert price_at(3.0, progress, ends) == pytest.approx(expected)
+
+
+def test_drawings_without_weights_say_nothing():
+    assert weigh([{"means2d": torch.zeros(1, 3, 2)}]) == {}
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_what_no_view_shows_goes_and_what_fills_much_stays(tmp_path, blocks):
+    views, start = ring_of_views(5), some_hidden()
+    photos = Photos(random_gaussians(150, seed=7, size=0.12), views)
+    options = {"blocks": blocks, "steps": 80, "density": replace(STILL, price=1.0), "batch": 1}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    told: list[Mended] = []
+    coordinator.announce.subscribe(lambda event: told.append(event) if isinstance(event, Mended) else None)
+    train(coordinator, photos)
+    left = whole_scene(coordinator)
+    assert sum(event.count for event in told if event.what == "shed") == len(start) - len(left)
+    assert HIDDEN / 2 < len(start) - len(left) < 2 * HIDDEN
+    assert sum(record.shed for record in coordinator.state.health.values()) == len(start) - len(left)
+    assert float(left.means[:, 2].max()) < 40
+    fills = sum(weights(left, coordinator.run.rasterizer, Shot(view, view.full)) for view in views)
+    assert float((fills > 0.5).float().mean()) > 0.9
+
+
+def test_below_zero_everything_stays(tmp_path, views, photos):
+    options = {"blocks": 2, "steps": 30, "density": replace(STILL, price=-1.0)}
+    coordinator = make_coordinator(tmp_path, some_hidden(), views, **options)
+    train(coordinator, photos)
+    assert coordinator.count() == 120
+
+
+def test_statistics_weigh_what_lies_before_the_block(tmp_path, views, photos, start):
+    """Those of a step are the weights of the block's Gaussians in pictures of the whole scene."""
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=2, density=replace(STILL, price=0.0), batch=1
+    )
+    rasterizer, run = coordinator.run.rasterizer, coordinator.run
+    batch = coordinator.next_batch()
+    block, live = run.active.geometry.block, coordinator.live
+    before = whole_scene(coordinator)
+    (sample,) = batch.samples
+    rendered = coordinator.render(batch)
+    coordinator.loss(batch, rendered.pictures, [photos(sample.view.index, sample.crop)]).backward()
+    found = run.density.count(run.params["means"], rendered.infos)["weight"]
+    owner = torch.cat([torch.full((coordinator.scene.count(b),), b) for b in range(2)])
+    expected = weights(before, rasterizer, replace(sample.shot, frozen=None, z_window=None))[owner == block]
+    assert len(live) == len(expected) == len(found)
+    # Layers are half floats, and by tiles where blocks interleave.
+    torch.testing.assert_close(found, expected, rtol=0.05, atol=0.05)
+
+
+def test_one_block_sheds_after_every_so_many_passes(tmp_path, views, photos):
+    options = {
+        "blocks": 1,
+        "steps": 3 * PASSES * len(views),
+        "density": replace(STILL, price=0.0),
+        "batch": 1,
+    }
+    coordinator = make_coordinator(tmp_path, some_hidden(), views, **options)
+    counts = []
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        counts.append(coordinator.count())
+    first = PASSES * len(views)
+    assert counts[first - 2] == 120
+    assert counts[first - 1] <= 120 - HIDDEN
+    assert math.isclose(counts[-1], counts[first - 1], abs_tol=5)
