@@ -33,7 +33,7 @@ class TrainingConfig:
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
-    visit_views: int = 16
+    visit_views: int = 32
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
     first_passes: int = 8
     """Uses of each of these views in a visit of the first sweep."""
