@@ -26,7 +26,7 @@ from rich.console import Console
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.style import in_style, save
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+from abcd_ns.machine import describe_machine, describe_versions
 
 BIN = Path(sys.executable).parent
 SECONDS_BETWEEN_LOOKS = 0.2

@@ -30,7 +30,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+from abcd_ns.machine import describe_machine, describe_versions
 from benchmarks.visit import Capture, begin, read
 
 COUNTED = 10
@@ -87,8 +87,10 @@ def count(rasterizer: TorchRasterizer, own: Gaussians, samples: tuple[Sample, ..
     for sample in samples:
         grid = TileGrid(sample.crop, rasterizer.tile_side)
         counts.own += bin_splats(rasterizer.project(own, sample.view), grid, rasterizer.chunk).fragments
-        if sample.near is not None:
-            counts.frozen += bin_splats(sample.near, grid, rasterizer.chunk, window=sample.window).fragments
+        if sample.interleaved is not None:
+            counts.frozen += bin_splats(
+                sample.interleaved, grid, rasterizer.chunk, window=sample.window
+            ).fragments
 
 
 def run(capture: Capture, side: int, seed: int, args: Args) -> Row:

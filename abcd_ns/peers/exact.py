@@ -33,7 +33,7 @@ from abcd_ns.engine.space.culling import Optics
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.visibility import reaches
-from abcd_ns.engine.store.scaffold import join, part
+from abcd_ns.engine.store.scaffold import join, split_by_block
 from abcd_ns.engine.train.density.control import DensityClock
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
@@ -185,7 +185,7 @@ class ExactTrainer(Trainer):
 
     def rest(self, within: float) -> None:
         """Put every block to rest; there are no visits."""
-        held, nobody = part(self._all, self._owner_of_all()), self._all.nobody
+        held, nobody = split_by_block(self._all, self._owner_of_all()), self._all.nobody
         blocks = range(self.scene.tree.num_blocks)
         self.run.rest(self.scene.tree, {block: held.get(block, nobody) for block in blocks}, within)
 
@@ -203,7 +203,7 @@ class ExactTrainer(Trainer):
 
     def _lay_over(self) -> None:
         everything = self._all.gaussians
-        self.scene.lay_over(None, lambda: everything)
+        self.scene.set_live(None, lambda: everything)
 
     def _owner_of_all(self) -> Int64[Tensor, "n"]:
         return self.scene.tree.assign(self._all.gaussians.means)

@@ -10,7 +10,7 @@ import torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
-from abcd_ns.engine.layers.painter import Painter, PaintSettings, Parts
+from abcd_ns.engine.layers.painter import FrozenLayers, Painter, PaintSettings
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.influence import coarser
@@ -142,10 +142,10 @@ class BlockPictures:
         rasterizer, view = self.painter.rasterizer, self.view
         return rasterizer.depth_window(own, view, crop=view.full, **options)
 
-    def _around(self, block: int, window: ZWindow | None) -> Parts:
+    def _around(self, block: int, window: ZWindow | None) -> FrozenLayers:
         painter, view = self.painter, self.view
         seen_by = painter.frusta([(view, view.full)])
-        parts: dict[int, Parts | None] = {}
+        parts: dict[int, FrozenLayers | None] = {}
         for unit in painter.units(exclude=block):
             loaded = painter.load(unit, block, seen_by)
             cut = {"active": block, "window": window}

@@ -29,7 +29,7 @@ from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.runner import claim, finish_job
 from abcd_ns.lab.scale import command as scale
 from abcd_ns.lab.scale.worker import LandSettings
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions
+from abcd_ns.machine import describe_machine, describe_versions
 from benchmarks import visit
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -50,11 +50,11 @@ def test_reading_copies_what_is_in_ram_and_waits_for_nothing(full):
 
 
 def test_what_is_inside_the_window_goes_along(counts):
-    store, near = LayerStore(DEVICE, 0, ram_bytes=1 << 20), Splats(torch.rand(11, 5, device=DEVICE))
-    store.put(0, Kept(kept().layers, near))
+    store, interleaved = LayerStore(DEVICE, 0, ram_bytes=1 << 20), Splats(torch.rand(11, 5, device=DEVICE))
+    store.put(0, Kept(kept().layers, interleaved))
     assert counts.copies_to_host == 2
-    assert store.get(0).near.planes.device == DEVICE
-    assert torch.equal(store.get(0).near.planes.cpu(), near.planes.cpu())
+    assert store.get(0).interleaved.planes.device == DEVICE
+    assert torch.equal(store.get(0).interleaved.planes.cpu(), interleaved.planes.cpu())
 
 
 @pytest.mark.usefixtures("simulated_gsplat")

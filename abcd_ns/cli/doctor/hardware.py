@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 
-from abcd_ns.nerfstudio.machine import describe_machine
+from abcd_ns.machine import describe_machine
 
 OUTPUTS = Path("outputs")
 """Where `ns-train` writes by default."""

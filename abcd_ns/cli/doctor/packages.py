@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from abcd_ns import __version__
-from abcd_ns.nerfstudio.machine import own_commit, package_version
+from abcd_ns.machine import own_commit, package_version
 
 VERSIONS = ("torch", "torchvision", "nerfstudio", "gsplat", "viser", "pycolmap", "numpy", "pillow")
 """Distributions that are listed."""

@@ -4,7 +4,7 @@ import shlex
 from dataclasses import dataclass
 
 from abcd_ns.cli.report.run_folder import default_config
-from abcd_ns.nerfstudio.machine import without_home
+from abcd_ns.machine import without_home
 from abcd_ns.nerfstudio.options import MIRRORED
 from abcd_ns.nerfstudio.run.settings import Plain, Settings, flat_options
 

@@ -26,7 +26,7 @@ from abcd_ns.cli.report.story import Story
 from abcd_ns.cli.report.svg import inline_svg, theme_css
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN
 from abcd_ns.lab.results.tables import NOTHING, about_machine
-from abcd_ns.nerfstudio.machine import Versions, without_home
+from abcd_ns.machine import Versions, without_home
 
 GENERATOR = "abcd report"
 """Begins the page's generator, by which a page of ours is known."""

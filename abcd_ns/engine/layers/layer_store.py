@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.painter import Parts
+from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.types import Layer
 
@@ -25,20 +25,20 @@ class Kept:
 
     layers: Float[Tensor, "2 h w 4"]
     """F and B, rounded: premultiplied colour, then transmittance."""
-    near: Splats | None
+    interleaved: Splats | None
     """Frozen Gaussians inside the window."""
 
     @property
     def nbytes(self) -> int:
         """Its size."""
-        return self.layers.nbytes + (0 if self.near is None else self.near.planes.nbytes)
+        return self.layers.nbytes + (0 if self.interleaved is None else self.interleaved.planes.nbytes)
 
     def moved(self, move: Callable[[Tensor], Tensor]) -> "Kept":
         """The same somewhere else."""
-        return Kept(move(self.layers), self.near and Splats(move(self.near.planes)))
+        return Kept(move(self.layers), self.interleaved and Splats(move(self.interleaved.planes)))
 
 
-def packed(parts: Parts) -> Float[Tensor, "2 h w 4"]:
+def packed(parts: FrozenLayers) -> Float[Tensor, "2 h w 4"]:
     """F and B in one tensor, not yet rounded."""
     like = parts.front.color
     layers = torch.empty((2, *like.shape[:2], 4), dtype=like.dtype, device=like.device)
@@ -47,10 +47,10 @@ def packed(parts: Parts) -> Float[Tensor, "2 h w 4"]:
     return layers
 
 
-def unpacked(layers: Float[Tensor, "2 h w 4"]) -> Parts:
+def unpacked(layers: Float[Tensor, "2 h w 4"]) -> FrozenLayers:
     """The inverse of `packed`; shares memory."""
     front, back = (Layer(one[..., :3], one[..., 3]) for one in layers)
-    return Parts(front, back)
+    return FrozenLayers(front, back)
 
 
 def rounded(layers: Float[Tensor, "2 h w 4"]) -> Float[Tensor, "2 h w 4"]:

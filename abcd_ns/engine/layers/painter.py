@@ -38,7 +38,7 @@ class PaintSettings:
 
 
 @dataclass(frozen=True)
-class Parts:
+class FrozenLayers:
     """What one view sees of a unit, cut by the active block's window."""
 
     front: Layer
@@ -164,7 +164,7 @@ class Painter:
         *,
         active: int | None = None,
         window: ZWindow | None = None,
-    ) -> Parts | None:
+    ) -> FrozenLayers | None:
         """Draw a unit, loaded by `load`, cut by the window of the active block (by fragments) or put
         whole before or behind the active block (by means). Without an active block all is in front.
         None if the view sees nothing of it."""
@@ -174,10 +174,10 @@ class Painter:
         if self.ownership == "means":
             layer = self._draw(gaussians, view, crop, settings, None)
             front = active is None or self._is_in_front(unit, active, view)
-            return Parts(layer, nothing) if front else Parts(nothing, layer)
+            return FrozenLayers(layer, nothing) if front else FrozenLayers(nothing, layer)
         span = self.span(unit, view, crop)
         if window is None:
-            return Parts(self._draw(gaussians, view, crop, settings, span), nothing)
+            return FrozenLayers(self._draw(gaussians, view, crop, settings, span), nothing)
         cut = self.rasterizer.cut(
             gaussians,
             view,
@@ -189,7 +189,7 @@ class Painter:
             antialiased=settings.antialiased,
         )
         # What reaches in from another unit is inside that one's.
-        return Parts(cut.front, cut.back, cut.inside[torch.where(cut.members < loaded.own)[0]])
+        return FrozenLayers(cut.front, cut.back, cut.inside[torch.where(cut.members < loaded.own)[0]])
 
     def span(self, unit: int, view: View, crop: Crop) -> ZWindow:
         """Where the rays through the crop's tiles are inside a unit."""
@@ -203,7 +203,7 @@ class Painter:
         wanted, center = set(units), view.center.double().cpu()
         return tuple(node for node in self._walk(0, center) if node in wanted)
 
-    def fold_up(self, parts: dict[int, Parts | None], unit: int, view: View) -> None:
+    def fold_up(self, parts: dict[int, FrozenLayers | None], unit: int, view: View) -> None:
         """Collapse what has come in with `unit` and its neighbours in the tree, in place, as far as it goes.
 
         Whatever lies under a node is a run of the front-to-back order, so it folds by itself. Done after
@@ -220,19 +220,19 @@ class Painter:
                 return
             parts[node] = _over(parts.pop(near), parts.pop(far))
 
-    def fold(self, parts: dict[int, Parts | None], view: View, crop: Crop) -> Parts:
+    def fold(self, parts: dict[int, FrozenLayers | None], view: View, crop: Crop) -> FrozenLayers:
         """All parts collapsed into one layer in front of the active block and one behind, and what is
         inside in one."""
-        folded: Parts | None = None
+        folded: FrozenLayers | None = None
         for unit in self.order(tuple(parts), view):
             folded = _over(folded, parts[unit])
         nothing = self._nothing(view, crop)
-        return folded or Parts(nothing, nothing)
+        return folded or FrozenLayers(nothing, nothing)
 
     def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
         """The whole scene through layers, unit by unit: the composited render."""
         crop = crop or view.full
-        parts: dict[int, Parts | None] = {}
+        parts: dict[int, FrozenLayers | None] = {}
         for unit in self.units():
             loaded = self.load(unit, seen_by=self.frusta([(view, crop)]))
             parts[unit] = self.paint(unit, loaded, view, crop, settings)
@@ -284,12 +284,12 @@ class Painter:
         return self.tree.leaves(unit)[0] in front
 
 
-def _over(front: Parts | None, behind: Parts | None) -> Parts | None:
+def _over(front: FrozenLayers | None, behind: FrozenLayers | None) -> FrozenLayers | None:
     """The parts of two units as one, `front` being the nearer; None shows nothing."""
     if front is None or behind is None:
         return behind if front is None else front
     inside = [part.inside.planes for part in (front, behind) if part.inside is not None and len(part.inside)]
-    return Parts(
+    return FrozenLayers(
         over(front.front, behind.front),
         over(front.back, behind.back),
         Splats(torch.cat(inside, dim=1)) if inside else None,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
-from abcd_ns.engine.layers.painter import Loaded, Painter, PaintSettings, Parts
+from abcd_ns.engine.layers.painter import FrozenLayers, Loaded, Painter, PaintSettings
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -69,12 +69,12 @@ def survey(
 class Surroundings:
     """What one training view sees around the active block."""
 
-    layers: Parts
+    layers: FrozenLayers
     """F (front) and B (back), for the view's crop."""
-    near: Splats | None
+    interleaved: Splats | None
     """Frozen Gaussians to be sorted in with the active ones, as this view sees them."""
     window: ZWindow | None
-    """Where the fragments of `near` count; None by means."""
+    """Where the fragments of `interleaved` count; None by means."""
 
 
 class VisitLayers:
@@ -151,7 +151,7 @@ class VisitLayers:
         block = self._geometry.block
         # By means no unit holds the active block's own place in the order; nothing stands there.
         own_place = {} if self._own is not None else {self._painter.tree.node_of(block): None}
-        parts: dict[int, dict[int, Parts | None]] = {view: dict(own_place) for view in views}
+        parts: dict[int, dict[int, FrozenLayers | None]] = {view: dict(own_place) for view in views}
         for unit in self._units:
             loaded = self._painter.load(unit, exclude=block, seen_by=self._seen_by)
             self._loaded[unit] = len(loaded.gaussians)
@@ -172,7 +172,7 @@ class VisitLayers:
         window = self._window(view)
         return Surroundings(
             unpacked(layers.to(self._views[view].viewmat.dtype)),
-            kept.near,
+            kept.interleaved,
             window and window.on(TileGrid(part, window.grid.side)),
         )
 
@@ -203,7 +203,7 @@ class VisitLayers:
     def _window(self, view: int) -> ZWindow | None:
         return None if self._own is None else self._windows[view]
 
-    def _paint(self, unit: int, loaded: Loaded, view: int) -> Parts | None:
+    def _paint(self, unit: int, loaded: Loaded, view: int) -> FrozenLayers | None:
         return self._painter.paint(
             unit,
             loaded,
@@ -214,7 +214,7 @@ class VisitLayers:
             window=self._window(view),
         )
 
-    def _keep(self, view: int, parts: dict[int, Parts | None]) -> Kept:
+    def _keep(self, view: int, parts: dict[int, FrozenLayers | None]) -> Kept:
         folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])
         layers = packed(folded)
         self._sum = self._sum + layers.sum()

@@ -55,7 +55,7 @@ def _waits(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     return gaussians.opacities[:, 0] == WAITING
 
 
-def part(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
+def split_by_block(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
     """By block, the rows that `owner` [n] gives it; the clocks stay those of `state`."""
     return {block: state[owner == block] for block in owner.unique().tolist()}
 
@@ -77,7 +77,7 @@ def blocks_at_rest(
         keep: begin with a scaffold of so many, the others, if any, in reserve; None for no warm-up.
     """
     if keep is None:
-        at_rest = part(BlockState.fresh(gaussians), tree.assign(gaussians.means))
+        at_rest = split_by_block(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
         return {b: at_rest.get(b, nobody).to_tensors() for b in range(tree.num_blocks)}
     scaffold, waiting = split_off(gaussians, keep, seed)

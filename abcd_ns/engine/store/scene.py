@@ -15,7 +15,7 @@ from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import BlockMemory
-from abcd_ns.engine.store.scaffold import drawn, part, revealed
+from abcd_ns.engine.store.scaffold import drawn, revealed, split_by_block
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -133,7 +133,7 @@ class StoredScene:
         """Find out who waits for which block."""
         before, self.inbox, self._mail = self._mail, inbox, {}
         if inbox is not None and len(inbox):
-            self._mail = part(inbox, self.tree.assign(inbox.gaussians.means))
+            self._mail = split_by_block(inbox, self.tree.assign(inbox.gaussians.means))
         for block in before.keys() | self._mail.keys():
             old, new = (
                 mail[block].gaussians.means if block in mail else None for mail in (before, self._mail)
@@ -173,11 +173,11 @@ class StoredScene:
         finally:
             self.store.close()
 
-    def lay_over(self, block: int | None, live: Callable[[], Gaussians]) -> None:
+    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
         """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest."""
         self._live = (block, live)
 
-    def lift(self) -> None:
+    def clear_live(self) -> None:
         """No block is live any more."""
         self._live = None
 
@@ -232,7 +232,7 @@ class StoredScene:
             return self._live[1]().detach()
         return drawn(self._with_mail(block))
 
-    def at_rest(self, block: int) -> Gaussians:
+    def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
         return revealed(self._with_mail(block))
 
@@ -279,5 +279,5 @@ class StoredScene:
             return bounds_of(self.gaussians(block))
         version = self.version(block)
         if block not in self._bounds or self._bounds[block][0] != version:
-            self._bounds[block] = (version, bounds_of(self.at_rest(block)))
+            self._bounds[block] = (version, bounds_of(self.gaussians_at_rest(block)))
         return self._bounds[block][1]

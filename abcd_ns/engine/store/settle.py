@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.store.scaffold import join, part, put_to_wait, revealed
+from abcd_ns.engine.store.scaffold import join, put_to_wait, revealed, split_by_block
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE, RESERVE, WHOLE
 
 
-def at_rest(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
+def state_for_visit(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
     """What is attached when a visit to `block`, or with WHOLE the warm-up, begins or goes on.
 
     Args:
@@ -24,8 +24,8 @@ def at_rest(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
     return replace(state, gaussians=revealed(state.gaussians))
 
 
-def count_at_rest(scene: StoredScene, block: int, saved: bool = False) -> int:
-    """Rows of `at_rest`, without reading them."""
+def rows_for_visit(scene: StoredScene, block: int, saved: bool = False) -> int:
+    """Rows of `state_for_visit`, without reading them."""
     if saved:
         return scene.rows(LIVE)
     return sum(scene.rows(number) + len(scene.mail(number) or ()) for number in _blocks(scene, block))
@@ -81,7 +81,8 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockSta
         KeyError: there is no reserve.
     """
     waiting = scene.state(RESERVE)
-    trained, arrivals = part(state, _owner(scene, state)), part(put_to_wait(waiting), _owner(scene, waiting))
+    trained = split_by_block(state, _owner(scene, state))
+    arrivals = split_by_block(put_to_wait(waiting), _owner(scene, waiting))
     nobody = replace(waiting.nobody, clocks=state.clocks)
     settled = {
         block: trained.get(block, nobody).joined_by(arrivals.get(block, nobody))

@@ -100,7 +100,7 @@ class Coordinator(Trainer):
         if not active.is_whole:
             infos = rendered.infos if sound else ()
             clock = self.live.density_clock(taken, self.batch, self.visits.room())
-            self.live.refine(infos, clock, self.steps.parts() if infos else ())
+            self.live.refine(infos, clock, self.steps.contributions() if infos else ())
             if self.live.is_due_to_shed(taken):
                 self.live.shed()
         self.announce(StepTaken(self.state.step, active.number, active.done, psnr))
@@ -125,7 +125,7 @@ class Coordinator(Trainer):
     def _attach(self, active: ActiveVisit) -> None:
         self.live.attach(active, self.batch)
         block, seen = None if active.is_whole else active.geometry.block, len(active.geometry.views)
-        self.scene.lay_over(block, self.visits.attached(active))
+        self.scene.set_live(block, self.visits.attached(active))
         state, gaussians = self.state, len(self.live)
         self.announce(VisitBegan(active.number, state.sweep, block, active.steps, seen, gaussians))
         before = self.stopwatch.seconds
@@ -153,7 +153,7 @@ class Coordinator(Trainer):
         tree, updates = cut_full(self.scene, updates, self.state, *limits, self.announce)
         if active.saved:
             updates[LIVE] = state.nobody
-        self.scene.lift()
+        self.scene.clear_live()
         self.steps.end_visit()
         self.state.active = None
         crash_points.reached(crash_points.VISIT_TRAINED)

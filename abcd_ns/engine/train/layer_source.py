@@ -56,7 +56,7 @@ class LayerSource:
             painter,
             LayerStore(run.device, self.room.device // active.crew, self.room.ram // active.crew),
             active.geometry,
-            run.scene.at_rest(active.geometry.block),
+            run.scene.gaussians_at_rest(active.geometry.block),
             run.views,
             PaintSettings(active.sh_degree, config.antialiased),
             window_weight=config.window_weight,

@@ -206,5 +206,6 @@ class Planner:
         if bounds is None:
             return VisitGeometry(block, {})
         (shows,) = self._frusta.may_show([self._optics.drawn_within(bounds)]).tolist()
-        near = [view for view, may in zip(self._views.values(), shows, strict=True) if may]
-        return survey(self._scene.at_rest(block).to(self._run.device), block, near, self._run.rasterizer)
+        seeing = [view for view, may in zip(self._views.values(), shows, strict=True) if may]
+        gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)
+        return survey(gaussians, block, seeing, self._run.rasterizer)

@@ -4,7 +4,7 @@ from abcd_ns.engine.events import Announcer, BlockSplit
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.partition import best_split
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.scaffold import part
+from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail, without
 from abcd_ns.engine.store.special_blocks import INBOX
@@ -60,7 +60,7 @@ def with_full(scene: StoredScene, settled: dict[int, BlockState], limit: int) ->
     inbox = settled.get(INBOX)
     if not limit or inbox is None:
         return settled
-    waiting = part(inbox, scene.tree.assign(inbox.gaussians.means))
+    waiting = split_by_block(inbox, scene.tree.assign(inbox.gaussians.means))
     full = {b: mail for b, mail in waiting.items() if scene.rows(b) + len(mail) > FULL * limit}
     joined = {block: scene.state(block).joined_by(mail) for block, mail in full.items()}
     return {**settled, **joined, INBOX: without(scene, inbox, full)} if full else settled

@@ -7,7 +7,7 @@ from statistics import fmean
 from abcd_ns.lab.job import Settings
 from abcd_ns.lab.results.records import encode, read_record, write_json
 from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.nerfstudio.machine import Machine, Versions
+from abcd_ns.machine import Machine, Versions
 
 SCHEMA = 2
 """Raised whenever a field changes its name or meaning."""

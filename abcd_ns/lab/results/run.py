@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from abcd_ns.nerfstudio.machine import Versions
+from abcd_ns.machine import Versions
 
 
 @dataclass(frozen=True)

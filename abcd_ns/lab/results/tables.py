@@ -14,7 +14,7 @@ from abcd_ns.lab.job import HELD_OUT_EVERY
 from abcd_ns.lab.results.findings import find_default, find_difference
 from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results
 from abcd_ns.lab.results.run import Run
-from abcd_ns.nerfstudio.machine import Machine
+from abcd_ns.machine import Machine
 
 TABLE_FILE = "table.md"
 NOTHING = "-"

@@ -13,7 +13,7 @@ from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Resu
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.results.tables import TABLE_FILE, print_table, write_table
 from abcd_ns.lab.runs.runner import claim, finish_job
-from abcd_ns.nerfstudio.machine import Machine, describe_machine, describe_versions
+from abcd_ns.machine import Machine, describe_machine, describe_versions
 
 Found = Sequence[tuple[Job, Run | Failure]]
 Draw = Callable[[Results, Path], list[Path]]

@@ -8,7 +8,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Job
 from abcd_ns.lab.results.records import decode, encode, read_json, write_json
 from abcd_ns.lab.results.run import Run
-from abcd_ns.nerfstudio.machine import peak_device_bytes, peak_rss_bytes
+from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
 
 RUN_FILE = "run.json"
 """Written when all is done, beside the job."""

@@ -27,7 +27,7 @@ from abcd_ns.lab.runs.evaluate import (
 )
 from abcd_ns.lab.runs.training import Training
 from abcd_ns.lab.runs.work import memory_of_run, work
-from abcd_ns.nerfstudio.machine import (
+from abcd_ns.machine import (
     describe_versions,
     disk_bytes,
     without_home,

@@ -28,7 +28,7 @@ from abcd_ns.lab.job import Job
 from abcd_ns.lab.results.run import Footing, Run
 from abcd_ns.lab.runs.work import memory_of_run, work
 from abcd_ns.lab.scale.land import Land
-from abcd_ns.nerfstudio.machine import describe_versions, disk_bytes, peak_rss_bytes
+from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 
 STORE = "store"
 WHOLE = "abcd-monolithic"

@@ -36,7 +36,7 @@ from abcd_ns.lab.stability.scenarios import (
     values,
 )
 from abcd_ns.lab.stability.scenarios.real import read_stage, real_scenarios
-from abcd_ns.nerfstudio.machine import describe_machine
+from abcd_ns.machine import describe_machine
 
 KIND = "stability report"
 _MODULES = (values, sizes, emptiness, growth, cameras, captures, freshness, borders)

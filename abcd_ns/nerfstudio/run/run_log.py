@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from abcd_ns.data.photos import Photos
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.nerfstudio.machine import peak_rss_bytes
+from abcd_ns.machine import peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import (
     KIND_OF,
     SCHEMA,

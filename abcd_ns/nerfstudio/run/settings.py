@@ -16,7 +16,7 @@ from typing import Any
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.store.atomic import write_file
-from abcd_ns.nerfstudio.machine import Machine, Versions, describe_machine, describe_versions
+from abcd_ns.machine import Machine, Versions, describe_machine, describe_versions
 
 SETTINGS_FILE = "settings.json"
 SCHEMA = 1

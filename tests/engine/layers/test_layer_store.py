@@ -5,7 +5,7 @@ import torch
 
 from abcd_ns.engine.layers import visit_layers as visit
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
-from abcd_ns.engine.layers.painter import Parts
+from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Layer
@@ -15,12 +15,12 @@ from tests.reference.scenes import make_coordinator, whole_scene
 CPU = torch.device("cpu")
 
 
-def kept(height: int = 5, width: int = 7, near: Splats | None = None) -> Kept:
-    return Kept(rounded(torch.rand(2, height, width, 4)), near)
+def kept(height: int = 5, width: int = 7, interleaved: Splats | None = None) -> Kept:
+    return Kept(rounded(torch.rand(2, height, width, 4)), interleaved)
 
 
 def test_packing_is_undone_by_unpacking():
-    parts = Parts(*(Layer(torch.rand(5, 7, 3), torch.rand(5, 7)) for _ in range(2)))
+    parts = FrozenLayers(*(Layer(torch.rand(5, 7, 3), torch.rand(5, 7)) for _ in range(2)))
     again = unpacked(packed(parts))
     for side in ("front", "back"):
         assert torch.equal(getattr(again, side).color, getattr(parts, side).color)
@@ -41,10 +41,10 @@ def test_a_colour_beyond_halves_is_their_largest():
     assert torch.equal(rounded(torch.full((2, 1, 1, 4), 1e6)).float(), torch.full((2, 1, 1, 4), 65504.0))
 
 
-@pytest.mark.parametrize("near", [None, Splats(torch.rand(11, 3))])
-def test_what_has_no_room_is_not_kept(near):
-    one = kept(near=near)
-    assert one.nbytes == 2 * 5 * 7 * 4 * 2 + (0 if near is None else 11 * 3 * 4)
+@pytest.mark.parametrize("interleaved", [None, Splats(torch.rand(11, 3))])
+def test_what_has_no_room_is_not_kept(interleaved):
+    one = kept(interleaved=interleaved)
+    assert one.nbytes == 2 * 5 * 7 * 4 * 2 + (0 if interleaved is None else 11 * 3 * 4)
     store = LayerStore(CPU, 2 * one.nbytes + 1, ram_bytes=1 << 30)
     for view in range(3):
         store.put(view, one)

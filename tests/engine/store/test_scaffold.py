@@ -106,7 +106,8 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, 
             faint = torch.sigmoid(live).sub(REVEALED_OPACITY).abs() < 1e-6
             assert len(live) == found
             assert bool(faint.any())
-            assert len(scene.at_rest(active.geometry.block)) == found  # what windows and views go by
+            # What windows and views go by.
+            assert len(scene.gaussians_at_rest(active.geometry.block)) == found
             visited.add(active.geometry.block)
         for block in set(range(4)) - visited:
             assert 0 < len(scene.gaussians(block)) < scene.count(block)

@@ -94,7 +94,7 @@ def test_what_density_control_counts_is_that_of_all_views(make, photos):
     crew, order = shared.steps.crew, shared.steps._order_of(shared.state.active, 1)
     rendered = shared.render(batch)
     shared.loss(batch, rendered.pictures, [photos(s.view.index, s.crop) for s in batch.samples]).backward()
-    (part,) = crew.parts()
+    (part,) = crew.contributions()
     own = shared.density.count(shared.params["means"], rendered.infos)
     found = {name: own[name] + part.counts[name] for name in own}
     alone.next_batch()
@@ -210,7 +210,7 @@ def test_what_counts_is_masked_in_helpers_too(make, photos):
         target=lambda s: (photos(s.view.index, s.crop), torch.zeros(s.crop.height, s.crop.width, 1))
     )
     nothing.next_batch()
-    (part,) = nothing.steps.crew.parts()
+    (part,) = nothing.steps.crew.contributions()
     assert all(float(value.abs().max()) == 0 for value in part.gradients.values())
     nothing.steps.crew.dismiss()
 

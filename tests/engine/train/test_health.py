@@ -91,7 +91,7 @@ def test_a_value_that_is_no_number_is_put_back_as_it_was_at_rest(tmp_path, views
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30, density=STILL)
     train_step(coordinator, photos)
     block = coordinator.state.active.geometry.block
-    before, told = coordinator.scene.at_rest(block), listen(coordinator, Mended)
+    before, told = coordinator.scene.gaussians_at_rest(block), listen(coordinator, Mended)
     with torch.no_grad():
         coordinator.params["means"][4, 1] = math.nan
         coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0

@@ -87,7 +87,7 @@ def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, sta
     assert {event.block for event in seen if isinstance(event, VisitBegan)} >= {cut.new for cut in cuts[:1]}
     assert coordinator.scene.store.header["tree"] == tree.to_json()
     for block in range(tree.num_blocks):
-        means = coordinator.scene.at_rest(block).means
+        means = coordinator.scene.gaussians_at_rest(block).means
         assert bool((tree.assign(means) == block).all())
 
 

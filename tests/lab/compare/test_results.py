@@ -13,7 +13,7 @@ from abcd_ns.lab.results.records import RecordError, decode, encode
 from abcd_ns.lab.results.results import SCHEMA, read_results, write_results
 from abcd_ns.lab.results.run import CurvePoint, Run
 from abcd_ns.lab.runs.evaluate import mean, ordering_gap
-from abcd_ns.nerfstudio.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
+from abcd_ns.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
 from tests.lab.compare.records import made_up_results, made_up_run
 
 RUN = ("arms", 0, "runs", 0)

@@ -19,7 +19,7 @@ from abcd_ns.engine.events import Announcer, Mended, VisitUndone
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.settle import at_rest
+from abcd_ns.engine.store.settle import state_for_visit
 from abcd_ns.engine.train.health.health_rules import (
     GIANT_ANGLE,
     HIDDEN,
@@ -178,7 +178,7 @@ class Health:
         record.undone += 1
         record.damping = max(record.damping / 2, LEAST_DAMPING)
         self._announce(VisitUndone(active.number, active.geometry.block, rise[0], rise[1]))
-        before = at_rest(self._scene, active.geometry.block)
+        before = state_for_visit(self._scene, active.geometry.block)
         clocks = replace(state.clocks, adam_views=before.clocks.adam_views)
         return replace(before, clocks=clocks)
 
@@ -227,7 +227,7 @@ class Health:
         """Numbers for `rows`: as they are at rest where rows still are what they were, else stand-ins."""
         active = self._active
         if active is not None and self._params["means"] is self._attached:
-            before = at_rest(self._scene, active.geometry.block, self._resumed).gaussians
+            before = state_for_visit(self._scene, active.geometry.block, self._resumed).gaussians
             if len(before) == len(live):
                 kept = before[rows.cpu()]
                 if not bool(unsound(kept).any()):

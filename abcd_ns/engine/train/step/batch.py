@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import sandwich
-from abcd_ns.engine.layers.painter import Parts
+from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.render.projection import Splats
@@ -29,8 +29,8 @@ class Sample:
 
     view: View
     crop: Crop
-    layers: Parts | None
-    near: Splats | None
+    layers: FrozenLayers | None
+    interleaved: Splats | None
     window: ZWindow | None
     background: Float[Tensor, "3"]
     share: float = 1.0
@@ -44,7 +44,7 @@ class Sample:
     @property
     def shot(self) -> Shot:
         """What the rasterizer is to draw."""
-        return Shot(self.view, self.crop, self.near, None if self.near is None else self.window)
+        return Shot(self.view, self.crop, self.interleaved, None if self.interleaved is None else self.window)
 
     def picture(self, raster: Raster) -> Float[Tensor, "h w 3"]:
         """What the rasterizer drew, between the layers and on the background, 0..1."""

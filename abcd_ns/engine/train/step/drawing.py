@@ -28,7 +28,7 @@ from abcd_ns.engine.train.step.batch import Backgrounds, Batch, Rendered, Sample
 from abcd_ns.engine.train.step.weighing import weighed
 from abcd_ns.engine.train.step.workers.crew import Crew
 from abcd_ns.engine.train.step.workers.helper_process import can_fork
-from abcd_ns.engine.train.step.workers.share import DrawShare, Part, Share, Target, Task, share_of
+from abcd_ns.engine.train.step.workers.share import Contribution, DrawShare, Share, Target, Task, share_of
 from abcd_ns.engine.types import Crop, Gaussians
 
 
@@ -152,9 +152,9 @@ class StepDrawing:
             return photometric
         return photometric + run.density.regularisation(run.params, run.count())
 
-    def parts(self) -> list[Part]:
+    def contributions(self) -> list[Contribution]:
         """What helpers add to the step."""
-        return [] if self.crew is None else self.crew.parts()
+        return [] if self.crew is None else self.crew.contributions()
 
     @property
     def _degree(self) -> int:
@@ -176,7 +176,7 @@ class StepDrawing:
             view=self._run.views[view],
             crop=crop,
             layers=around and around.layers,
-            near=around and around.near,
+            interleaved=around and around.interleaved,
             window=around and around.window,
             background=self._backgrounds.at(step, place),
         )

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
-from abcd_ns.engine.store.settle import at_rest, count_at_rest
+from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos, added
 from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.splitting import is_full
-from abcd_ns.engine.train.step.workers.share import Part
+from abcd_ns.engine.train.step.workers.share import Contribution
 
 
 class LiveBlock:
@@ -39,8 +39,8 @@ class LiveBlock:
             OutOfRoomError: it does not fit on the device.
         """
         run, which = self._run, (self._run.scene, active.geometry.block, active.saved)
-        check_room(count_at_rest(*which), run.config.sh_degree, run.device)
-        rest = at_rest(*which).to(run.device)
+        check_room(rows_for_visit(*which), run.config.sh_degree, run.device)
+        rest = state_for_visit(*which).to(run.device)
         if active.done == 0 and not run.config.recipe.keep_moments:
             rest = rest.forgetful()
         attach(rest, run.params, run.optimizers, batch=batch)
@@ -67,16 +67,16 @@ class LiveBlock:
         """A visit has ended."""
         self.clocks = replace(self.clocks, visits=self.clocks.visits + 1)
 
-    def refine(self, infos: Infos, clock: DensityClock, parts: Sequence[Part] = ()) -> None:
+    def refine(self, infos: Infos, clock: DensityClock, contributions: Sequence[Contribution] = ()) -> None:
         """Grow and prune, where it is time for that.
 
         Args:
             infos: of the step's drawings; none where its gradients were no numbers.
-            parts: what helpers have counted.
+            contributions: what helpers have counted.
         """
         run = self._run
-        for part in parts:
-            self.growth = added(self.growth, part.counts)
+        for contribution in contributions:
+            self.growth = added(self.growth, contribution.counts)
         self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock)
         if run.density.resets(clock):
             self.clocks = replace(self.clocks, resets=clock.steps // run.config.density.reset_every)

@@ -66,7 +66,7 @@ class DampedBlock(LiveBlock):
         state, active = super().detached(), self._run.state.active
         if active is None or active.is_whole:
             return state
-        before = self._run.scene.at_rest(active.geometry.block)
+        before = self._run.scene.gaussians_at_rest(active.geometry.block)
         mixed = {n: torch.lerp(getattr(before, n), v, self._share) for n, v in state.gaussians.items()}
         return BlockState(
             Gaussians(**mixed), state.exp_avg, state.exp_avg_sq, state.growth, state.clocks

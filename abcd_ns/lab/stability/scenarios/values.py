@@ -12,7 +12,7 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, nothing_live
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.compositing import composite
 from abcd_ns.engine.layers.layer_store import packed, rounded, unpacked
-from abcd_ns.engine.layers.painter import Parts
+from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -136,7 +136,7 @@ def bright_and_hidden(lab: Lab) -> Finding:
     bright = replace(stage.start(), features_dc=torch.full((len(stage.points), 3), 1.1 / SH_C0))
     bright = replace(bright, opacities=torch.full_like(bright.opacities, 4.0), scales=bright.scales + 1)
     layer = lab.rasterizer(bright, stage.views[0], sh_degree=0).layer
-    back = unpacked(rounded(packed(Parts(layer, layer))).float()).back
+    back = unpacked(rounded(packed(FrozenLayers(layer, layer))).float()).back
     brightest = float(back.color.max())
     # Behind half a pane, 1.6 is 0.8: it must not be clipped before that.
     dimmed = float(composite(replace(back, color=0.5 * back.color), torch.zeros(3)).max())

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.train.step.workers.helper_process import HelperProcess, Room
-from abcd_ns.engine.train.step.workers.share import Drawn, DrawShare, Part, Share, Task
+from abcd_ns.engine.train.step.workers.share import Contribution, Drawn, DrawShare, Share, Task
 from abcd_ns.engine.train.step.workers.shared_memory import SharedRows
 from abcd_ns.engine.types import Gaussians
 
@@ -62,7 +62,7 @@ class Helper:
             self._drawn = self._share.drawn
         return self._drawn
 
-    def part(self) -> Part:
+    def contribution(self) -> Contribution:
         """What its share adds to the step; waits for it."""
         self.drawn()
         if self._share is None:
@@ -115,7 +115,7 @@ class Crew:
             room = Room(self._params, gaussians, self._limit)
             process = HelperProcess(room, lambda make=make: make(True)) if forks else None
             self._helpers.append(Helper(room, process, make(False)))
-        self._parts: list[Part] | None = []
+        self._contributions: list[Contribution] | None = []
         self._joined: Tensor | None = None
 
     @property
@@ -125,9 +125,9 @@ class Crew:
 
     def begin(self, live: Gaussians, task: Task) -> None:
         """Let the helpers begin a step."""
-        if self._parts is None:  # the last step's gradient was never asked for
-            self.parts()
-        fits, self._parts = len(live) <= self._limit, None
+        if self._contributions is None:  # the last step's gradient was never asked for
+            self.contributions()
+        fits, self._contributions = len(live) <= self._limit, None
         if fits and self.pids:
             self._params.write(dict(live.items()))
         for helper in self._helpers:
@@ -145,11 +145,11 @@ class Crew:
             raise RuntimeError("no step was begun")
         return self._joined + sum(each.loss for each in self.drawn())
 
-    def parts(self) -> list[Part]:
+    def contributions(self) -> list[Contribution]:
         """What the helpers add to the step; waits for them."""
-        if self._parts is None:
-            self._parts = [helper.part() for helper in self._helpers]
-        return self._parts
+        if self._contributions is None:
+            self._contributions = [helper.contribution() for helper in self._helpers]
+        return self._contributions
 
     def dismiss(self) -> None:
         """End all processes. Harmless when done twice."""
@@ -168,5 +168,5 @@ class _Joined(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        by_parameter = zip(*(part.gradients.values() for part in ctx.crew.parts()), strict=True)
+        by_parameter = zip(*(part.gradients.values() for part in ctx.crew.contributions()), strict=True)
         return None, *(upstream * torch.stack(rows).sum(dim=0) for rows in by_parameter)

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import torch
 
 from abcd_ns.engine.train.density.control import COUNTED
-from abcd_ns.engine.train.step.workers.share import DrawShare, Part, Task
+from abcd_ns.engine.train.step.workers.share import Contribution, DrawShare, Task
 from abcd_ns.engine.train.step.workers.shared_memory import SharedRows
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
@@ -41,16 +41,16 @@ class Room:
         self.gradients = SharedRows.like(like, rows)
         self.counts = SharedRows(dict.fromkeys(COUNTED, ()), rows)
 
-    def give(self, part: Part) -> bool:
+    def give(self, part: Contribution) -> bool:
         """Write what a share adds; whether there were counts."""
         self.gradients.write(part.gradients)
         self.counts.write(part.counts)
         return bool(part.counts)
 
-    def take(self, rows: int, counted: bool) -> Part:
+    def take(self, rows: int, counted: bool) -> Contribution:
         """Read it: shared memory, to be used before the next step."""
         gradients = {name: self.gradients.rows(name, rows) for name in PARAM_NAMES}
-        return Part(gradients, {n: self.counts.rows(n, rows) for n in COUNTED} if counted else {})
+        return Contribution(gradients, {n: self.counts.rows(n, rows) for n in COUNTED} if counted else {})
 
     def leaves(self, rows: int) -> Gaussians:
         """The parameters, to be differentiated by."""

@@ -41,7 +41,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Part:
+class Contribution:
     """What a share adds to a step."""
 
     gradients: dict[str, Tensor]
@@ -55,7 +55,7 @@ class Share:
     """A share that is drawn, and yet to be differentiated."""
 
     drawn: Drawn
-    differentiate: Callable[[], Part]
+    differentiate: Callable[[], Contribution]
     """Takes the gradient; once."""
 
 
@@ -90,11 +90,11 @@ def share_of(
     numbers = torch.stack([each.detach() for each in losses]).tolist()
     indices = (sample.view.index for sample in samples)
 
-    def differentiate() -> Part:
+    def differentiate() -> Contribution:
         if loss.requires_grad:
             loss.backward()
         gradients = {n: torch.zeros_like(v) if v.grad is None else v.grad for n, v in gaussians.items()}
-        return Part(gradients, density.count(gaussians.means, rendered.infos))
+        return Contribution(gradients, density.count(gaussians.means, rendered.infos))
 
     drawn = Drawn(tuple(zip(indices, numbers, strict=True)), float(loss.detach()), float(max(shown)))
     return Share(drawn, differentiate)

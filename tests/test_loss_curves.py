@@ -1,0 +1,23 @@
+"""What every method learns on a tiny scene is what it learnt before: tests/reference/loss_curves.json."""
+
+import json
+
+import pytest
+
+from tests.reference.loss_curves import CURVES, METHODS, STEPS, curve_of
+
+KNOWN = json.loads(CURVES.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_learns_as_it_did(method, tmp_path):
+    """If the change is meant: `python -m tests.reference.loss_curves`, and look at the difference."""
+    found = curve_of(method, tmp_path)
+    assert len(found["psnr"]) == STEPS
+    assert found["gaussians"] == KNOWN[method]["gaussians"]
+    assert found["psnr"] == pytest.approx(KNOWN[method]["psnr"], abs=2e-3)
+
+
+def test_curves_tell_methods_apart():
+    ends = [tuple(KNOWN[method]["psnr"][-5:]) for method in METHODS]
+    assert len(set(ends)) == len(METHODS)
