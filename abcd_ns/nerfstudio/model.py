@@ -1,6 +1,7 @@
 """Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -16,6 +17,7 @@ from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
 from abcd_ns.engine.render import Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, psnrs, ssim_windows
@@ -117,13 +119,18 @@ class AbcdModel(SplatfactoModel):
         scene = self._coordinator.scene
         return Gaussians.cat([scene.gaussians(block).to("cpu") for block in range(scene.tree.num_blocks)])
 
-    def initial_gaussians(self) -> Gaussians:
-        """What a run begins with: a Gaussian for each point, or random ones."""
+    def initial_gaussians(self, views: Sequence[View], point_pixels: float) -> Gaussians:
+        """What a run begins with: random Gaussians, or one for each point that the views can tell apart.
+
+        Args:
+            point_pixels: see TrainingConfig.
+        """
         config = self.config
         if self.seed_points is None or config.random_init or len(self.seed_points[0]) == 0:
             points, colors = random_points(config.num_random, config.random_scale)
         else:
-            points, colors = (values.cpu() for values in self.seed_points)
+            points, colors = (values.cpu().float() for values in self.seed_points)
+            points, colors = thin_points(points, colors, views, point_pixels)
         return gaussians_from_points(points.float(), colors, sh_degree=config.sh_degree)
 
     # -- checkpoints ---------------------------------------------------------------------------------

@@ -273,11 +273,12 @@ class AbcdPipeline(VanillaPipeline):
         made_for = MadeFor.of(photos, views, training)
         if asked.resumed_from is not None:
             return take_over(asked.resumed_from, folder, made_for), True
-        everything = self.model.initial_gaussians()
+        everything = self.model.initial_gaussians(views, training.point_pixels)
+        self._tell_of_points(len(everything))
         gaussians = thin_out(everything, training.density.limit, training.seed)
         if len(gaussians) < len(everything):
             CONSOLE.print(
-                f"Training begins with {len(gaussians):,} of {len(everything):,} points, the limit "
+                f"Training begins with {len(gaussians):,} of {len(everything):,} Gaussians, the limit "
                 "on Gaussians.",
                 highlight=False,
             )
@@ -294,6 +295,12 @@ class AbcdPipeline(VanillaPipeline):
         keep = scaffold_size(training, largest, self._pixels) if warms_up else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
+
+    def _tell_of_points(self, begun: int) -> None:
+        known = 0 if self.model.seed_points is None else len(self.model.seed_points[0])
+        if begun < known:
+            words = f"{known:,} points begin as {begun:,} Gaussians: photos of this size show no more apart."
+            CONSOLE.print(words, highlight=False)
 
 
 def cut_space(gaussians: Gaussians, blocks: int, partition: str) -> BlockTree:

@@ -11,7 +11,7 @@ from typing import Annotated, TypeVar
 import psutil
 import torch
 import tyro
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -29,6 +29,7 @@ from abcd_ns.cli.plan.forecast import (
 )
 from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of
@@ -102,7 +103,7 @@ class Capture:
     """What there is to train on."""
 
     points: Float[Tensor, "n 3"]
-    colors: UInt8[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
     views: list[View]
     factor: int = 1
     """By which the photos were reduced."""
@@ -123,8 +124,10 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
         points = dataset.metadata["points3D_xyz"].float()
         views = views_of(dataset.cameras)
         near = near_plane(points, views)
-        colors = dataset.metadata["points3D_rgb"]
-        return Capture(points, colors, [replace(v, near=near) for v in views], manager.dataparser.factor)
+        views = [replace(view, near=near) for view in views]
+        pixels = methods.abcd.config.pipeline.training.point_pixels
+        thinned = thin_points(points, dataset.metadata["points3D_rgb"].float(), views, pixels)
+        return Capture(*thinned, views, manager.dataparser.factor)
 
     return _said(console, "Reading the capture", work)
 

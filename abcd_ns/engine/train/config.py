@@ -56,6 +56,9 @@ class TrainingConfig:
     """What lies behind the scene while training."""
     means_lr_decay: float = 0.01
     """Learning rate of the means at the end, as a share of the start's; exponential over the run."""
+    point_pixels: float = 2.0
+    """Points of the cloud that lie in a cube so many pixels wide, in the view that sees them from nearest,
+    begin as one Gaussian; 0 begins with all."""
     seed: int = 0
     """Of the order of blocks and views, backgrounds and splits."""
     density: DensityConfig = field(default_factory=DensityConfig)

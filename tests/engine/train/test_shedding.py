@@ -58,7 +58,7 @@ def test_what_was_seen_long_ago_counts_for_less():
     ("progress", "ends", "expected"),
     [(0.0, 0.5, 0.0), (0.25, 0.5, 1.5), (0.5, 0.5, 3.0), (0.69, 0.5, 3.0), (0.7, 0.5, 0.0), (0.0, 0.0, 3.0)],
 )
-def test_the_price_rises_until_growth_ends_and_falls_when_nothing_could_be_made_good(progress, ends, expected):
+def test_the_price_rises_with_growth_and_is_off_when_nothing_could_be_made_good(progress, ends, expected):
     assert price_at(3.0, progress, ends) == pytest.approx(expected)
 
 

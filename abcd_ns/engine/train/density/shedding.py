@@ -54,8 +54,8 @@ def faded(growth: Mapping[str, Tensor], views: int) -> dict[str, Float[Tensor, "
 
 
 def price_at(price: float, progress: float, growth_ends: float) -> float:
-    """The price at a share of the run: it rises until growth ends, for who is new has not found its place. Late
-    in the run only what fills nothing at all goes, for what is missed could not be made good."""
+    """The price at a share of the run: it rises until growth ends, for who is new has not found its place.
+    Late in the run only what fills nothing at all goes, for what is missed could not be made good."""
     if progress >= LAST:
         return 0.0
     return price * min(progress / growth_ends, 1.0) if growth_ends > 0 else price

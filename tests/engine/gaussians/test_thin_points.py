@@ -1,0 +1,63 @@
+"""Points that no view can tell apart become one."""
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.gaussians.thin_points import finest_pixel, thin_points
+from tests.reference.scenes import ring_of_views
+
+VIEWS = ring_of_views(6)
+
+
+def cloud(count: int, seed: int, width: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    points = (torch.rand(count, 3, generator=generator) - 0.5) * width
+    return points, torch.rand(count, 3, generator=generator) * 255
+
+
+def test_a_pixel_is_as_wide_as_the_nearest_view_that_sees_the_point_has_it():
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.2, 0.1], [0.0, 0.0, 90.0]])
+    found = finest_pixel(points, VIEWS)
+    for point, width in zip(points, found, strict=True):
+        seen = []
+        for view in VIEWS:
+            x, y, z = (view.viewmat[:3, :3] @ point + view.viewmat[:3, 3]).tolist()
+            u, v = (view.K[0, 0] * x / z + view.K[0, 2], view.K[1, 1] * y / z + view.K[1, 2])
+            if z > view.near and 0 <= u < view.width and 0 <= v < view.height:
+                seen.append(z / float(view.K[0, 0]))
+        torch.testing.assert_close(float(width), min(seen, default=float("inf")), rtol=1e-5, atol=0)
+    assert found[2].isinf()
+
+
+@given(seed=st.integers(0, 1000), pixels=st.floats(0.1, 8), width=st.floats(0.05, 2.0))
+def test_no_point_is_far_from_the_one_that_stands_for_it(seed, pixels, width):
+    points, colors = cloud(60, seed, width)
+    found, tints = thin_points(points, colors, VIEWS, pixels)
+    assert 1 <= len(found) <= len(points)
+    assert len(tints) == len(found)
+    size = pixels * finest_pixel(points, VIEWS)
+    away = torch.cdist(points.double(), found.double()).amin(dim=1)
+    assert bool((away <= 3**0.5 * size + 1e-6).all())
+    assert float(tints.min()) >= float(colors.min()) - 1e-3
+    assert float(tints.max()) <= float(colors.max()) + 1e-3
+
+
+def test_a_clump_is_one_point_in_its_midst_of_its_mean_colour():
+    points, colors = cloud(50, 3, width=1e-5)
+    found, tints = thin_points(points + 0.013, colors, VIEWS, 2.0)
+    torch.testing.assert_close(found, (points + 0.013).mean(dim=0, keepdim=True), rtol=0, atol=1e-5)
+    torch.testing.assert_close(tints, colors.mean(dim=0, keepdim=True), rtol=1e-4, atol=1e-2)
+
+
+def test_points_that_nobody_sees_stay_and_so_do_all_at_0():
+    points, colors = cloud(40, 4, width=1e-4)
+    unseen = points + torch.tensor([0.0, 0.0, 500.0])
+    assert len(thin_points(unseen, colors, VIEWS, 2.0)[0]) == 40
+    assert thin_points(points, colors, VIEWS, 0.0)[0] is points
+
+
+def test_fine_photos_keep_what_coarse_ones_do_not():
+    points, colors = cloud(400, 5, width=0.6)
+    coarse, fine = (ring_of_views(6, width=48 * k, height=36 * k) for k in (1, 8))
+    assert len(thin_points(points, colors, coarse, 2.0)[0]) < len(thin_points(points, colors, fine, 2.0)[0])
