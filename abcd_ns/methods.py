@@ -25,7 +25,7 @@ PAPER = TrainingConfig(
     heal=False,
     ssim_lambda=0.0,
 )
-"""What Shiu and Subr 2026 did, as far as it is published; docs/method.md says where it is not."""
+"""What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""
 
 
 PEER_BLOCKS = 8

@@ -1,6 +1,6 @@
 """Draws frozen blocks into layers, as many blocks in one pass as the device has room for.
 
-With ownership by *fragments* (design, section 2) a layer holds the fragments of one convex node of the
+With ownership by *fragments* (docs/design.md) a layer holds the fragments of one convex node of the
 block tree, drawn from all Gaussians that reach into it, so that folding layers gives the merged picture.
 With ownership by *means* a layer holds a node's own Gaussians whole, as the paper has it.
 """

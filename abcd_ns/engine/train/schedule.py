@@ -1,7 +1,7 @@
 """Which block next, for how many steps, on which views: pure functions of integers.
 
 There is one step budget for the whole scene. A sweep visits every block that some view sees; a block's
-steps are proportional to the number of those views, as in joint training (design, section 2: blocks that
+steps are proportional to the number of those views, as in joint training (docs/design.md: blocks that
 few views see overfit otherwise). Visits are short at first, while the neighbours are still blobs, and
 grow longer, so that drawing the frozen layers is paid for by more steps.
 """
