@@ -5,6 +5,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
@@ -24,6 +25,8 @@ PAPER = TrainingConfig(
     visit_views=10**6,
     heal=False,
     ssim_lambda=0.0,
+    point_pixels=0.0,
+    density=DensityConfig(price=-1.0),
 )
 """What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""
 
@@ -72,7 +75,11 @@ abcd_partition = MethodSpecification(
         _trainer(
             "abcd-partition",
             blocks=PEER_BLOCKS,
-            training=TrainingConfig(recipe=Recipe(layers=False, overlap=0.2, migrate=False), warmup=0.0),
+            training=TrainingConfig(
+                recipe=Recipe(layers=False, overlap=0.2, migrate=False),
+                warmup=0.0,
+                density=DensityConfig(price=-1.0),  # blocks have one visit, and nothing after it
+            ),
         )
     ),
     description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
