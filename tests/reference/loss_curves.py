@@ -7,7 +7,7 @@ writes that file anew: where a change is meant to change what is learnt, and say
 
 import json
 import tempfile
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import torch
@@ -16,7 +16,6 @@ from abcd_ns import methods
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
@@ -25,7 +24,7 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 CURVES = Path(__file__).with_suffix(".json")
 STEPS, BLOCKS, SCAFFOLD = 40, 4, 60
 METHODS = ("abcd", "abcd_ablated", "abcd_partition", "abcd_exact", "abcd_paper", "abcd_monolithic")
-OFTEN = DensityConfig(refine_start=0.1, refine_every=5)
+OFTEN = {"refine_start": 0.1, "refine_every": 5}
 """So that such short runs grow."""
 
 
@@ -37,6 +36,7 @@ def options_of(method: str) -> dict:
     changed = {
         name: getattr(training, name) for name in own if getattr(training, name) != getattr(default, name)
     }
+    changed["density"] = replace(training.density, **OFTEN)
     return {**changed, **asdict(training.recipe), "visit_steps": 5 * (training.recipe.visit_steps > 0)}
 
 
@@ -55,7 +55,7 @@ def curve_of(method: str, folder: Path) -> dict[str, list[float]]:
         options["scaffold"] = SCAFFOLD
     blocks = 1 if method == "abcd_monolithic" else BLOCKS
     trainer = make_coordinator(
-        folder, start, views, blocks=blocks, steps=STEPS, kind=kind, content=content, density=OFTEN, **options
+        folder, start, views, blocks=blocks, steps=STEPS, kind=kind, content=content, **options
     )
     found: dict[str, list[float]] = {"psnr": [], "gaussians": []}
 
