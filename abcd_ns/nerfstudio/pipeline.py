@@ -290,16 +290,22 @@ class AbcdPipeline(VanillaPipeline):
             store.commit(independent_at_rest(tree, gaussians))
             return store, False
         warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.recipe.exact
-        largest = fitted["block_limit"] or -(-len(gaussians) // tree.num_blocks)
+        # Blocks grow to hold as many Gaussians as there were points, and so may the scaffold.
+        grown = max(min(self._points, training.density.limit or self._points), len(gaussians))
+        largest = fitted["block_limit"] or -(-grown // tree.num_blocks)
         training = replace(training, limits=replace(training.limits, **fitted))
         keep = scaffold_size(training, largest, self._pixels) if warms_up else None
         store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
 
+    @property
+    def _points(self) -> int:
+        """In the cloud."""
+        return 0 if self.model.seed_points is None else len(self.model.seed_points[0])
+
     def _tell_of_points(self, begun: int) -> None:
-        known = 0 if self.model.seed_points is None else len(self.model.seed_points[0])
-        if begun < known:
-            words = f"{known:,} points begin as {begun:,} Gaussians: photos of this size show no more apart."
+        if begun < self._points:
+            words = f"{self._points:,} points begin as {begun:,} Gaussians: photos of this size show no more."
             CONSOLE.print(words, highlight=False)
 
 
