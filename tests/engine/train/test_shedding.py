@@ -19,7 +19,7 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
 """Nothing grows, and the price is the full one from the beginning."""
-HIDDEN = 30
+HIDDEN = 20
 
 
 def statistics(weight: list[float], looks: list[float]) -> dict[str, torch.Tensor]:
