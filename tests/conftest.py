@@ -1,14 +1,17 @@
 """Set-up that must happen before any test module is imported."""
 
 import sys
+from pathlib import Path
 from types import ModuleType
 
+import pytest
 import torch
 from hypothesis import settings
+from jaxtyping import config as checks
 from jaxtyping import install_import_hook
 
-# Shapes and dtypes in these packages' signatures are checked on every call. The hook only works on modules
-# that are not imported yet, hence here and not in a fixture.
+# Shapes and dtypes in these packages' signatures are checked when they are called. The hook only works on
+# modules that are not imported yet, hence here and not in a fixture.
 install_import_hook(["abcd_ns.engine", "abcd_ns.peers"], "beartype.beartype")
 
 # The same sums in the same order on any machine, and room for other processes.
@@ -24,3 +27,15 @@ if not torch.cuda.is_available():
     backend = ModuleType("gsplat.cuda._backend")
     backend._C = None
     sys.modules["gsplat.cuda._backend"] = backend
+
+TRAIN = ("engine/train", "engine/store", "simulated", "peers", "lab", "nerfstudio", "cli", "benchmarks")
+"""Folders whose tests train for many steps: checks would take half their time. `test_loss_curves` has every
+method train with checks on."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _shapes_are_checked(request):
+    folder = request.path.parent.relative_to(Path(__file__).parent).as_posix()
+    checks.update("jaxtyping_disable", folder.startswith(TRAIN))
+    yield
+    checks.update("jaxtyping_disable", False)

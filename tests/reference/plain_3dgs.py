@@ -23,7 +23,7 @@ def train_plain(
         name: torch.optim.Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
         for name in PARAM_NAMES
     }
-    draw, density, growth = TorchRasterizer(compile="never"), DensityControl(config.density), {}
+    draw, density, growth = TorchRasterizer(), DensityControl(config.density), {}
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
         adam["means"].param_groups[0]["lr"] = exponential_decay(

@@ -65,7 +65,7 @@ class Photos:
     """Photos of `truth`, drawn once; callable as the training loop's photo reader."""
 
     def __init__(self, truth: Gaussians, views: list[View]) -> None:
-        draw = TorchRasterizer(compile="never")
+        draw = TorchRasterizer()
         with torch.no_grad():
             rasters = {v.index: draw(truth, v, sh_degree=truth.sh_degree) for v in views}
         self.images = {i: r.color.clamp(0, 1) for i, r in rasters.items()}
@@ -113,7 +113,7 @@ def make_coordinator(
         Budget(steps=steps),
         StoredScene(tree, store, ram_bytes),
         views,
-        rasterizer or TorchRasterizer(compile="never"),
+        rasterizer or TorchRasterizer(),
         *nothing_live(gaussians.sh_degree, device),
         device=device,
     )

@@ -24,7 +24,7 @@ from abcd_ns.viewer.pictures import (
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 SETTINGS = PaintSettings(sh_degree=1)
-DRAW = TorchRasterizer(compile="never")
+DRAW = TorchRasterizer()
 GAUSSIANS = random_gaussians(400, size=0.03, dtype=torch.float64)
 VIEW = ring_of_views(3, dtype=torch.float64)[1]
 TREE = build_kd(GAUSSIANS.means, 6)

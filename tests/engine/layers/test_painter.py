@@ -18,8 +18,8 @@ from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, Layer, View
 from tests.reference.rasterizer_scenes import as_leaves, probe, relative_error
 from tests.reference.scenes import random_gaussians, ring_of_views
 
-DRAW = TorchRasterizer(compile="never")
-BY_SIDE = {side: TorchRasterizer(compile="never", tile_side=side) for side in (1, 4, 16)}
+DRAW = TorchRasterizer()
+BY_SIDE = {side: TorchRasterizer(tile_side=side) for side in (1, 4, 16)}
 """Rasterizers by the side of their tiles, and so of their windows."""
 SETTINGS = PaintSettings(sh_degree=1)
 

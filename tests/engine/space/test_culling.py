@@ -17,7 +17,7 @@ from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians
 from tests.reference.scenes import random_gaussians, ring_of_views
 
-DRAW = TorchRasterizer(compile="never")
+DRAW = TorchRasterizer()
 SETTINGS = PaintSettings(sh_degree=1)
 
 

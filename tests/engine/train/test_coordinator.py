@@ -30,7 +30,7 @@ def test_training_improves_every_photo(tmp_path, views, photos, start):
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=120, background="black")
 
     def error() -> list[float]:
-        draw = TorchRasterizer(compile="never")
+        draw = TorchRasterizer()
         scene = whole_scene(coordinator)
         with torch.no_grad():
             pictures = [draw(scene, v, sh_degree=1).color.clamp(0, 1) for v in views]
@@ -101,7 +101,7 @@ def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership):
 
 def _gradient_of_whole_picture(coordinator, sample, weights, block, ownership) -> dict[str, torch.Tensor]:
     """By autograd through one render of everything (fragments) or through the fold of all blocks (means)."""
-    draw, tree = TorchRasterizer(compile="never"), coordinator.scene.tree
+    draw, tree = TorchRasterizer(), coordinator.scene.tree
     blocks = {b: coordinator.scene.gaussians(b) for b in range(tree.num_blocks)}
     active = Gaussians(**{n: v.clone().requires_grad_() for n, v in blocks[block].items()})
     degree = coordinator.run.active.sh_degree
@@ -276,7 +276,7 @@ def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start, 
     start, views = start.to(torch.float64), [view.to(torch.float64) for view in views]
     options = {"window_weight": 0.0, "pass_gaussians": pass_gaussians}
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, **options)
-    draw = TorchRasterizer(compile="never")
+    draw = TorchRasterizer()
     scene = whole_scene(coordinator)
     for _ in range(4):
         batch = coordinator.next_batch()
@@ -298,7 +298,7 @@ def test_a_giant_is_trained_where_it_reaches_out_of_its_cell(tmp_path, views, st
     start.opacities[3] = 2.0
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, visit_steps=1)
     scene, tree = whole_scene(coordinator), coordinator.scene.tree
-    owner, draw, seen = int(tree.assign(start.means[3:4])), TorchRasterizer(compile="never"), 0
+    owner, draw, seen = int(tree.assign(start.means[3:4])), TorchRasterizer(), 0
     for _ in range(4):
         batch = coordinator.next_batch()
         if coordinator.state.active.geometry.block == owner:
@@ -332,7 +332,7 @@ def test_visits_count_what_their_layers_cost_and_a_new_sweep_begins_anew(tmp_pat
 def test_layers_show_what_earlier_visits_made_of_the_other_blocks(tmp_path, views, photos, start):
     """Invariant 6: whenever a visit begins, its pictures are those of the whole scene as it is by then."""
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, window_weight=0.0, visit_steps=2)
-    draw, render, begun = TorchRasterizer(compile="never"), coordinator.render, 0
+    draw, render, begun = TorchRasterizer(), coordinator.render, 0
 
     def compared(batch):
         nonlocal begun

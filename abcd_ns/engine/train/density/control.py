@@ -18,7 +18,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
-from abcd_ns.engine.train.density.shedding import WEIGHED, faded, price_at, weigh, worthless
+from abcd_ns.engine.train.density.shedding import WEIGHED, faded, may_grow, price_at, weigh, worthless
 
 # Step numbers as gsplat sees them. It refines on multiples of REFINE, resets opacities on multiples of
 # `reset_every` (never, with these numbers) and prunes by size where step > reset_every.
@@ -281,6 +281,8 @@ class DensityControl:
         )
         state: dict[str, Any] = {"scene_scale": 1.0, **growth}
         if self.refines(clock, infos):
+            growth = self._payable(growth, clock.views)
+            state |= growth
             strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, clock.room)
             # Nothing is visible in this info, so the statistics are not gathered twice.
             unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
@@ -288,6 +290,13 @@ class DensityControl:
         if self.resets(clock):
             gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
         return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+
+    def _payable(self, growth: dict[str, Tensor], views: int) -> dict[str, Tensor]:
+        """The statistics without the gradients of those that fill too little to become two."""
+        if not self.weighs or any(name not in growth for name in WEIGHED):
+            return growth
+        grows = may_grow(growth, views, self.config.price)
+        return {**growth, "grad2d": torch.where(grows, growth["grad2d"], 0.0)}
 
     def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:
         room = len(params["means"]) if clock.room is None else clock.room

@@ -47,6 +47,18 @@ def worthless(growth: Mapping[str, Tensor], views: int, price: float) -> Bool[Te
     return (looks >= views) & (weight * views <= price * looks)
 
 
+def may_grow(growth: Mapping[str, Tensor], views: int, price: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians fill enough of their block's views for two, so that both that growth leaves of one fill
+    their price. Whoever was not weighed may grow.
+
+    Args:
+        growth: with WEIGHED.
+        views: that see the block.
+    """
+    weight, looks = (growth[name] for name in WEIGHED)
+    return weight * views >= 2.0 * price * looks
+
+
 def faded(growth: Mapping[str, Tensor], views: int) -> dict[str, Float[Tensor, "n"]]:
     """The statistics when all have been judged: what is seen from now on soon counts for more."""
     half = torch.where(growth["looks"] >= views, 0.5, 1.0)
