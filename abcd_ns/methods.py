@@ -26,7 +26,7 @@ PAPER = TrainingConfig(
     heal=False,
     ssim_lambda=0.0,
     point_pixels=0.0,
-    density=DensityConfig(price=-1.0),
+    density=DensityConfig(price=0.0),
 )
 """What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""
 
@@ -78,7 +78,7 @@ abcd_partition = MethodSpecification(
             training=TrainingConfig(
                 recipe=Recipe(layers=False, overlap=0.2, migrate=False),
                 warmup=0.0,
-                density=DensityConfig(price=-1.0),  # blocks have one visit, and nothing after it
+                density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
             ),
         )
     ),

@@ -123,6 +123,22 @@ def test_giants_are_pruned_only_once_opacities_were_reset():
         assert len(params["means"]) == left
 
 
+def test_only_those_grow_that_fill_several_prices():
+    """Eight alike by their gradients, of which the last four fill too little."""
+    gaussians = random_gaussians(8, size=0.005)
+    params, optimizers = live(gaussians)
+    growth = {
+        "grad2d": torch.full((8,), 9.0),
+        "count": torch.ones(8),
+        "weight": torch.tensor([13.0] * 4 + [11.0] * 4),
+        "looks": torch.ones(8),
+    }
+    control = DensityControl(DensityConfig(price=3.0, refine_every=10))
+    growth = control.after_step(params, optimizers, growth, (fake_info(8, 0.0),), clock(steps=100, views=1))
+    assert len(params["means"]) == 12
+    assert all(len(value) == 12 for value in growth.values())
+
+
 def test_after_the_last_refinement_nothing_changes():
     params, optimizers = live(random_gaussians(8))
     control = DensityControl(DensityConfig())
@@ -193,7 +209,9 @@ def test_covariances_against_the_definition():
 @pytest.mark.parametrize(("blocks", "given", "expected"), [(1, 0, 100), (8, 0, 30), (1, 7, 7), (8, 7, 7)])
 def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given, expected):
     config = DensityConfig(refine_every=given, refine_stop=0.3)
-    assert for_blocks(config, blocks) == replace(config, refine_every=expected)
+    price = 8.0 if blocks == 1 else 2.0
+    assert for_blocks(config, blocks) == replace(config, refine_every=expected, price=price)
+    assert for_blocks(replace(config, price=3.0), blocks).price == 3.0
 
 
 @pytest.mark.parametrize("resets", [None, 0])

@@ -12,7 +12,7 @@ from abcd_ns.engine.events import Mended
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.density.shedding import PASSES, faded, price_at, weigh, worthless
+from abcd_ns.engine.train.density.shedding import PASSES, faded, may_grow, price_at, weigh, worthless
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
@@ -45,6 +45,14 @@ def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_price(weig
         per_view = value / max(looks, 1)
         if abs(per_view * views - price) > 1e-3:
             assert goes == (looks >= views and per_view * views < price)
+
+
+@given(weight=st.floats(0, 100), views=st.integers(1, 50), price=st.floats(0, 20), looks=st.integers(0, 200))
+def test_who_goes_does_not_grow_and_who_was_not_weighed_may(weight, views, price, looks):
+    growth = statistics([weight if looks else 0.0], [float(looks)])
+    grows = may_grow(growth, views, price)
+    assert not bool((grows & worthless(growth, views, price) & (growth["weight"] > 0)).any())
+    assert bool(grows) or looks > 0
 
 
 def test_what_was_seen_long_ago_counts_for_less():
@@ -84,8 +92,8 @@ def test_what_no_view_shows_goes_and_what_fills_much_stays(tmp_path, blocks):
     assert float((fills > 0.5).float().mean()) > 0.9
 
 
-def test_below_zero_everything_stays(tmp_path, views, photos):
-    options = {"blocks": 2, "steps": 30, "density": replace(STILL, price=-1.0)}
+def test_without_a_price_everything_stays(tmp_path, views, photos):
+    options = {"blocks": 2, "steps": 30, "density": replace(STILL, price=0.0)}
     coordinator = make_coordinator(tmp_path, some_hidden(), views, **options)
     train(coordinator, photos)
     assert coordinator.count() == 120
@@ -94,7 +102,7 @@ def test_below_zero_everything_stays(tmp_path, views, photos):
 def test_statistics_weigh_what_lies_before_the_block(tmp_path, views, photos, start):
     """Those of a step are the weights of the block's Gaussians in pictures of the whole scene."""
     coordinator = make_coordinator(
-        tmp_path, start, views, blocks=2, density=replace(STILL, price=0.0), batch=1
+        tmp_path, start, views, blocks=2, density=replace(STILL, price=1e-9), batch=1
     )
     rasterizer, run = coordinator.run.rasterizer, coordinator.run
     batch = coordinator.next_batch()
@@ -115,7 +123,7 @@ def test_one_block_sheds_after_every_so_many_passes(tmp_path, views, photos):
     options = {
         "blocks": 1,
         "steps": 3 * PASSES * len(views),
-        "density": replace(STILL, price=0.0),
+        "density": replace(STILL, price=1e-9),
         "batch": 1,
     }
     coordinator = make_coordinator(tmp_path, some_hidden(), views, **options)

@@ -1,8 +1,8 @@
 """Where methods fail, ABCD does not: every scenario of `abcd stability`, under its own rule.
 
-What more there is to each in other files: A10 engine/test_ordering, A13 engine/test_coordinator, A17
-plugin/test_dataparser_reads, A18 plugin/test_photos and plugin/test_dataparser_refuses, A20
-engine/test_coordinator, A21 engine/test_rasterizer_self_check.
+What more there is to each in other files: A10 engine/space/test_ordering, A13 and A20
+engine/train/test_coordinator, A17 data/test_dataparser_reads, A18 data/test_photos and
+data/test_dataparser_refuses, A21 engine/render/test_rasterizer_self_check.
 """
 
 import pytest
@@ -11,7 +11,7 @@ from abcd_ns.lab.stability.command import SCENARIOS
 from abcd_ns.lab.stability.lab import Lab
 
 SLOW = {"A3", "A6", "A8", "A9", "A11", "A12", "A13", "A14", "A15", "A16", "A19"}
-"""These train for long. What they rest on is in engine/test_health too."""
+"""These train for long. What they rest on is in engine/train/test_health too."""
 QUICK = {"A1", "A5", "A17", "A20"}
 """A third of the training says as much."""
 BEHIND = {

@@ -5,7 +5,7 @@ before its block included: so many pixels it fills. Drawings that train it tell 
 Added up over the views of its block it says what would be missing without it, as RadSplat (Niemeyer et al.,
 2024) and LightGaussian (Fan et al., NeurIPS 2024) prune by the largest and by the sum of such weights when
 training ends. Here they go while it goes on, at a price that rises as growth comes to its end: those that
-remain take their place, and each step costs less.
+remain take their place, and each step costs less. Nor do those grow that could not pay for two.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,6 +19,8 @@ WEIGHED = ("weight", "looks")
 """What is added up for each Gaussian: its weight, px, and the drawings in which it might have shown."""
 LAST = 0.7
 """Share of the run, its warm-up left out, after which nothing that fills anything goes."""
+GROWS = 4.0
+"""Times its price that a Gaussian fills before it is cloned or split: more than both halves must."""
 PASSES = 4
 """A block that is the whole scene sheds whenever each of its views was drawn so often."""
 
@@ -48,15 +50,14 @@ def worthless(growth: Mapping[str, Tensor], views: int, price: float) -> Bool[Te
 
 
 def may_grow(growth: Mapping[str, Tensor], views: int, price: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians fill enough of their block's views for two, so that both that growth leaves of one fill
-    their price. Whoever was not weighed may grow.
+    """Which Gaussians fill GROWS prices in all of their block's views together; those never weighed may grow.
 
     Args:
         growth: with WEIGHED.
         views: that see the block.
     """
     weight, looks = (growth[name] for name in WEIGHED)
-    return weight * views >= 2.0 * price * looks
+    return weight * views >= GROWS * price * looks
 
 
 def faded(growth: Mapping[str, Tensor], views: int) -> dict[str, Float[Tensor, "n"]]:
