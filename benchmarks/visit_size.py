@@ -128,7 +128,7 @@ def measure(args: Args, folder: Path) -> tuple[Counter, dict[str, float]]:
         if coordinator.state.visit == 1 and coordinator.state.active is None:
             seconds.clear()
         whole(coordinator, photo)
-        if coordinator.steps.layers is not None:
+        if coordinator.visit.steps.layers is not None:
             layers = coordinator.layer_bytes
     seconds["steps"] -= seconds["attach"] + seconds["end"]
     seconds["attach"] -= seconds["survey"] + seconds["layers"]

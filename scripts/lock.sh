@@ -4,7 +4,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-.venv/bin/uv pip compile pyproject.toml --extra dev --universal --python-version 3.10 \
+.venv/bin/uv pip compile pyproject.toml --all-extras --universal --python-version 3.10 \
   --no-annotate --no-header --quiet --output-file constraints.txt "$@" >/dev/null
 # [tool.uv] environments already says which platform this is for: repeating it 300 times helps nobody.
 sed -i -E "s/ (and|;) (implementation_name != 'PyPy' and )?platform_machine == 'x86_64' and sys_platform == 'linux'//" \

@@ -28,7 +28,17 @@ if not torch.cuda.is_available():
     backend._C = None
     sys.modules["gsplat.cuda._backend"] = backend
 
-TRAIN = ("engine/train", "engine/store", "simulated", "peers", "lab", "nerfstudio", "cli", "benchmarks")
+TRAIN = (
+    "engine/train",
+    "engine/store",
+    "cluster",
+    "simulated",
+    "peers",
+    "lab",
+    "nerfstudio",
+    "cli",
+    "benchmarks",
+)
 """Folders whose tests train for many steps: checks would take half their time. `test_loss_curves` has every
 method train with checks on."""
 

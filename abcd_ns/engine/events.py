@@ -102,6 +102,40 @@ class VisitUndone:
 
 
 @dataclass(frozen=True)
+class WorkerSeen:
+    """What one of the run's workers is doing."""
+
+    worker: int
+    """From 0."""
+    block: int | None
+    """In training; None where it waits, or is starting."""
+    done: int
+    steps: int
+    """Of the visit, taken and in all."""
+    visits: int
+    """That it has finished."""
+    deaths: int
+    """Times that it was lost and replaced."""
+    waited: float
+    """Share of its time since it first was ready, 0..1, in which it had no block."""
+
+
+@dataclass(frozen=True)
+class WorkersSeen:
+    """The driver has looked at its workers; it does so about once a second."""
+
+    workers: tuple[WorkerSeen, ...]
+
+
+@dataclass(frozen=True)
+class WorkerLost:
+    """A worker is gone, and with it what it was at: the visit is trained again, by another."""
+
+    block: int
+    why: str
+
+
+@dataclass(frozen=True)
 class HeldOutScored:
     """Whoever runs the training has looked at views that are not trained on; means over them."""
 
@@ -120,6 +154,8 @@ Event = (
     | BlockSplit
     | Mended
     | VisitUndone
+    | WorkersSeen
+    | WorkerLost
     | HeldOutScored
 )
 Listener = Callable[[Event], None]

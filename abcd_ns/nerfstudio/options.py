@@ -7,6 +7,7 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.workers import check_workers
 
 MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
 """Splatfacto's model options that nerfstudio's tools read; `mirror` sets them."""
@@ -22,7 +23,7 @@ def check_options(config: TrainerConfig) -> None:
     """
     pipeline = config.pipeline
     if config.machine.num_devices * config.machine.num_machines > 1:
-        raise UserError("ABCD trains on one device; leave out --machine.num-devices.")
+        raise UserError("For several devices give --pipeline.workers; leave out --machine.num-devices.")
     for name in ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb"):
         if not getattr(pipeline, name) >= 0:
             flag = name.replace("_", "-")
@@ -30,6 +31,7 @@ def check_options(config: TrainerConfig) -> None:
     if config.is_viewer_legacy_enabled():
         raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
     pipeline.training.check()
+    check_workers(pipeline.workers, pipeline.cluster, pipeline.blocks, pipeline.training.recipe)
     if config.mixed_precision:
         raise UserError("ABCD trains in float32; leave out --mixed-precision.")
     mirror(pipeline.training, pipeline.model)

@@ -27,7 +27,7 @@ from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.splitting import cut_at_rest
-from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.batch import Rendered, Sample
 from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
@@ -40,6 +40,7 @@ from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import MadeFor, RunRequest, new_store, take_over
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.nerfstudio.workers import BLOCKS_EACH, dispatcher_for
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from abcd_ns.viewer import guard
@@ -74,6 +75,12 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     ram_budget_gb: float = 0.0
     """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it.
     0 takes 8, or 40% of the machine's memory where that is less."""
+    workers: int = 1
+    """Blocks that are trained at once, each by a process of its own: on a GPU each, or on cores of the CPU.
+    Needs Ray: pip install 'abcd-ns[cluster]'."""
+    cluster: str | None = None
+    """Address (host:port) of the head of a Ray cluster that is to have the workers, instead of this machine;
+    --data and --output-dir must be paths that all its machines see."""
     max_seconds: float | None = None
     """Stop after this many seconds of training; evaluation and saving do not count."""
 
@@ -94,6 +101,7 @@ class AbcdPipeline(VanillaPipeline):
         guard.install()
         super().__init__(config, *args, **kwargs)
         self._coordinator: Trainer | None = None
+        self._rendered: Rendered | None = None
         self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
 
     @property
@@ -123,6 +131,7 @@ class AbcdPipeline(VanillaPipeline):
                 trainer.stop_training = True
 
         def end_run(step: int) -> None:  # noqa: ARG001
+            self._coordinator.dismiss()
             report.close()
             log.close()
 
@@ -140,7 +149,7 @@ class AbcdPipeline(VanillaPipeline):
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
         if self._coordinator is not None:
-            self._coordinator.stopwatch.pause()
+            self._coordinator.pause()
         return super().get_eval_image_metrics_and_images(step)
 
     def get_average_eval_image_metrics(
@@ -148,7 +157,7 @@ class AbcdPipeline(VanillaPipeline):
     ) -> dict[str, Any]:
         """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
         if self._coordinator is not None:
-            self._coordinator.stopwatch.pause()
+            self._coordinator.pause()
         found = super().get_average_eval_image_metrics(step, output_path, get_std)
         if self._coordinator is not None:
             self._coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
@@ -157,6 +166,8 @@ class AbcdPipeline(VanillaPipeline):
     def _after_step(self) -> None:
         if self._coordinator is None:
             raise RuntimeError("training has not begun")
+        if self._rendered is None:  # workers took the step
+            return
         self._coordinator.after_step(self._rendered, self._psnrs)
         self._rendered = None
 
@@ -164,7 +175,9 @@ class AbcdPipeline(VanillaPipeline):
 
     def _begin(self, asked: RunRequest, optimizers: dict[str, Any]) -> Trainer:
         config, views = self.config, self._views()
-        self.datamanager.device_photo_bytes = 0 if self._on_cpu else int(PHOTO_SHARE * self._budget)
+        # Where there are workers, one of them shares this device, and photos are theirs.
+        keeps_photos = not self._on_cpu and not self._lends
+        self.datamanager.device_photo_bytes = int(PHOTO_SHARE * self._budget) if keeps_photos else 0
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(asked, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
@@ -183,19 +196,27 @@ class AbcdPipeline(VanillaPipeline):
             {name: optimizers[name] for name in self.model.gauss_params},
             device=self.device,
         )
-        coordinator = self._trainer_of(run)
+        coordinator = self._trainer_of(run, asked)
         if resumed:
             coordinator.restore()
         return coordinator
 
-    def _trainer_of(self, run: TrainingRun) -> Trainer:
+    def _trainer_of(self, run: TrainingRun, asked: RunRequest) -> Trainer:
         """Who trains by the run's options."""
         if run.config.recipe.exact:
             return ExactTrainer(run)
         if run.config.recipe.overlap > 0:
             return independent_trainer(run)
         source = LayerSource(run, self._room_for_layers())
-        return Coordinator(run, source=source, target=self._target)
+        coordinator = Coordinator(run, source=source, target=self._target)
+        if self._lends and run.scene.tree.num_blocks > 1:
+            return dispatcher_for(coordinator, asked.config, self._budget)
+        return coordinator
+
+    @property
+    def _lends(self) -> bool:
+        """Whether workers are to train the blocks."""
+        return self.config.workers > 1 or self.config.cluster is not None
 
     @property
     def _on_cpu(self) -> bool:
@@ -257,7 +278,7 @@ class AbcdPipeline(VanillaPipeline):
             return self.config.blocks, {name: getattr(self.config.training.limits, name) for name in FITTED}
         fit = self._fit(points)
         CONSOLE.print(fit.in_words(), highlight=False, soft_wrap=True)
-        return fit.blocks, fit.limits
+        return max(fit.blocks, BLOCKS_EACH * self.config.workers * (self.config.workers > 1)), fit.limits
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""

@@ -13,11 +13,11 @@ import torch
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
-from abcd_ns.engine.events import Event, LayersDrawn
+from abcd_ns.engine.events import Event, LayersDrawn, WorkersSeen
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder
 from abcd_ns.errors import UserError
@@ -186,14 +186,22 @@ class AbcdTrainer(Trainer):
             "photos."
         )
 
+    def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
+        """As nerfstudio's; where workers train, what one of them did counts."""
+        coordinator = self.pipeline.coordinator
+        if coordinator is None or not coordinator.trains_elsewhere:
+            return super().train_iteration(step)
+        coordinator.await_step()
+        return torch.zeros(()), {}, {}
+
     def _train_complete_viewer(self) -> None:
         # All is saved; nerfstudio goes on serving its viewer until Ctrl-C, which is how such a run ends.
         with suppress(Stopped):
             super()._train_complete_viewer()
 
     def _between_layers(self, event: Event) -> None:
-        # Drawing a visit's layers may take long, and between two of them there is nothing that could be lost.
-        if isinstance(event, LayersDrawn):
+        # Drawing layers, or waiting for workers, may take long, and nothing could be lost meanwhile.
+        if isinstance(event, (LayersDrawn, WorkersSeen)):
             self._signals.check()
 
     def _end_report(self) -> None:
@@ -238,7 +246,7 @@ class AbcdTrainer(Trainer):
         coordinator = self.pipeline.coordinator
         if coordinator is None:
             raise RuntimeError("there is nothing to save before training has begun")
-        coordinator.stopwatch.pause()
+        coordinator.pause()
         coordinator.save(pin=pin_name(step))
         crash_points.reached(crash_points.CHECKPOINT_PINNED)
         path = self.checkpoint_dir / f"{pin_name(step)}.ckpt"

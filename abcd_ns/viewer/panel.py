@@ -12,11 +12,19 @@ import viser
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
-from abcd_ns.engine.events import Event, LayersDrawn, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import (
+    Event,
+    LayersDrawn,
+    SweepEnded,
+    VisitBegan,
+    VisitEnded,
+    WorkerSeen,
+    WorkersSeen,
+)
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import BlockScene
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
+from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
 from abcd_ns.viewer.boxes import boxes_of, bulk
@@ -25,7 +33,7 @@ from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Choice
 from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, seconds_left, sweep_share
 from abcd_ns.viewer.scenery import Scenery, first_look, views_that_see
-from abcd_ns.viewer.texts import block_table, headline, memory_table, sweep_line
+from abcd_ns.viewer.texts import block_table, headline, memory_table, sweep_line, workers_line
 
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 5.0
@@ -63,6 +71,7 @@ class AbcdPanel(ViewerControl):
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
         self._layers = ""
+        self._workers: tuple[WorkerSeen, ...] = ()
         self._laid_out = 0
         """Blocks for which boxes and lists are made; 0 before that."""
         self._first_look: tuple[np.ndarray, np.ndarray] | None = None
@@ -97,15 +106,16 @@ class AbcdPanel(ViewerControl):
     def __call__(self, event: Event) -> None:
         """Take an event in; the browser is told at visits' ends and otherwise once in a while."""
         self._history.note(event, self._seconds)
+        self._workers = event.workers if isinstance(event, WorkersSeen) else self._workers
         self._layers = f"layers {event.done} of {event.total}" if isinstance(event, LayersDrawn) else ""
         due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
         if due or isinstance(event, (VisitBegan, VisitEnded, SweepEnded)):
             self._update()
-        if due and isinstance(event, LayersDrawn):
+        if isinstance(event, WorkersSeen) or (due and isinstance(event, LayersDrawn)):
             self._let_viewer_draw()
 
     def _let_viewer_draw(self) -> None:
-        """Hand the training lock over for one picture: a visit's layers take long, and browsers wait."""
+        """Hand the training lock over for one picture: layers and workers take long, and browsers wait."""
         lock = self.viewer.train_lock
         if lock is None or not lock.locked() or not self.viewer.render_statemachines:
             return
@@ -144,17 +154,20 @@ class AbcdPanel(ViewerControl):
         history, state, seconds = self._history, coordinator.state, self._seconds
         share, sweep = sweep_share(history, state), ""
         if history.sweep is not None and not coordinator.finished:
-            visits = history.sweep_visits + len(state.queue) + (history.visit is not None)
+            visits = history.sweep_visits + len(state.queue) + len(history.under_way)
             left = seconds_left(seconds - history.sweep_began, share)
             sweep = sweep_line(history.sweep, history.sweep_visits, visits, left)
-        where, left = self._where(state.active), seconds_left(seconds, coordinator.progress)
+        where, left = self._where(state), seconds_left(seconds, coordinator.progress)
         self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)
         self._controls.progress(coordinator.progress, share)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
             self._curve_drawn = self._updated
             self._controls.draw_curve(history.curve)
 
-    def _where(self, active: ActiveVisit | None) -> str:
+    def _where(self, state: RunState) -> str:
+        active = state.active
+        if active is None and self._workers:
+            return workers_line(self._workers)
         if active is None:
             return "All blocks at once" if self._coordinator.config.recipe.exact else "Between visits"
         steps = f" of {active.steps}" if 0 < active.steps < UNLIMITED else ""
@@ -206,9 +219,10 @@ class AbcdPanel(ViewerControl):
         return self.viewer.train_lock or nullcontext()
 
     def _chosen_block(self) -> int | None:
-        if self._controls.block is not None or self._history.visit is None:
+        visit = next(iter(self._history.under_way.values()), None)
+        if self._controls.block is not None or visit is None:
             return self._controls.block
-        return self._history.visit.block
+        return visit.block
 
     def _show_cameras(self) -> None:
         block = self._chosen_block() if self._controls.cameras else None

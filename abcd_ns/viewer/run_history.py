@@ -48,16 +48,18 @@ class RunHistory:
     psnr: dict[int, float] = field(default_factory=dict)
     curve: list[tuple[float, float]] = field(default_factory=list)
     """(seconds of training, mean PSNR of the crops since the last point)."""
-    visit: VisitBegan | None = None
-    """The one that is under way."""
+    under_way: dict[int, VisitBegan] = field(default_factory=dict)
+    """Visits, by number; several where workers train."""
+    steps: dict[int, int] = field(default_factory=dict)
+    """By visit that is under way, its steps so far."""
     sweep: int | None = None
     """None before the first."""
     sweep_began: float = 0.0
     """Seconds of training when the sweep began."""
     sweep_visits: int = 0
     """Visits that are over in this sweep."""
-    _crops: list[float] = field(default_factory=list)
-    """PSNR of the visit's steps."""
+    _crops: dict[int, list[float]] = field(default_factory=dict)
+    """By visit that is under way, the PSNR of its steps."""
     _recent: list[float] = field(default_factory=list)
     """PSNR of the steps since the last point of the curve."""
 
@@ -76,9 +78,8 @@ class RunHistory:
         history.sweep = state.sweep if state.views else None
         if (active := state.active) is not None:
             block = None if active.is_whole else active.geometry.block
-            history.visit = VisitBegan(
-                active.number, state.sweep, block, active.steps, len(active.geometry.views), 0
-            )
+            seen = len(active.geometry.views)
+            history._begin(VisitBegan(active.number, state.sweep, block, active.steps, seen, 0))
         return history
 
     def note(self, event: Event, seconds: float) -> None:
@@ -87,24 +88,36 @@ class RunHistory:
             case VisitBegan():
                 if event.block is not None and event.sweep != self.sweep:
                     self.sweep, self.sweep_began, self.sweep_visits = event.sweep, seconds, 0
-                self.visit, self._crops = event, []
-            case StepTaken() if math.isfinite(event.psnr):
-                self._crops.append(event.psnr)
-                self._recent.append(event.psnr)
-                if not self.curve or seconds - self.curve[-1][0] >= SECONDS_BETWEEN_POINTS:
-                    self._add_point(seconds)
+                self._begin(event)
+            case StepTaken():
+                self._take_step(event, seconds)
             case BlockSplit():
                 self.visits[event.new] = self.visits.get(event.block, 0)
             case VisitEnded():
-                self.visit = None
-                if event.block is not None:
-                    self._end_visit(event.block)
+                self._end_visit(event)
 
-    def _end_visit(self, block: int) -> None:
-        self.visits[block] = self.visits.get(block, 0) + 1
+    def _begin(self, visit: VisitBegan) -> None:
+        self.under_way[visit.visit], self.steps[visit.visit], self._crops[visit.visit] = visit, 0, []
+
+    def _take_step(self, step: StepTaken, seconds: float) -> None:
+        self.steps[step.visit] = step.visit_step
+        if not math.isfinite(step.psnr):
+            return
+        self._crops.setdefault(step.visit, []).append(step.psnr)
+        self._recent.append(step.psnr)
+        if not self.curve or seconds - self.curve[-1][0] >= SECONDS_BETWEEN_POINTS:
+            self._add_point(seconds)
+
+    def _end_visit(self, visit: VisitEnded) -> None:
+        crops = self._crops.pop(visit.visit, [])
+        self.under_way.pop(visit.visit, None)
+        self.steps.pop(visit.visit, None)
+        if visit.block is None:
+            return
+        self.visits[visit.block] = self.visits.get(visit.block, 0) + 1
         self.sweep_visits += 1
-        if self._crops:
-            self.psnr[block] = sum(self._crops) / len(self._crops)
+        if crops:
+            self.psnr[visit.block] = sum(crops) / len(crops)
 
     def _add_point(self, seconds: float) -> None:
         self.curve.append((seconds, sum(self._recent) / len(self._recent)))
@@ -114,7 +127,7 @@ class RunHistory:
 
     def status(self, block: int, views: int | None) -> Status:
         """Of one block, on which so many views are worth training, if that is known."""
-        if self.visit is not None and self.visit.block == block:
+        if any(visit.block == block for visit in self.under_way.values()):
             return Status.ACTIVE
         if views is not None and views < FEW_VIEWS:
             return Status.UNDER_OBSERVED
@@ -131,12 +144,12 @@ class RunHistory:
 
 
 def sweep_share(history: RunHistory, state: RunState) -> float:
-    """Share of the sweep's visits that is done, 0..1; a visit whose steps are planned counts in part."""
-    active = state.active
-    if active is None or active.is_whole:
+    """Share of the sweep's visits that is done, 0..1; visits whose steps are planned count in part."""
+    visits = [visit for visit in history.under_way.values() if visit.block is not None]
+    if not visits:
         return 0.0
-    part = active.done / active.steps if 0 < active.steps < UNLIMITED else 0.0
-    return (history.sweep_visits + part) / (history.sweep_visits + 1 + len(state.queue))
+    parts = (history.steps[v.visit] / v.steps for v in visits if 0 < v.steps < UNLIMITED)
+    return (history.sweep_visits + sum(parts)) / (history.sweep_visits + len(visits) + len(state.queue))
 
 
 def seconds_left(elapsed: float, share: float) -> float | None:

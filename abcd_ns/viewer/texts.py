@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from datetime import timedelta
 
+from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.viewer.run_history import BlockRow, Status
 
 MOST_ROWS = 24
@@ -20,6 +21,20 @@ def headline(where: str, progress: float, left: float | None) -> str:
     if progress >= 1:
         return "**Trained.**"
     return f"**{where}**  \n{progress:.0%} of the run, {clock(left)} left"
+
+
+def workers_line(workers: Sequence[WorkerSeen]) -> str:
+    """What each worker is doing, counted from 1."""
+    return "  \n".join(worker_words(worker) for worker in workers)
+
+
+def worker_words(worker: WorkerSeen) -> str:
+    """What a worker is doing."""
+    what = "waits" if worker.visits else "is starting"
+    if worker.block is not None:
+        what = f"block {worker.block + 1}, step {worker.done} of {worker.steps}"
+    lost = f", replaced {worker.deaths} times" if worker.deaths else ""
+    return f"Worker {worker.worker + 1}: {what}; {worker.visits} visits{lost}"
 
 
 def sweep_line(sweep: int, over: int, visits: int, left: float | None) -> str:

@@ -163,7 +163,7 @@ def test_a_run_that_was_shared_by_a_crew_is_gone_on_with(tmp_path, start, views,
     train(first, photos, steps=1)
     assert first.state.active.crew == 2
     first.save()
-    first.steps.crew.dismiss()
+    first.visit.steps.crew.dismiss()
     first.scene.store.close()
     second = on_device(tmp_path, start, views, resume=True, target=target, **options)
     train(second, photos, steps=2)

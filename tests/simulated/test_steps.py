@@ -150,7 +150,7 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, start, views
     assert [(event.what, event.count) for event in told] == [("gradients", 1)] * 2
     train(coordinator, photos)
     assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
-    assert bool(coordinator.live.growth["grad2d"].isfinite().all())
+    assert bool(coordinator.visit.live.growth["grad2d"].isfinite().all())
 
 
 def test_the_torch_rasterizer_is_what_it_is_on_the_cpu(tmp_path, start, views, photos, counts):  # noqa: ARG001
@@ -162,6 +162,6 @@ def test_the_torch_rasterizer_is_what_it_is_on_the_cpu(tmp_path, start, views, p
         options = {"rasterizer": TorchRasterizer("never"), "density": GATHERING, "device": device}
         coordinator = make_coordinator(folder, start, views, blocks=1, steps=4, **options)
         train(coordinator, photos, steps=3)
-        grown[str(device)] = {name: value.cpu() for name, value in coordinator.live.growth.items()}
+        grown[str(device)] = {name: value.cpu() for name, value in coordinator.visit.live.growth.items()}
     for name, value in grown["cpu"].items():
         torch.testing.assert_close(grown[str(DEVICE)][name], value, rtol=1e-3, atol=1e-6)

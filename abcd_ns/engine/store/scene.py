@@ -44,6 +44,31 @@ class BlockScene(Protocol):
         ...
 
 
+@runtime_checkable
+class VisitScene(BlockScene, Protocol):
+    """What a visit needs to know of the scene that its block belongs to."""
+
+    def state(self, number: int) -> BlockState:
+        """A block at rest and whole, without its mail."""
+        ...
+
+    def mail(self, block: int) -> BlockState | None:
+        """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
+        ...
+
+    def rows(self, number: int) -> int:
+        """Gaussians at rest under a number, the mail of a block left out; nothing is read."""
+        ...
+
+    def gaussians_at_rest(self, block: int) -> Gaussians:
+        """The block as a visit will find it, whatever is live."""
+        ...
+
+    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
+        """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest."""
+        ...
+
+
 class MemoryScene:
     """A scene that is one list of Gaussians in memory, parted by a tree."""
 

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.store.scaffold import join, put_to_wait, revealed, split_by_block
-from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.scene import StoredScene, VisitScene
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE, RESERVE, WHOLE
 
 
-def state_for_visit(scene: StoredScene, block: int, saved: bool = False) -> BlockState:
+def state_for_visit(scene: VisitScene, block: int, saved: bool = False) -> BlockState:
     """What is attached when a visit to `block`, or with WHOLE the warm-up, begins or goes on.
 
     Args:
@@ -24,34 +24,40 @@ def state_for_visit(scene: StoredScene, block: int, saved: bool = False) -> Bloc
     return replace(state, gaussians=revealed(state.gaussians))
 
 
-def rows_for_visit(scene: StoredScene, block: int, saved: bool = False) -> int:
+def rows_for_visit(scene: VisitScene, block: int, saved: bool = False) -> int:
     """Rows of `state_for_visit`, without reading them."""
     if saved:
         return scene.rows(LIVE)
     return sum(scene.rows(number) + len(scene.mail(number) or ()) for number in _blocks(scene, block))
 
 
-def _blocks(scene: StoredScene, block: int) -> range:
+def _blocks(scene: VisitScene, block: int) -> range:
     return range(scene.tree.num_blocks) if block == WHOLE else range(block, block + 1)
 
 
-def with_mail(scene: StoredScene, block: int) -> BlockState:
+def with_mail(scene: VisitScene, block: int) -> BlockState:
     """A block at rest, joined by those that wait for its next visit."""
     state, mail = scene.state(block), scene.mail(block)
     return state if mail is None else state.joined_by(mail)
 
 
-def settle(scene: StoredScene, block: int, state: BlockState, migrate: bool = True) -> dict[int, BlockState]:
+def settle(
+    scene: StoredScene, block: int, state: BlockState, migrate: bool = True, taken: int | None = None
+) -> dict[int, BlockState]:
     """What changes when `block`, or with WHOLE the scaffold of all, has been trained.
 
     Args:
         state: on the CPU.
         migrate: False drops the Gaussians that left their cell.
+        taken: of those that wait for the block, so many of the first were in its visit, and the others came
+            since; None for all.
     """
     if block == WHOLE:
         return settle_scaffold(scene, state)
     inside = _owner(scene, state) == block
     left = state[~inside] if migrate else state.nobody
+    if taken is not None and (mail := scene.mail(block)) is not None:
+        left = left.joined_by(mail[taken:])
     return {block: state[inside], **inbox_without(scene, {block}, left)}
 
 

@@ -37,6 +37,10 @@ class NothingSeenError(UserError, RuntimeError):
     """There is nothing to train: no view sees any Gaussian, or none is left."""
 
 
+class BlocksBusyError(Exception):
+    """All blocks whose turn it is are with workers."""
+
+
 @runtime_checkable
 class Visits(Protocol):
     """Decides which block is trained when, and on what terms."""
@@ -74,7 +78,11 @@ class Planner:
 
     def begin(self) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
-        passed over, and most of the time those that no picture showed when they were last visited."""
+        passed over, and most of the time those that no picture showed when they were last visited.
+
+        Raises:
+            BlocksBusyError: the blocks that are left in this sweep are in flight.
+        """
         run, state = self._run, self._run.state
         began = run.stopwatch.seconds
         if state.visit == 0 and has_scaffold(self._scene) and run.progress < self._config.warmup:
@@ -176,7 +184,7 @@ class Planner:
                 state.views = self._views_of_blocks(state)
             else:
                 state.sweep += 1
-            remaining = None if self._budget.steps is None else self._budget.steps - state.step
+            remaining = None if self._budget.steps is None else self._budget.steps - state.planned
             last = config.last_passes or passes_for_layers(state.trained, state.frozen)
             state.trained = state.frozen = 0
             passes = passes_of_sweep(state.sweep, config.first_passes, last)
@@ -186,7 +194,11 @@ class Planner:
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
                 raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
-        return state.queue.pop(0)
+        busy = {visit.geometry.block for visit in state.in_flight}
+        free = next((place for place, plan in enumerate(state.queue) if plan.block not in busy), None)
+        if free is None:
+            raise BlocksBusyError
+        return state.queue.pop(free)
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
         """As far as influences are known they tell; a visit looks again."""

@@ -7,7 +7,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl, for_blocks
 from abcd_ns.engine.train.health.health import Health
@@ -17,7 +17,7 @@ from abcd_ns.engine.types import View
 
 
 class TrainingRun:
-    """One training run over a scene at rest, through the caller's live parameters and optimizers.
+    """One training run over a scene, through the caller's live parameters and optimizers.
 
     Args:
         views: the training views; `View.index` names them.
@@ -29,7 +29,7 @@ class TrainingRun:
         self,
         config: TrainingConfig,
         budget: Budget,
-        scene: StoredScene,
+        scene: VisitScene,
         views: list[View],
         rasterizer: Rasterizer,
         params: Params,
@@ -55,8 +55,8 @@ class TrainingRun:
 
     @property
     def progress(self) -> float:
-        """Share of the run that is done, 0..1."""
-        return self.budget.progress(self.state.step, self.stopwatch.seconds)
+        """Share of the run that is done, 0..1; what workers are at counts as done."""
+        return self.budget.progress(self.state.planned, self.stopwatch.seconds)
 
     @property
     def share(self) -> float:

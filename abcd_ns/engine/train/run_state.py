@@ -112,8 +112,16 @@ class RunState:
     health: Ledger = field(default_factory=dict)
     """What had to be mended, by block."""
     active: ActiveVisit | None = None
+    in_flight: list[ActiveVisit] = field(default_factory=list)
+    """Visits that workers are at, in the order in which they will count. Who goes on from here plans them
+    anew."""
     seconds: float = 0.0
     """Training time up to the last save."""
+
+    @property
+    def planned(self) -> int:
+        """Steps taken, and those that workers are to take."""
+        return self.step + sum(visit.steps for visit in self.in_flight)
 
     def count_drawn(self, trained: int, frozen: int) -> None:
         """A visit has drawn its layers."""
@@ -137,12 +145,13 @@ class RunState:
             "looked_at": list(self.active.looked_at),
             "objective": {str(view): list(losses) for view, losses in self.active.objective.items()},
         }
-        queue = [[plan.block, plan.steps] for plan in self.queue]
+        lent = [[visit.geometry.block, visit.steps] for visit in self.in_flight]
+        queue = lent + [[plan.block, plan.steps] for plan in self.queue]
         views = {str(block): count for block, count in self.views.items()}
         known = {str(b): {str(v): value for v, value in row.items()} for b, row in self.influence.items()}
         health = {str(block): dict(vars(record)) for block, record in self.health.items()}
         changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
-        return {**vars(self), **changed}
+        return {**{k: v for k, v in vars(self).items() if k != "in_flight"}, **changed}
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "RunState":

@@ -54,14 +54,21 @@ def is_full(gaussians: int, blocks: int, limit: int, sole: int) -> bool:
     return limit > 0 and gaussians > FULL * (max(limit, sole) if blocks == 1 else limit)
 
 
-def with_full(scene: StoredScene, settled: dict[int, BlockState], limit: int) -> dict[int, BlockState]:
+def with_full(
+    scene: StoredScene, settled: dict[int, BlockState], limit: int, busy: set[int]
+) -> dict[int, BlockState]:
     """What is about to be put to rest, and the blocks that are full with those that wait for their visit: for
-    these there might be no room in it."""
+    these there might be no room in it.
+
+    Args:
+        busy: blocks that are being trained.
+    """
     inbox = settled.get(INBOX)
     if not limit or inbox is None:
         return settled
     waiting = split_by_block(inbox, scene.tree.assign(inbox.gaussians.means))
-    full = {b: mail for b, mail in waiting.items() if scene.rows(b) + len(mail) > FULL * limit}
+    at_rest = {block: mail for block, mail in waiting.items() if block not in busy}
+    full = {b: mail for b, mail in at_rest.items() if scene.rows(b) + len(mail) > FULL * limit}
     joined = {block: scene.state(block).joined_by(mail) for block, mail in full.items()}
     return {**settled, **joined, INBOX: without(scene, inbox, full)} if full else settled
 
@@ -82,7 +89,8 @@ def cut_full(
     Returns:
         The tree with the cuts, and everything to be put to rest.
     """
-    tree, settled, parents = split_full(scene.tree, with_full(scene, settled, limit), limit, sole)
+    busy = {visit.geometry.block for visit in state.in_flight}
+    tree, settled, parents = split_full(scene.tree, with_full(scene, settled, limit, busy), limit, sole)
     for new, parent in parents.items():
         state.inherit(new, parent)
         announce(BlockSplit(parent, new, len(settled[parent]), len(settled[new])))

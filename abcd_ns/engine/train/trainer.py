@@ -57,6 +57,24 @@ class Trainer(ABC):
             psnrs: of each picture, dB; listeners are told their mean.
         """
 
+    # -- elsewhere -----------------------------------------------------------------------------------
+
+    @property
+    def trains_elsewhere(self) -> bool:
+        """Whether steps are taken by others now: then `await_step` stands for all of the above."""
+        return False
+
+    def await_step(self) -> None:
+        """Return when one more step of the run has been taken, or the run is finished."""
+        raise NotImplementedError
+
+    def dismiss(self) -> None:  # noqa: B027 - most have nobody
+        """End whoever trains elsewhere."""
+
+    def pause(self) -> None:
+        """From now on no time counts, until the next step; but where others go on training it does."""
+        self.stopwatch.pause()
+
     # -- where it stands -----------------------------------------------------------------------------
 
     @property

@@ -23,6 +23,9 @@ def train(coordinator: Trainer, photo: PhotoReader, steps: int | None = None) ->
 
 def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
     """Render a batch, take its loss' gradient, step every optimizer, report back."""
+    if coordinator.trains_elsewhere:
+        coordinator.await_step()
+        return
     batch = coordinator.next_batch()
     read = (photo(sample.view.index, sample.crop) for sample in batch.samples)
     photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]

@@ -18,6 +18,7 @@ class CurveRecorder:
 
     Args:
         moments: shares of the run, rising; 1 and above are left to whoever ends the run.
+        pause: stops the stopwatch, unless training goes on meanwhile.
         progress: the share of the run that is done.
         steps: optimisation steps taken.
         measure: the score, dB.
@@ -28,6 +29,7 @@ class CurveRecorder:
         self,
         moments: tuple[float, ...],
         stopwatch: Stopwatch,
+        pause: Callable[[], None],
         progress: Callable[[], float],
         steps: Callable[[], int],
         measure: Callable[[], float],
@@ -38,6 +40,7 @@ class CurveRecorder:
         """Spent on evaluation."""
         self._left = [moment for moment in moments if moment < 1]
         self._stopwatch, self._progress, self._steps = stopwatch, progress, steps
+        self._pause = pause
         self._measure, self._count = measure, count
 
     def look(self) -> None:
@@ -46,7 +49,7 @@ class CurveRecorder:
         if progress >= 1 or not self._left or progress < self._left[0]:
             return
         self._left = [moment for moment in self._left if moment > progress]
-        self._stopwatch.pause()
+        self._pause()
         began = time.perf_counter()
         seconds, steps = self._stopwatch.seconds, self._steps()
         self.points.append(CurvePoint(seconds, steps, self._measure(), self._count()))
@@ -67,6 +70,7 @@ class Training:
         self.recorder = CurveRecorder(
             settings.moments,
             self.stopwatch,
+            self.coordinator.pause if ours else self.stopwatch.pause,
             lambda: self.progress,
             lambda: self.steps,
             self._score_aloud if ours else lambda: mean_psnr(self.pipeline),
@@ -78,10 +82,10 @@ class Training:
             self._follow_steps()
 
     def _listen(self, event: Event) -> None:
-        if isinstance(event, StepTaken):
-            self.recorder.look()
-        elif isinstance(event, VisitEnded):
+        if isinstance(event, VisitEnded):
             self.layer_seconds += event.layer_seconds
+        if isinstance(event, (StepTaken, VisitEnded)):
+            self.recorder.look()
 
     def _score_aloud(self) -> float:
         found = mean_psnr(self.pipeline)

@@ -84,6 +84,25 @@ class SweepEndLine(Line):
 
 
 @dataclass(frozen=True)
+class WorkerLostLine(Line):
+    """A worker was lost, and the visit it was at is trained again."""
+
+    block: int
+    why: str
+
+
+@dataclass(frozen=True)
+class WorkerLine(Line):
+    """What a worker has done when training ends."""
+
+    worker: int
+    visits: int
+    deaths: int
+    waited: float
+    """Share of its time without a block, 0..1."""
+
+
+@dataclass(frozen=True)
 class HeldOutLine(Line):
     """The held-out views were looked at; means over them."""
 
@@ -107,6 +126,8 @@ KINDS: dict[str, type[Line]] = {
     "sample": SampleLine,
     "visit end": VisitEndLine,
     "sweep end": SweepEndLine,
+    "worker lost": WorkerLostLine,
+    "worker": WorkerLine,
     "held out": HeldOutLine,
     "end": EndLine,
 }

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 
 import psutil
 import torch
@@ -17,6 +18,9 @@ from abcd_ns.engine.events import (
     VisitBegan,
     VisitEnded,
     VisitUndone,
+    WorkerLost,
+    WorkerSeen,
+    WorkersSeen,
 )
 from abcd_ns.engine.train.health_record import MENDED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
@@ -41,6 +45,7 @@ class ProgressReport:
         self._sweep = 0
         self._visit: VisitBegan | None = None
         self._layer_seconds = self._visit_seconds = 0.0
+        self._workers: tuple[WorkerSeen, ...] = ()
         self._last_line = time.monotonic()
         self._live: Progress | None = None
         self._task: TaskID | None = None
@@ -60,6 +65,11 @@ class ProgressReport:
                 self._visit_seconds += event.seconds
             case SweepEnded():
                 self._end_sweep(event)
+            case WorkersSeen():
+                self._workers = event.workers
+                self._show("")
+            case WorkerLost():
+                self._print(f"{_block(event.block)}: lost its worker, trained again: {event.why}")
             case Mended() if event.what in ALARMING:
                 self._print(f"{_block(event.block)}: {event.count:,} {MENDED[event.what]}")
             case VisitUndone():
@@ -87,6 +97,8 @@ class ProgressReport:
         if math.isfinite(event.psnr):
             before = event.psnr if self._psnr is None else self._psnr
             self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
+        if self._workers:
+            return
         steps = self._visit.steps if self._visit else 0
         endless = not 0 < steps < UNLIMITED or (self._visit is not None and self._visit.block is None)
         self._show(f"step {event.visit_step}" if endless else f"step {event.visit_step}/{steps}")
@@ -115,6 +127,8 @@ class ProgressReport:
         blocks = coordinator.scene.tree.num_blocks
         if visit is not None and visit.block is None:
             where = "warm-up of the whole scene"
+        elif self._workers:
+            where = f"sweep {self._sweep}  {_at_work(self._workers, blocks)}"
         else:
             where = f"sweep {self._sweep} block {'-' if visit is None else visit.block + 1}/{blocks}"
         quality = "" if self._psnr is None else f"{self._psnr:.2f} dB  "
@@ -137,6 +151,14 @@ class ProgressReport:
 
 def _block(block: int | None) -> str:
     return "warm-up" if block is None else f"block {block + 1}"
+
+
+def _at_work(workers: Sequence[WorkerSeen], blocks: int) -> str:
+    """What workers are doing, in few words."""
+    busy = [worker for worker in workers if worker.block is not None]
+    steps = ", ".join(f"{worker.block + 1}: {worker.done}/{worker.steps}" for worker in busy[:4])
+    more = ", ..." if len(busy) > 4 else ""
+    return f"{len(busy)} of {len(workers)} workers at blocks of {blocks} {steps}{more}".rstrip()
 
 
 def _memory() -> str:

@@ -14,7 +14,17 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.photos import Photos
-from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import (
+    Event,
+    HeldOutScored,
+    StepTaken,
+    SweepEnded,
+    VisitBegan,
+    VisitEnded,
+    WorkerLost,
+    WorkerSeen,
+    WorkersSeen,
+)
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.machine import peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import (
@@ -28,6 +38,8 @@ from abcd_ns.nerfstudio.run.log_lines import (
     TrainingLine,
     VisitEndLine,
     VisitLine,
+    WorkerLine,
+    WorkerLostLine,
 )
 from abcd_ns.nerfstudio.run.resuming import RunRequest
 from abcd_ns.nerfstudio.run.settings import write_settings
@@ -68,8 +80,9 @@ class RunLog:
         self._coordinator, self._meters = coordinator, tuple(meters)
         self._path: Path | None = path
         self._psnrs: list[float] = []
-        self._visit_psnrs: list[float] = []
+        self._visit_psnrs: dict[int, list[float]] = {}
         self._lines: list[str] = []
+        self._workers: tuple[WorkerSeen, ...] = ()
         if earlier is not None:
             self._write(past_of(coordinator, earlier), "w")
         self._sampled = coordinator.stopwatch.seconds
@@ -85,13 +98,18 @@ class RunLog:
             case StepTaken():
                 self._take_step(event)
             case VisitBegan():
-                self._visit_psnrs = []
+                self._visit_psnrs[event.visit] = []
                 self._note(VisitLine, **vars(event))
                 self._flush()
             case VisitEnded():
                 self._end_visit(event)
             case SweepEnded():
                 self._note(SweepEndLine, sweep=event.sweep)
+            case WorkersSeen():
+                self._workers = event.workers
+            case WorkerLost():
+                self._note(WorkerLostLine, block=event.block, why=event.why)
+                self._flush()
             case HeldOutScored():
                 self._note(HeldOutLine, psnr=_finite(event.psnr), ssim=_finite(event.ssim))
                 self._flush()
@@ -100,6 +118,14 @@ class RunLog:
         """Training is over: say what it took."""
         cuda = torch.cuda.is_available()
         self._sample()
+        for worker in self._workers:
+            self._note(
+                WorkerLine,
+                worker=worker.worker,
+                visits=worker.visits,
+                deaths=worker.deaths,
+                waited=round(worker.waited, 3),
+            )
         self._note(
             EndLine,
             gaussians=self._coordinator.count(),
@@ -111,13 +137,14 @@ class RunLog:
     def _take_step(self, event: StepTaken) -> None:
         if math.isfinite(event.psnr):
             self._psnrs.append(event.psnr)
-            self._visit_psnrs.append(event.psnr)
+            self._visit_psnrs.setdefault(event.visit, []).append(event.psnr)
         seconds = self._coordinator.stopwatch.seconds
         if seconds - self._sampled >= max(SECONDS_BETWEEN_SAMPLES, seconds / SAMPLES):
             self._sample()
 
     def _end_visit(self, event: VisitEnded) -> None:
         self._sample()
+        psnrs = self._visit_psnrs.pop(event.visit, [])
         self._note(
             VisitEndLine,
             visit=event.visit,
@@ -127,7 +154,7 @@ class RunLog:
             migrated=event.migrated,
             layer_seconds=round(event.layer_seconds, 3),
             visit_seconds=round(event.seconds, 3),
-            psnr=_mean(self._visit_psnrs[len(self._visit_psnrs) // 2 :]),
+            psnr=_mean(psnrs[len(psnrs) // 2 :]),
         )
         self._flush()
 

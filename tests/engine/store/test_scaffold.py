@@ -186,4 +186,6 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     assert not coordinator.state.active
     train_step(coordinator, photos)
     rest = 10 * len(views) - coordinator.state.step + 1
-    assert coordinator.live.density_clock(4, coordinator.batch, None).progress == pytest.approx(1 / rest)
+    assert coordinator.visit.live.density_clock(4, coordinator.batch, None).progress == pytest.approx(
+        1 / rest
+    )

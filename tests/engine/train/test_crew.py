@@ -67,13 +67,13 @@ def test_a_step_is_the_one_that_a_single_process_takes(make, photos):
     """The same views, the same weights: gradients equal those of all views drawn at once."""
     shared, alone = make("shared", batch=4, density=DensityConfig("off")), make("alone", 1, batch=4)
     batch = shared.next_batch()
-    crew = shared.steps.crew
+    crew = shared.visit.steps.crew
     assert len(batch.samples) == 2
     assert len(crew.pids) == 1
     rendered = shared.render(batch)
     loss = shared.loss(batch, rendered.pictures, [photos(s.view.index, s.crop) for s in batch.samples])
     loss.backward()
-    order = shared.steps._order_of(shared.state.active, 1)
+    order = shared.visit.steps._order_of(shared.state.active, 1)
     helped = [shared.steps._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
     alone.next_batch()
     every = type(batch)(0, (*batch.samples, *helped))
@@ -91,7 +91,7 @@ def test_what_density_control_counts_is_that_of_all_views(make, photos):
     """Sums over the views of all members are those of the same views drawn in one process."""
     shared, alone = make("shared", batch=4), make("alone", 1, batch=4)
     batch = shared.next_batch()
-    crew, order = shared.steps.crew, shared.steps._order_of(shared.state.active, 1)
+    crew, order = shared.visit.steps.crew, shared.visit.steps._order_of(shared.state.active, 1)
     rendered = shared.render(batch)
     shared.loss(batch, rendered.pictures, [photos(s.view.index, s.crop) for s in batch.samples]).backward()
     (part,) = crew.contributions()
@@ -135,7 +135,7 @@ def test_a_step_of_the_warm_up_is_the_one_that_a_single_process_takes(make, phot
     for name in PARAM_NAMES:
         found, expected = shared.params[name].grad, alone.params[name].grad
         assert torch.allclose(found, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max())), name
-    shared.steps.crew.dismiss()
+    shared.visit.steps.crew.dismiss()
 
 
 @pytest.mark.parametrize("options", [{}, WARM], ids=["blocks", "warm-up"])
@@ -145,8 +145,8 @@ def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch, o
     train(helped, photos)
     while not lost.finished:
         train_step(lost, photos)
-        if lost.state.step % 4 == 0 and lost.steps.crew is not None:
-            for pid in lost.steps.crew.pids:
+        if lost.state.step % 4 == 0 and lost.visit.steps.crew is not None:
+            for pid in lost.visit.steps.crew.pids:
                 os.kill(pid, signal.SIGKILL)
     monkeypatch.setattr("abcd_ns.engine.train.step.drawing.can_fork", lambda _: False)
     train(never, photos)
@@ -185,8 +185,8 @@ def test_each_member_has_its_part_of_the_room_for_layers(make, photos):
     held = []
     while not tight.finished:
         train_step(tight, photos)
-        if tight.steps.crew is not None:
-            assert len(tight.steps.crew.pids) == 1
+        if tight.visit.steps.crew is not None:
+            assert len(tight.visit.steps.crew.pids) == 1
             held.append(tight.layer_bytes)
     assert 0 < max(held) <= 40_000
     assert equal(whole_scene(roomy), whole_scene(tight))
@@ -197,8 +197,8 @@ def test_helpers_end_with_their_visit(make, photos):
     threads = torch.get_num_threads()
     while not coordinator.finished:
         train_step(coordinator, photos)
-        if coordinator.steps.crew is not None:
-            seen |= set(coordinator.steps.crew.pids)
+        if coordinator.visit.steps.crew is not None:
+            seen |= set(coordinator.visit.steps.crew.pids)
     assert len(seen) >= 2
     assert not any(is_alive(pid) for pid in seen)
     assert torch.get_num_threads() == threads
@@ -210,9 +210,9 @@ def test_what_counts_is_masked_in_helpers_too(make, photos):
         target=lambda s: (photos(s.view.index, s.crop), torch.zeros(s.crop.height, s.crop.width, 1))
     )
     nothing.next_batch()
-    (part,) = nothing.steps.crew.contributions()
+    (part,) = nothing.visit.steps.crew.contributions()
     assert all(float(value.abs().max()) == 0 for value in part.gradients.values())
-    nothing.steps.crew.dismiss()
+    nothing.visit.steps.crew.dismiss()
 
 
 def test_a_helper_does_not_outlive_the_training_process(tmp_path):
@@ -228,7 +228,7 @@ coordinator = make_coordinator(
     Path({str(tmp_path)!r}), random_gaussians(60, seed=2), views, blocks=2, steps=30, processes=2,
     target=lambda s: (photos(s.view.index, s.crop), None))
 coordinator.next_batch()
-print(*coordinator.steps.crew.pids, flush=True)
+print(*coordinator.visit.steps.crew.pids, flush=True)
 time.sleep(600)
 """
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
@@ -276,7 +276,7 @@ def test_a_run_goes_on_where_there_can_be_no_processes(make, photos, monkeypatch
     resumed = make("stopped", processes=1, resume=True, **options)
     for _ in range(left):
         train_step(resumed, photos)
-        assert resumed.steps.crew is None or resumed.steps.crew.pids == ()
+        assert resumed.visit.steps.crew is None or resumed.visit.steps.crew.pids == ()
     assert equal(whole_scene(straight), whole_scene(resumed))
     train(resumed, photos)
     assert resumed.finished

@@ -310,7 +310,7 @@ def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, visit_steps=10)
     train_step(coordinator, photos)
     coordinator.state.views[coordinator.state.active.geometry.block] = seen
-    assert coordinator.live.density_clock(4, coordinator.batch, None).views == expected
+    assert coordinator.visit.live.density_clock(4, coordinator.batch, None).views == expected
 
 
 @pytest.mark.parametrize("blocks", [1, 3])
@@ -321,9 +321,9 @@ def test_a_block_that_is_emptied_in_its_visit_ends_it(tmp_path, views, photos, s
     options = {"blocks": blocks, "steps": 30, "density": density}
     coordinator = make_coordinator(tmp_path, start, views, **options)
     train(coordinator, photos, steps=2)
-    nobody = coordinator.live.detached()[:0]
+    nobody = coordinator.visit.live.detached()[:0]
     attach(nobody, coordinator.params, coordinator.optimizers, batch=coordinator.batch)
-    coordinator.live.growth = {}
+    coordinator.visit.live.growth = {}
     batch = coordinator.next_batch()
     wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
     assert coordinator.loss(batch, coordinator.render(batch).pictures, wanted).requires_grad

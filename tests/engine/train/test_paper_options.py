@@ -45,7 +45,7 @@ def test_moments_are_forgotten_at_the_next_visit_only_when_asked(tmp_path, views
     adam = coordinator.optimizers["scales"].state[coordinator.params["scales"]]
     assert int(adam["step"]) == (3 if keep else 0)
     assert bool(adam["exp_avg"].any()) == keep
-    assert coordinator.live.clocks.visits == 1
+    assert coordinator.visit.live.clocks.visits == 1
 
 
 def test_a_run_without_moments_can_be_resumed_within_a_visit(tmp_path, views, photos, start):

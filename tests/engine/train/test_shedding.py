@@ -106,7 +106,7 @@ def test_statistics_weigh_what_lies_before_the_block(tmp_path, views, photos, st
     )
     rasterizer, run = coordinator.run.rasterizer, coordinator.run
     batch = coordinator.next_batch()
-    block, live = run.active.geometry.block, coordinator.live
+    block, live = run.active.geometry.block, coordinator.visit.live
     before = whole_scene(coordinator)
     (sample,) = batch.samples
     rendered = coordinator.render(batch)

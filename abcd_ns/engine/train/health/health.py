@@ -18,7 +18,7 @@ from torch import Tensor
 from abcd_ns.engine.events import Announcer, Mended, VisitUndone
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
-from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.settle import state_for_visit
 from abcd_ns.engine.train.health.health_rules import (
     GIANT_ANGLE,
@@ -49,7 +49,7 @@ class Health:
 
     def __init__(
         self,
-        scene: StoredScene,
+        scene: VisitScene,
         params: Params,
         optimizers: Optimizers,
         announce: Announcer,

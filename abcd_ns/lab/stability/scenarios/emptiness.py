@@ -66,7 +66,7 @@ def _prune_a_visit(coordinator: Coordinator, stage: Stage) -> tuple[bool, int]:
     others = {b: scene.gaussians(b) for b in range(scene.tree.num_blocks) if b != block}
     with torch.no_grad():
         coordinator.params["opacities"].fill_(-20.0)
-    coordinator.live.growth["weight"].zero_()  # nor do statistics remember that they ever showed
+    coordinator.visit.live.growth["weight"].zero_()  # nor do statistics remember that they ever showed
     while coordinator.state.active is not None:
         train_step(coordinator, stage)
     return all(equal(scene.gaussians(b), gaussians) for b, gaussians in others.items()), block

@@ -1,0 +1,72 @@
+"""Joins a Ray cluster, or starts one that nobody outside this machine can reach."""
+
+import importlib.util
+import os
+import secrets
+from contextlib import suppress
+from typing import Any
+
+from abcd_ns.cluster.lease import WorkersError
+
+MISSING = "Workers need Ray, which is not installed: pip install 'abcd-ns[cluster]'."
+LOOPBACK = "127.0.0.1"
+STARTS = 3
+"""Attempts to start Ray, which gives its own processes half a minute: little on a machine that is busy."""
+
+
+def check_installed() -> None:
+    """See that Ray can be imported.
+
+    Raises:
+        WorkersError: it cannot.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise WorkersError(MISSING)
+
+
+def connect(address: str | None, *, cores: int, object_store_bytes: int | None = None) -> None:
+    """Join the cluster whose head is at `address` (host:port), or start one here for as long as we live.
+
+    One that is started listens on 127.0.0.1 alone, and asks for a token that only its own processes know. A
+    cluster's token, if it asks for one, is taken from where Ray looks for it: RAY_AUTH_TOKEN, or
+    ~/.ray/auth_token.
+
+    Raises:
+        WorkersError: no Ray, no such cluster, or one that refuses us.
+    """
+    check_installed()
+    keep_to_ourselves(address is None)
+    import ray
+
+    ray.shutdown()  # of an earlier run of this process
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "CRITICAL"}
+    local = {"num_cpus": cores, "include_dashboard": False, "_node_ip_address": LOOPBACK}
+    local["object_store_memory"] = object_store_bytes
+    for attempt in range(STARTS):
+        try:
+            ray.init(**quiet, **(local if address is None else {"address": address}))
+            return
+        except Exception as error:
+            with suppress(Exception):
+                ray.shutdown()
+            first = (str(error).strip() or type(error).__name__).splitlines()[0]
+            if address is not None:
+                raise WorkersError(f"No Ray cluster answers at {address}: {first}") from error
+            if attempt == STARTS - 1:
+                raise WorkersError(f"No Ray could be started here: {first}") from error
+
+
+def keep_to_ourselves(starts: bool) -> None:
+    """Set what Ray reads from the environment, some of it when it is imported.
+
+    Args:
+        starts: whether a cluster is started here.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault(
+        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0"
+    )  # no GPU asked for: leave the others alone
+    if starts:
+        os.environ["RAY_AUTH_MODE"] = "token"
+        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # else it takes an interface others can reach

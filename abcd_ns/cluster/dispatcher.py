@@ -1,0 +1,314 @@
+"""Trains blocks at once: lends them to workers, and takes in what they made of them in a fixed order.
+
+Visits are numbered as they are planned. Visit k begins from what visits up to k - `lag` have left, whoever is
+done sooner or later, and they are taken in one after the other. So what a run computes depends on `lag` and
+not on timing, nor on who was lost: whoever is given a visit again makes the same of it. With a lag of 1 a
+run is the same as one by a coordinator alone.
+
+Two blocks that are trained at once both answer for what neither shows alone. How little that matters was
+measured (docs/cluster.md).
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.cluster.lease import (
+    Finished,
+    Lease,
+    Lost,
+    Report,
+    StepsSeen,
+    VisitOutcome,
+    VisitTask,
+    Workers,
+    WorkersError,
+)
+from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, WorkerLost, WorkersSeen
+from abcd_ns.engine.store.lent_scene import Outlines
+from abcd_ns.engine.store.settle import has_scaffold, settle, state_for_visit
+from abcd_ns.engine.train.coordinator import Coordinator, put_to_rest, tell_of_end
+from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.planner import BlocksBusyError
+from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.step.batch import Batch, Rendered
+from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.engine.types import Gaussians
+
+SLACK = 2
+"""Visits begun and not yet taken in, for each worker: with 1 all would wait for the slowest."""
+SECONDS = 0.5
+"""Between two looks at the workers."""
+LOSSES = 5
+"""Workers that a visit may lose before the run gives up: it is the visit that ends them."""
+
+
+@dataclass
+class Lent:
+    """A visit that was begun and is not taken in yet."""
+
+    active: ActiveVisit
+    lease: Lease
+    taken: int
+    """Gaussians that waited for the block and are in its visit."""
+    submitted: bool = False
+    losses: int = 0
+    outcome: VisitOutcome | None = None
+
+
+class Dispatcher(Trainer):
+    """Lends blocks to workers; what cannot be lent, the warm-up, is trained here.
+
+    Args:
+        local: trains it, and has planner, scene and live parameters.
+        lag: see above; None takes SLACK for each worker. Fewer where there are fewer blocks.
+    """
+
+    def __init__(self, local: Coordinator, workers: Workers, lag: int | None = None) -> None:
+        super().__init__(local.run)
+        self._local, self.workers = local, workers
+        self._lag = lag or SLACK * workers.count
+        self._lent: deque[Lent] = deque()
+        self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}
+        self._leases = 0
+        self._counted = self.state.step
+        self.refused = 0
+        """Answers that came after their lease was given up."""
+
+    # -- a step, here or elsewhere -------------------------------------------------------------------
+
+    @property
+    def trains_elsewhere(self) -> bool:
+        """Once the warm-up, or a visit that was saved in its midst, is over."""
+        state = self.state
+        warms_up = state.visit == 0 and has_scaffold(self.scene) and self.progress < self.config.warmup
+        return state.active is None and not warms_up
+
+    def await_step(self) -> None:
+        """Return when one more step was taken in, or the run is finished.
+
+        Raises:
+            NothingSeenError: no view sees any block.
+            WorkersError: there are no workers, or a visit lost LOSSES of them.
+        """
+        self.stopwatch.start()
+        if not self._leases and self.device.type == "cuda":
+            torch.cuda.empty_cache()  # of the warm-up: a worker may share this device
+        while self._counted >= self.state.step and not self.finished:
+            self._lend()
+            if self._counted < self.state.step or self.finished:
+                break
+            for report in self.workers.wait(SECONDS):
+                self._hear(report)
+            self.announce(WorkersSeen(tuple(self.workers.seen())))
+        self._counted += 1
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is used up, and all that was lent is taken in."""
+        return not self._lent and super().finished
+
+    def pause(self) -> None:
+        """No time counts until the next step, unless workers go on."""
+        if not self._lent:
+            super().pause()
+
+    @property
+    def batch(self) -> int:
+        """Views in a step."""
+        return self._local.batch
+
+    def next_batch(self) -> Batch:
+        """As the coordinator's."""
+        return self._local.next_batch()
+
+    def render(self, batch: Batch) -> Rendered:
+        """As the coordinator's."""
+        return self._local.render(batch)
+
+    def loss(
+        self,
+        batch: Batch,
+        pictures: Sequence[Float[Tensor, "_h _w 3"]],
+        photos: Sequence[Float[Tensor, "_h _w 3"]],
+    ) -> Float[Tensor, ""]:
+        """As the coordinator's."""
+        return self._local.loss(batch, pictures, photos)
+
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+        """As the coordinator's."""
+        self._local.after_step(rendered, psnrs)
+        self._counted = self.state.step
+
+    # -- lending -------------------------------------------------------------------------------------
+
+    def _lend(self) -> None:
+        """Take in what may be, and lend as much as workers can take."""
+        self._submit()
+        while self._may_lend:
+            if len(self._lent) >= self._lag:
+                if not self._take_in_first():
+                    return
+            elif self.workers.idle == 0:
+                return
+            else:
+                try:
+                    active = self._local.visits.begin()
+                except BlocksBusyError:
+                    if not self._take_in_first():
+                        return
+                    continue
+                self._lent.append(self._lent_of(active))
+                self._submit()
+        while self._lent and self._take_in_first():
+            pass
+
+    @property
+    def _may_lend(self) -> bool:
+        steps = self.run.budget.steps
+        return self.progress < 1.0 and (steps is None or self.state.planned < steps)
+
+    def _lent_of(self, active: ActiveVisit) -> Lent:
+        state, scene, block = self.state, self.scene, active.geometry.block
+        blocks = range(scene.tree.num_blocks)
+        mail = scene.mail(block)
+        task = VisitTask(
+            active=active,
+            tree=scene.tree,
+            outlines=Outlines(
+                *(list(map(known, blocks)) for known in (scene.version, scene.count, scene.bounds))
+            ),
+            step=state.planned,
+            seconds=self.stopwatch.seconds,
+            sweep=state.sweep,
+            warm=state.warm,
+            views=state.views.get(block, len(active.geometry.views)),
+            health=state.health.get(block, BlockHealth()),
+            allowance=self._allowance(),
+        )
+        state.active = None
+        state.in_flight.append(active)
+        own = self.workers.share(state_for_visit(scene, block))
+        lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks if b != block}))
+        return Lent(active, lease, len(mail or ()))
+
+    def _as_drawn(self, block: int) -> Callable[[], Gaussians]:
+        """What reads a block as it is now; what was shared before stays with the leases that have it."""
+        version = self.scene.version(block)
+        if block not in self._shown or self._shown[block][0] != version:
+            self._shown[block] = version, self.workers.share(self.scene.gaussians(block))
+        return self._shown[block][1]
+
+    def _lease(self, lease: Lease) -> Lease:
+        """The same under a new number."""
+        self._leases += 1
+        return replace(lease, number=self._leases)
+
+    def _allowance(self) -> int | None:
+        """The visit's part of what the scene's limit leaves: all that are out at once may grow."""
+        limit = self.config.density.limit
+        if limit is None:
+            return None
+        given = sum(lent.lease.task.allowance for lent in self._lent)
+        return max(limit - self.count() - given, 0) // max(self._lag - len(self._lent), 1)
+
+    def _submit(self) -> None:
+        for lent in self._lent:
+            if not lent.submitted and self.workers.idle:
+                self.workers.submit(lent.lease)
+                lent.submitted = True
+                active, task = lent.active, lent.lease.task
+                seen, gaussians = len(active.geometry.views), task.outlines.counts[active.geometry.block]
+                if not lent.losses:
+                    block = active.geometry.block
+                    self.announce(VisitBegan(active.number, task.sweep, block, active.steps, seen, gaussians))
+
+    # -- taking in -----------------------------------------------------------------------------------
+
+    def _hear(self, report: Report) -> None:
+        lent = next((lent for lent in self._lent if lent.lease.number == report.lease), None)
+        if lent is None or lent.outcome is not None:
+            self.refused += isinstance(report, Finished)
+            return
+        match report:
+            case StepsSeen():
+                number = lent.active.number
+                self.announce(StepTaken(self.state.step, number, report.done, report.psnr))
+            case Finished():
+                lent.outcome = report.outcome
+            case Lost():
+                self._lose(lent, report.why)
+
+    def _lose(self, lent: Lent, why: str) -> None:
+        lent.losses += 1
+        block = lent.active.geometry.block
+        self.announce(WorkerLost(block, why))
+        if lent.losses >= LOSSES:
+            raise WorkersError(
+                f"The visit to block {block + 1} lost {LOSSES} workers, the last one so: {why}. All that was "
+                "taken in is safe; see to their memory (abcd plan says what a block needs), and go on."
+            )
+        lent.lease, lent.submitted = self._lease(lent.lease), False
+
+    def _take_in_first(self) -> bool:
+        """Take in the visit that was begun first, if it is done; whether it was."""
+        if self._lent[0].outcome is None:
+            return False
+        lent = self._lent.popleft()
+        outcome, active, state = lent.outcome, lent.active, self.state
+        block, sweep = active.geometry.block, lent.lease.task.sweep
+        state.in_flight.remove(active)
+        state.step += outcome.done
+        state.count_drawn(outcome.trained, outcome.frozen)
+        if outcome.shown:
+            state.influence[block].update(outcome.shown)
+        state.health[block] = outcome.health
+        active.layer_seconds = outcome.layer_seconds
+        updates = settle(self.scene, block, outcome.state, self.config.recipe.migrate, lent.taken)
+        tell_of_end(self.run, active, outcome.state, put_to_rest(self.run, updates), sweep)
+        if not self._is_under_way(sweep):
+            self.announce(SweepEnded(sweep, state.step))
+        return True
+
+    def _is_under_way(self, sweep: int) -> bool:
+        """Whether visits of a sweep are still to come, or out."""
+        queued = self.state.sweep == sweep and bool(self.state.queue)
+        return queued or any(lent.lease.task.sweep == sweep for lent in self._lent)
+
+    # -- at rest -------------------------------------------------------------------------------------
+
+    @property
+    def layer_limit(self) -> int:
+        """As the coordinator's."""
+        return self._local.layer_limit
+
+    @property
+    def layer_bytes(self) -> int:
+        """Here, without workers'."""
+        return self._local.layer_bytes
+
+    def rest(self, within: float) -> None:
+        """Put what is live here to rest, and the run's state. What workers are at is planned again by whoever
+        goes on from there."""
+        self._local.rest(within)
+
+    def restore(self) -> None:
+        """As the coordinator's; what workers are at is dropped."""
+        self._lent.clear()
+        self._local.restore()
+        self._counted = self.state.step
+
+    def dismiss(self) -> None:
+        """End the workers."""
+        self.workers.close()
+
+    def close(self) -> None:
+        """End the workers, write what waits, and let go of the store."""
+        try:
+            self.dismiss()
+        finally:
+            super().close()

@@ -1,0 +1,135 @@
+"""What passes between the one who lends blocks and those who train them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from abcd_ns.engine.events import WorkerSeen
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store.lent_scene import Outlines
+from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
+
+
+class WorkersError(UserError):
+    """Workers cannot be had, or are lost again and again; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class VisitTask:
+    """All that decides what a visit makes of its block, besides Gaussians: whoever trains it, and however
+    often, comes to the same."""
+
+    active: ActiveVisit
+    tree: BlockTree
+    outlines: Outlines
+    """Of all blocks, at the moment they are lent."""
+    step: int
+    """Steps of the run before the visit's first one."""
+    seconds: float
+    """Training time when it begins."""
+    sweep: int
+    warm: float
+    """As in RunState."""
+    views: int
+    """Worth training the block on."""
+    health: BlockHealth
+    allowance: int | None
+    """Gaussians by which the block may grow, for the sake of a limit on the scene; None for any number."""
+
+
+@dataclass(frozen=True)
+class VisitOutcome:
+    """What became of a block."""
+
+    state: BlockState
+    """On the CPU; Gaussians that left the cell are still among them."""
+    done: int
+    """Steps taken."""
+    psnr: float
+    """Mean of its steps' training crops, dB; NaN where none is known."""
+    trained: int
+    frozen: int
+    """Gaussians of the block and around it, when the visit began."""
+    shown: dict[int, float]
+    """The influence that the block has on views that were doubtful."""
+    health: BlockHealth
+    layer_seconds: float
+    seconds: float
+    """That the visit took."""
+
+
+@dataclass(frozen=True)
+class Lease:
+    """A visit in the hands of a worker. It ends when the worker answers, or is given up."""
+
+    number: int
+    """No other lease of the run has it: an answer to one that was given up is known by that."""
+    task: VisitTask
+    state: Callable[[], BlockState]
+    """Reads what the visit begins with, wherever the worker is."""
+    others: Mapping[int, Callable[[], Gaussians]]
+    """Likewise all other blocks as they are drawn."""
+
+
+@dataclass(frozen=True)
+class StepsSeen:
+    """A worker is at it."""
+
+    lease: int
+    done: int
+    psnr: float
+    """Of recent steps, dB."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A worker has answered."""
+
+    lease: int
+    outcome: VisitOutcome
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A worker is gone, or too long silent, and with it what it was at."""
+
+    lease: int
+    why: str
+
+
+Report = StepsSeen | Finished | Lost
+
+
+class Workers(Protocol):
+    """Those who train visits."""
+
+    @property
+    def count(self) -> int:
+        """How many there are, those that are starting included."""
+
+    @property
+    def idle(self) -> int:
+        """How many could take a visit now."""
+
+    def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
+        """What reads this wherever a worker is, as long as the caller keeps it."""
+
+    def submit(self, lease: Lease) -> None:
+        """Give a visit to one that is idle."""
+
+    def wait(self, seconds: float) -> list[Report]:
+        """What has happened, in order; waits for something so long at most.
+
+        Raises:
+            WorkersError: a worker cannot do what it was asked, and no other could.
+        """
+
+    def seen(self) -> Sequence[WorkerSeen]:
+        """What each is doing."""
+
+    def close(self) -> None:
+        """End them. Harmless when done twice."""

@@ -1,0 +1,291 @@
+"""Workers as Ray actors, on this machine or on those of a cluster.
+
+Ray carries blocks and answers, and nothing of a run lives in it: a worker that is lost is replaced by a new
+one, and what it was at is given to another. The driver owns every object, so the end of a worker takes none.
+"""
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import ray
+import torch
+from ray.exceptions import GetTimeoutError, RayActorError, RayError, RayTaskError
+
+from abcd_ns.cluster.lease import (
+    Finished,
+    Lease,
+    Lost,
+    Report,
+    StepsSeen,
+    VisitOutcome,
+    VisitTask,
+    WorkersError,
+)
+from abcd_ns.cluster.visit_worker import VisitWorker
+from abcd_ns.engine.events import StepTaken, WorkerSeen
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
+
+SILENCE, SLOW_START = 60.0, 600.0
+"""Seconds after which a worker that does not answer, or does not begin, counts as lost."""
+LOOK_EVERY = 1.0
+"""Seconds between two questions."""
+STARTS = 3
+"""Workers in a row that may end before they are ready; then there is something wrong with all of them."""
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Gaussians or a block in Ray's object store: calling it reads them; here without a copy."""
+
+    ref: ray.ObjectRef
+    meta: dict[str, Any] | None
+    """Of a block; None for Gaussians."""
+
+    @staticmethod
+    def of(value: Gaussians | BlockState) -> "Shared":
+        """Put it there; the caller owns it."""
+        tensors, meta = (dict(value.items()), None) if isinstance(value, Gaussians) else value.to_tensors()
+        return Shared(ray.put({name: tensor.numpy() for name, tensor in tensors.items()}), meta)
+
+    def __call__(self) -> Gaussians | BlockState:
+        """Read it; not to be written to."""
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")
+            tensors = {name: torch.from_numpy(array) for name, array in ray.get(self.ref).items()}
+        return Gaussians(**tensors) if self.meta is None else BlockState.from_tensors(tensors, self.meta)
+
+
+class Actor:
+    """A worker's process. One thread trains; another answers how far it is."""
+
+    def __init__(self) -> None:
+        self._worker: VisitWorker | None = None
+        self._done, self._psnrs = 0, list[float]()
+
+    def prepare(self, make: Callable[[], VisitWorker]) -> int:
+        """Read what the run needs; gives the process' identifier."""
+        torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+        self._worker = make()
+        return os.getpid()
+
+    def visit(
+        self, task: VisitTask, state: Shared, others: dict[int, Shared]
+    ) -> tuple[VisitOutcome, Any, Any]:
+        """Train a block; gives what became of it, its Gaussians apart."""
+        self._done, self._psnrs = 0, []
+        outcome = self._worker.visit(task, state(), others, self._hear)
+        tensors, meta = outcome.state.to_tensors()
+        arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+        return replace(outcome, state=outcome.state.nobody), arrays, meta
+
+    def _hear(self, step: StepTaken) -> None:
+        self._done = step.visit_step
+        self._psnrs = [*self._psnrs[-15:], step.psnr]
+
+    def progress(self) -> tuple[int, float]:
+        """Steps of the visit so far, and the mean PSNR of the last ones, dB."""
+        psnrs = [psnr for psnr in self._psnrs if psnr == psnr]
+        return self._done, sum(psnrs) / len(psnrs) if psnrs else float("nan")
+
+
+@dataclass
+class Member:
+    """A worker, as the driver knows it."""
+
+    number: int
+    actor: Any
+    asked: ray.ObjectRef
+    """What it is at: getting ready, or a visit."""
+    lease: Lease | None = None
+    question: ray.ObjectRef | None = None
+    asked_at: float = 0.0
+    """When its last question was put, or it was started; of `time.monotonic`, as the other moments."""
+    ready: bool = False
+    pid: int = 0
+    steps: int = 0
+    visits: int = 0
+    deaths: int = 0
+    since: float | None = None
+    """When it was first ready."""
+    free_since: float = 0.0
+    waited: float = 0.0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether it could take a visit."""
+        return self.ready and self.lease is None
+
+
+class RayWorkers:
+    """So many actors of the Ray cluster that this process is connected to; see `connect`.
+
+    Args:
+        make: called in each worker's process; reads what the run needs. Must be picklable.
+        gpus: of each worker, 1 or 0.
+        cores: of each worker where it has no GPU.
+    """
+
+    def __init__(self, count: int, make: Callable[[], VisitWorker], *, gpus: int = 0, cores: int = 1) -> None:
+        options = {"num_gpus": gpus, "num_cpus": cores, "max_concurrency": 2}
+        self._class = ray.remote(**options, max_restarts=0, max_task_retries=0)(Actor)
+        self._make = ray.put(make)
+        self._failed_starts = 0
+        self._members = [self._start(Member(number, None, None)) for number in range(count)]
+
+    @property
+    def count(self) -> int:
+        """How many there are, those that are starting included."""
+        return len(self._members)
+
+    @property
+    def idle(self) -> int:
+        """How many could take a visit now."""
+        return sum(member.is_idle for member in self._members)
+
+    def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
+        """Put it where all workers can read it."""
+        return Shared.of(value)
+
+    def submit(self, lease: Lease) -> None:
+        """Give a visit to the one who has waited longest."""
+        idle = (member for member in self._members if member.is_idle)
+        member = min(idle, key=lambda member: member.free_since)
+        now = time.monotonic()
+        member.waited += now - member.free_since
+        member.lease, member.asked_at, member.steps = lease, now, 0
+        member.asked = member.actor.visit.remote(lease.task, lease.state, dict(lease.others))
+
+    def wait(self, seconds: float) -> list[Report]:
+        """What has happened; asks those that are at work how far they are."""
+        self._ask()
+        by_ref = {ref: member for member in self._members for ref in (member.asked, member.question) if ref}
+        if not by_ref:
+            return []
+        ray.wait(list(by_ref), num_returns=1, timeout=seconds)
+        answered, _ = ray.wait(list(by_ref), num_returns=len(by_ref), timeout=0)
+        reports: list[Report] = []
+        for ref in answered:
+            member = by_ref[ref]
+            if ref == member.question:
+                reports += self._answer_of(member)
+            elif ref == member.asked:
+                reports += self._end_of(member, ref)
+        for member in self._members:
+            reports += self._give_up(member)
+        return reports
+
+    def _give_up(self, member: Member) -> list[Report]:
+        """Replace one that has not answered for too long."""
+        patience = SILENCE if member.ready else SLOW_START
+        waits = member.question is not None or not member.ready
+        if not waits or time.monotonic() - member.asked_at <= patience:
+            return []
+        ray.kill(member.actor)
+        return self._replace(member, f"silent for {patience:.0f} s")
+
+    def seen(self) -> Sequence[WorkerSeen]:
+        """What each is doing."""
+        return [self._seen(member) for member in self._members]
+
+    def close(self) -> None:
+        """End them."""
+        for member in self._members:
+            ray.kill(member.actor)
+        self._members = []
+
+    @property
+    def pids(self) -> list[int]:
+        """Processes of those that are ready."""
+        return [member.pid for member in self._members if member.ready]
+
+    def _start(self, member: Member) -> Member:
+        member.actor = self._class.remote()
+        member.asked = member.actor.prepare.remote(self._make)
+        member.question, member.lease, member.ready = None, None, False
+        member.asked_at = member.free_since = time.monotonic()
+        return member
+
+    def _ask(self) -> None:
+        now = time.monotonic()
+        for member in self._members:
+            if member.lease is not None and member.question is None and now - member.asked_at > LOOK_EVERY:
+                member.question, member.asked_at = member.actor.progress.remote(), now
+
+    def _answer_of(self, member: Member) -> list[Report]:
+        question, member.question = member.question, None
+        try:
+            steps, psnr = ray.get(question, timeout=0)
+        except (RayActorError, GetTimeoutError):
+            return []  # what it was asked to do fails likewise, and says why
+        if member.lease is None:
+            return []
+        member.steps = steps
+        return [StepsSeen(member.lease.number, steps, psnr)]
+
+    def _end_of(self, member: Member, ref: ray.ObjectRef) -> list[Report]:
+        try:
+            answer = ray.get(ref)
+        except RayTaskError as error:
+            raise _as_user_error(error, member.number) from error
+        except RayError as error:
+            return self._replace(member, _first_line(error))
+        now = time.monotonic()
+        member.asked, member.free_since = None, now
+        if not member.ready:
+            member.ready, member.pid, self._failed_starts = True, answer, 0
+            member.since = member.since or now
+            return []
+        lease, member.lease = member.lease, None
+        member.visits += 1
+        outcome, arrays, meta = answer
+        tensors = {
+            name: torch.tensor(array) for name, array in arrays.items()
+        }  # Ray's memory is for passing on
+        return [Finished(lease.number, replace(outcome, state=BlockState.from_tensors(tensors, meta)))]
+
+    def _replace(self, member: Member, why: str) -> list[Report]:
+        """Start another in place of one that is gone."""
+        lost = [] if member.lease is None else [Lost(member.lease.number, why)]
+        member.deaths += 1
+        self._failed_starts += not member.ready
+        if self._failed_starts >= STARTS:
+            raise WorkersError(
+                f"Workers end before they can begin, the last one so: {why}. Try with fewer workers; "
+                "abcd doctor looks at this machine."
+            )
+        self._start(member)
+        return lost
+
+    def _seen(self, member: Member) -> WorkerSeen:
+        lease, now = member.lease, time.monotonic()
+        waited = member.waited + (now - member.free_since if member.is_idle else 0.0)
+        share = waited / max(now - member.since, 1e-9) if member.since else 0.0
+        return WorkerSeen(
+            member.number,
+            lease and lease.task.active.geometry.block,
+            member.steps,
+            lease.task.active.steps if lease else 0,
+            member.visits,
+            member.deaths,
+            min(share, 1.0),
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def _as_user_error(error: RayTaskError, number: int) -> Exception:
+    """What a worker raised, as it would have been raised here."""
+    cause = error.cause
+    if isinstance(cause, UserError):
+        return WorkersError(f"worker {number + 1}: {cause}")
+    if isinstance(cause, torch.cuda.OutOfMemoryError):
+        return cause
+    return error

@@ -1,0 +1,198 @@
+"""Trains single visits of somebody else's run, on parameters of its own."""
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from abcd_ns.cluster.lease import VisitOutcome, VisitTask
+from abcd_ns.engine.events import Event, StepTaken
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.render import Rasterizer
+from abcd_ns.engine.render.loss import psnrs
+from abcd_ns.engine.store.lent_scene import LentScene
+from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.run import TrainingRun
+from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
+from abcd_ns.engine.train.step.batch import Batch, Sample
+from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.train.visit_training import VisitTraining
+from abcd_ns.engine.types import Gaussians, View
+
+
+@dataclass(frozen=True)
+class AdamOptions:
+    """Of one parameter's optimizer."""
+
+    lr: float
+    betas: tuple[float, float]
+    eps: float
+
+    @staticmethod
+    def of(optimizer: torch.optim.Optimizer) -> "AdamOptions":
+        """As an optimizer was made."""
+        group = optimizer.param_groups[0]
+        return AdamOptions(group["lr"], tuple(group["betas"]), group["eps"])
+
+
+@dataclass(frozen=True)
+class RunSetup:
+    """What all visits of a run have in common."""
+
+    config: TrainingConfig
+    budget: Budget
+    views: list[View]
+    optimizers: dict[str, AdamOptions]
+    """By parameter, as they are before the first step."""
+    layer_room: LayerRoom
+
+
+class OnLease:
+    """The terms of a visit that somebody else has decided on; see Visits."""
+
+    def __init__(self, run: TrainingRun, task: VisitTask, begun: int) -> None:
+        self._run, self._task, self._begun = run, task, begun
+
+    def begin(self) -> ActiveVisit:
+        """The one visit that there is."""
+        return self._run.active
+
+    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:  # noqa: ARG002 - all alike
+        """Others see the live block as it is."""
+        return lambda: live_gaussians(self._run.params)
+
+    def room(self) -> int | None:
+        """What the block's limit, and its part of the scene's, leave."""
+        config, live = self._run.config, len(self._run.params["means"])
+        left = 0 if self._task.allowance is None else self._task.allowance - (live - self._begun)
+        return config.room((config.density.limit or 0) - left, live, self._task.tree.num_blocks)
+
+    def compared(
+        self,
+        batch: Batch,  # noqa: ARG002 - all alike
+        pictures: Sequence[Tensor],
+        photos: Sequence[Tensor],
+    ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """Everything."""
+        return pictures, photos
+
+
+class VisitWorker:
+    """Trains visits, one after the other.
+
+    Args:
+        target: gives what a sample is trained on.
+    """
+
+    def __init__(
+        self,
+        setup: RunSetup,
+        rasterizer: Rasterizer,
+        target: Callable[[Sample], Target],
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self._setup, self._rasterizer = setup, rasterizer
+        self._target, self._device = target, torch.device(device)
+
+    def visit(
+        self,
+        task: VisitTask,
+        state: BlockState,
+        others: Mapping[int, Callable[[], Gaussians]],
+        listen: Callable[[StepTaken], None] | None = None,
+    ) -> VisitOutcome:
+        """Train a block between the others.
+
+        Args:
+            state: what it begins with.
+            others: what reads them; only those are read that some picture shows.
+            listen: is told of each step.
+        """
+        run = self._run_of(
+            task, LentScene(task.tree, task.outlines, task.active.geometry.block, state, others)
+        )
+        heard: list[float] = []
+
+        def hear(event: Event) -> None:
+            if isinstance(event, StepTaken):
+                if listen is not None:
+                    listen(event)
+                if math.isfinite(event.psnr):
+                    heard.append(event.psnr)
+
+        run.announce.subscribe(hear)
+        began = run.stopwatch.seconds
+        run.stopwatch.start()
+        training = VisitTraining(
+            run, OnLease(run, task, len(state)), LayerSource(run, self._setup.layer_room)
+        )
+        training.begin(run.active)
+        while not training.is_over:
+            self._take_step(training)
+        active, block = run.active, run.active.geometry.block
+        return VisitOutcome(
+            training.finish(),
+            active.done,
+            sum(heard) / len(heard) if heard else math.nan,
+            run.state.trained,
+            run.state.frozen,
+            run.state.influence[block],
+            run.state.health[block],
+            active.layer_seconds,
+            run.stopwatch.seconds - began,
+        )
+
+    def _run_of(self, task: VisitTask, scene: LentScene) -> TrainingRun:
+        setup, block = self._setup, task.active.geometry.block
+        empty = Gaussians.empty(setup.config.sh_degree, self._device)
+        params = {name: Parameter(value) for name, value in empty.items()}
+        optimizers = {
+            name: torch.optim.Adam([params[name]], fused=True, **vars(options))
+            for name, options in setup.optimizers.items()
+        }
+        run = TrainingRun(
+            setup.config,
+            setup.budget,
+            scene,
+            setup.views,
+            self._rasterizer,
+            params,
+            optimizers,
+            device=self._device,
+        )
+        run.state = RunState(
+            step=task.step,
+            sweep=task.sweep,
+            visit=task.active.number + 1,
+            warm=task.warm,
+            views={block: task.views},
+            influence={block: {}},
+            health={block: copy.copy(task.health)},
+            active=copy.deepcopy(task.active),
+        )
+        run.stopwatch = Stopwatch(task.seconds)
+        return run
+
+    def _take_step(self, training: VisitTraining) -> None:
+        batch, optimizers = training.next_batch(), training.run.optimizers.values()
+        targets = [self._target(sample) for sample in batch.samples]
+        rendered = training.render(batch)
+        pictures, photos = [], []
+        for picture, (photo, counts) in zip(rendered.pictures, targets, strict=True):
+            weight = None if counts is None else counts.to(picture.device)
+            pictures.append(picture if weight is None else picture * weight)
+            photos.append(photo if weight is None else photo * weight)
+        loss = training.loss(batch, pictures, photos)
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        if loss.requires_grad:
+            loss.backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        training.after_step(rendered, psnrs(pictures, photos))

@@ -1,0 +1,91 @@
+"""A scene as it was at one moment, lent to whoever trains a visit apart from it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.types import Gaussians
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """What is known of every block without its Gaussians."""
+
+    versions: Sequence[int]
+    counts: Sequence[int]
+    """Gaussians."""
+    bounds: Sequence[Box | None]
+    """See BlockScene."""
+
+
+class LentScene:
+    """The blocks of a moment: one with all that its training goes on from, the others to be drawn.
+
+    Args:
+        block: the one to be trained.
+        state: what its visit begins with.
+        others: by block, what gives its Gaussians; asked when they are drawn, once.
+    """
+
+    def __init__(
+        self,
+        tree: BlockTree,
+        outlines: Outlines,
+        block: int,
+        state: BlockState,
+        others: Mapping[int, Callable[[], Gaussians]],
+    ) -> None:
+        self.tree = tree
+        self._outlines, self._block, self._state = outlines, block, state
+        self._others, self._read = others, dict[int, Gaussians]()
+        self._live: Callable[[], Gaussians] | None = None
+
+    def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
+        """From now on the lent block is what `live` returns.
+
+        Raises:
+            ValueError: another block.
+        """
+        if block != self._block:
+            raise ValueError(f"block {self._block} was lent, not {block}")
+        self._live = live
+
+    def state(self, number: int) -> BlockState:
+        """The lent block as its visit found it.
+
+        Raises:
+            KeyError: another one: no more than its Gaussians is known.
+        """
+        if number != self._block:
+            raise KeyError(f"block {self._block} was lent, not {number}")
+        return self._state
+
+    def mail(self, block: int) -> BlockState | None:  # noqa: ARG002 - the lent block has had it
+        """Nobody waits."""
+        return None
+
+    def rows(self, number: int) -> int:
+        """Gaussians of the lent block as its visit found it."""
+        return len(self.state(number))
+
+    def gaussians_at_rest(self, block: int) -> Gaussians:
+        """The lent block as its visit found it."""
+        return self.state(block).gaussians
+
+    def gaussians(self, block: int) -> Gaussians:
+        if block == self._block:
+            return self._state.gaussians if self._live is None else self._live().detach()
+        if block not in self._read:
+            self._read[block] = self._others[block]()
+        return self._read[block]
+
+    def version(self, block: int) -> int:
+        return self._outlines.versions[block]
+
+    def count(self, block: int) -> int:
+        is_live = block == self._block and self._live is not None
+        return len(self._live()) if is_live else self._outlines.counts[block]
+
+    def bounds(self, block: int) -> Box | None:
+        return self._outlines.bounds[block]

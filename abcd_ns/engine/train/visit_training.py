@@ -1,0 +1,128 @@
+"""The training of one visit's block, from its first step to its last: by whoever has the block."""
+
+from collections.abc import Callable, Sequence
+
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.events import StepTaken, VisitBegan
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import Pace
+from abcd_ns.engine.train.layer_source import LayerSource
+from abcd_ns.engine.train.planner import Visits
+from abcd_ns.engine.train.run import TrainingRun
+from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.schedule import exponential_decay
+from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample
+from abcd_ns.engine.train.step.drawing import StepDrawing
+from abcd_ns.engine.train.step.live_block import LiveBlock
+from abcd_ns.engine.train.step.workers.share import Target
+
+
+class VisitTraining:
+    """Attaches a block between its layers, takes its steps, and gives back what they made of it.
+
+    Args:
+        visits: on what terms the block is trained.
+        source: gives visits their layers.
+        target: gives what a sample is trained on, so that helpers can share a step; None for one process.
+        live: the block in training; None for one that nobody else looks after.
+    """
+
+    def __init__(
+        self,
+        run: TrainingRun,
+        visits: Visits,
+        source: LayerSource,
+        target: Callable[[Sample], Target] | None = None,
+        live: LiveBlock | None = None,
+    ) -> None:
+        self.run, self._visits = run, visits
+        self.steps = StepDrawing(run, source, target)
+        self.live = live or LiveBlock(run)
+        self._pace = Pace(run.optimizers, run.config.recipe.batch_power)
+
+    @property
+    def batch(self) -> int:
+        """Views in a step of the visit that is under way."""
+        return self.steps.batch
+
+    def begin(self, active: ActiveVisit) -> None:
+        """Begin a visit, which from now on is the run's active one."""
+        active.crew = self.steps.size_of_crew(active)
+        self.attach(active)
+
+    def attach(self, active: ActiveVisit) -> None:
+        """Make its block live and draw its layers, at its beginning or where a save found it."""
+        run, state = self.run, self.run.state
+        self.live.attach(active, self.batch)
+        block, seen = None if active.is_whole else active.geometry.block, len(active.geometry.views)
+        run.scene.set_live(block, self._visits.attached(active))
+        gaussians = len(self.live)
+        run.announce(VisitBegan(active.number, state.sweep, block, active.steps, seen, gaussians))
+        before = run.stopwatch.seconds
+        self.steps.begin_visit(active)
+        active.layer_seconds += run.stopwatch.seconds - before
+        if active.done == 0 and self.steps.layers is not None:
+            state.count_drawn(gaussians, self.steps.layers.frozen)
+        if active.done == 0 and active.looked_at:
+            state.influence[block].update(self.steps.shown_in(active.looked_at))
+
+    def next_batch(self) -> Batch:
+        """Set the learning rates, and say what to train on next."""
+        run = self.run
+        decay = exponential_decay(run.share, 1.0, run.config.means_lr_decay)
+        self._pace.set(self.batch, means_decay=decay, damping=run.health.damping)
+        return self.steps.next_batch()
+
+    def render(self, batch: Batch) -> Rendered:
+        """Draw the active block between its layers; differentiable in the live parameters."""
+        return self.steps.render(batch)
+
+    def loss(
+        self,
+        batch: Batch,
+        pictures: Sequence[Float[Tensor, "_h _w 3"]],
+        photos: Sequence[Float[Tensor, "_h _w 3"]],
+    ) -> Float[Tensor, ""]:
+        """The loss of a step, helpers' part included, over what says something about the block."""
+        return self.steps.loss(batch, *self._visits.compared(batch, pictures, photos))
+
+    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+        """Call after the optimizers stepped: grows and prunes.
+
+        Args:
+            psnrs: of each picture, dB; listeners are told their mean.
+        """
+        run, active = self.run, self.run.active
+        taken = len(rendered.pictures) * active.crew
+        run.state.step += 1
+        active.done += 1
+        sound, psnr = run.health.end_step(psnrs)
+        self.live.count_step(self.batch, 0 if active.is_whole else taken)
+        if not active.is_whole:
+            infos = rendered.infos if sound else ()
+            clock = self.live.density_clock(taken, self.batch, self._visits.room())
+            self.live.refine(infos, clock, self.steps.contributions() if infos else ())
+            if self.live.is_due_to_shed(taken):
+                self.live.shed()
+        run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the visit has had all its steps or time, or its block has outgrown the device."""
+        run, active = self.run, self.run.active
+        is_warm = active.is_whole and run.progress >= run.config.warmup
+        out_of_time = run.progress >= min(active.until, 1.0)
+        return active.done >= active.steps or out_of_time or is_warm or self.live.has_outgrown
+
+    def finish(self) -> BlockState:
+        """What the visit has made of its block, on the CPU; helpers and layers go."""
+        active = self.run.active
+        if not active.is_whole:
+            if not active.sole:
+                self.live.shed()
+            self.live.count_visit()
+        state = self.run.health.end_visit(active, self.live.detached)
+        self.steps.end_visit()
+        return state

@@ -1,0 +1,116 @@
+"""Workers of a run: what each reads when it starts, and who lends them blocks."""
+
+import copy
+from dataclasses import replace
+from functools import partial
+
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from abcd_ns.cluster.connect import check_installed, connect
+from abcd_ns.cluster.dispatcher import Dispatcher
+from abcd_ns.cluster.lease import WorkersError
+from abcd_ns.cluster.visit_worker import AdamOptions, RunSetup, VisitWorker
+from abcd_ns.engine.render import make_rasterizer
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.layer_source import LayerRoom
+from abcd_ns.engine.train.memory import PHOTO_SHARE
+from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.errors import UserError
+
+BLOCKS_EACH = 2
+"""Blocks for each worker at least, where their number is not given: one in training, one that rests."""
+
+
+def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe) -> None:
+    """Look at what is asked for, before anything is written.
+
+    Raises:
+        UserError: workers are of no use, or cannot be had.
+    """
+    if workers < 1:
+        raise UserError(f"--pipeline.workers must be 1 or more, not {workers}.")
+    if workers == 1 and cluster is None:
+        return
+    check_installed()
+    if recipe.exact or recipe.overlap > 0:
+        raise UserError(
+            "This method trains in one process; leave out --pipeline.workers and --pipeline.cluster."
+        )
+    if 0 < blocks <= workers:
+        raise UserError(
+            f"{workers} workers need more than {blocks} blocks: leave --pipeline.blocks out, or give "
+            f"{BLOCKS_EACH * workers}."
+        )
+
+
+def dispatcher_for(local: Coordinator, config: TrainerConfig, budget: int) -> Dispatcher:
+    """Lends the blocks of a run to workers that are started for it.
+
+    Args:
+        budget: bytes of each worker's device that training may take.
+
+    Raises:
+        WorkersError: they cannot be had.
+    """
+    from abcd_ns.cluster.ray_workers import RayWorkers
+
+    pipeline, run, count = config.pipeline, local.run, config.pipeline.workers
+    on_gpu = config.machine.device_type == "cuda"
+    room = local.source.room
+    setup = RunSetup(
+        replace(run.config, processes=1),
+        run.budget,
+        list(run.views.values()),
+        {name: AdamOptions.of(optimizer) for name, optimizer in run.optimizers.items()},
+        LayerRoom(room.device if on_gpu else room.device // count, room.ram // count),
+    )
+    config = copy.deepcopy(config)
+    config.pipeline.datamanager.photo_cache_gb = pipeline.datamanager.photo_cache_gb / count
+    threads = max(torch.get_num_threads() // count, 1)
+    if on_gpu and pipeline.cluster is None and torch.cuda.device_count() < count:
+        raise WorkersError(
+            f"{count} workers need {count} GPUs, one each, and this machine has {torch.cuda.device_count()}: "
+            "ask for fewer."
+        )
+    connect(pipeline.cluster, cores=count * threads)
+    make = partial(make_worker, config, setup, 0 if not on_gpu else int(PHOTO_SHARE * budget))
+    workers = RayWorkers(count, make, gpus=int(on_gpu), cores=threads)
+    CONSOLE.print(f"{count} workers are starting.", highlight=False)
+    while not on_gpu and workers.idle < count:  # the warm-up, too, wants the cores that they start on
+        workers.wait(1.0)
+    return Dispatcher(local, workers)
+
+
+def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int) -> VisitWorker:
+    """In a worker's process: photos, rasterizer and options of the run.
+
+    Raises:
+        UserError: the data is not to be found where the run's driver has it, or is another.
+    """
+    device = torch.device("cuda" if config.machine.device_type == "cuda" else "cpu")
+    data = config.pipeline.datamanager.setup(device=device, test_mode="val", world_size=1, local_rank=0)
+    if len(data.train_dataset) != len(setup.views):
+        raise UserError(
+            f"{config.pipeline.datamanager.data} holds {len(data.train_dataset)} training photos here, and "
+            f"{len(setup.views)} where the run was started: it must be the same folder on every machine."
+        )
+    data.device_photo_bytes = device_photo_bytes
+
+    def target(sample: Sample) -> Target:
+        shot = sample.view.index, sample.crop
+        return _on_background(data.photo(*shot), sample.background), data.mask(*shot)
+
+    return VisitWorker(setup, make_rasterizer(config.pipeline.model.rasterizer, device), target, device)
+
+
+def _on_background(photo: Tensor, background: Tensor) -> Tensor:
+    """What a picture on this background should be, [h, w, 3]."""
+    if photo.shape[-1] == 3:
+        return photo
+    alpha = photo[..., 3:]
+    return alpha * photo[..., :3] + (1 - alpha) * background.to(photo)

@@ -1,0 +1,201 @@
+"""Blocks that are lent come back as if they had never left; and nobody who is lost takes anything along."""
+
+import random
+from dataclasses import replace
+
+import pytest
+import torch
+
+from abcd_ns.cluster.dispatcher import LOSSES, Dispatcher
+from abcd_ns.cluster.lease import Finished, Lost, StepsSeen, WorkersError
+from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded, WorkerLost
+from abcd_ns.engine.store.settle import with_mail
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import PARAM_NAMES
+from tests.cluster.conftest import in_process
+from tests.reference.scenes import whole_scene
+
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+STILL = DensityConfig(strategy="off")
+
+
+def equal(one, other) -> bool:
+    return len(one) == len(other) and all(
+        torch.equal(getattr(one, n), getattr(other, n)) for n in PARAM_NAMES
+    )
+
+
+class Unreliable:
+    """Workers in this process who answer in any order, late, twice, or never.
+
+    Args:
+        fate: says what becomes of a lease: "lost", "late" (lost, and answered all the same), or "done".
+    """
+
+    def __init__(self, inner, fate) -> None:
+        self._inner, self._fate = inner, fate
+        self._out, self._late = [], []
+        self.lost = self.answered_late = 0
+
+    @property
+    def count(self):
+        return self._inner.count
+
+    @property
+    def idle(self):
+        return self.count - len(self._out)
+
+    def share(self, value):
+        return self._inner.share(value)
+
+    def submit(self, lease):
+        assert self.idle > 0
+        self._out.append(lease)
+
+    def wait(self, seconds):
+        late, self._late = self._late, []
+        if not self._out:
+            return late
+        lease, fate = self._fate(self._out)
+        self._out.remove(lease)
+        reports = [StepsSeen(lease.number, 1, 20.0)]
+        if fate != "lost":
+            self._inner.submit(lease)
+            (answer,) = self._inner.wait(seconds)
+            reports = [*reports, answer]
+        if fate == "done":
+            return late + reports
+        self.lost += 1
+        if fate == "late":
+            self._late = [reports[-1]]
+            self.answered_late += 1
+        return [*late, Lost(lease.number, fate)]
+
+    def seen(self):
+        return self._inner.seen()
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("options", [{"density": GROWING}, {"density": STILL, "scaffold": 40, "warmup": 0.3}])
+def test_with_one_visit_at_a_time_the_run_is_that_of_a_coordinator(make, photos, options):
+    alone, lent = make("alone", **options), make("lent", workers=1, lag=1, **options)
+    train(alone, photos)
+    train(lent, photos)
+    assert isinstance(lent, Dispatcher)
+    assert alone.state.step == lent.state.step == 60
+    assert equal(whole_scene(alone), whole_scene(lent))
+    assert alone.state.to_json() | {"seconds": 0} == lent.state.to_json() | {"seconds": 0}
+
+
+@pytest.mark.parametrize("lag", [2, 4])
+def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, photos, lag):
+    steady = make("steady", workers=2, lag=lag, density=GROWING)
+    train(steady, photos)
+    for seed in range(2):
+        rng = random.Random(seed)
+
+        def fate(leases, rng=rng):
+            return rng.choice(leases), rng.choices(["done", "lost", "late"], [6, 1, 1])[0]
+
+        workers = []
+
+        def unreliable(run, fate=fate, workers=workers):
+            workers.append(Unreliable(in_process(run, photos, 2), fate))
+            return workers[-1]
+
+        shaken = make(f"shaken {seed}", workers=unreliable, lag=lag, density=GROWING)
+        lost = []
+        shaken.announce.subscribe(lambda e, lost=lost: lost.append(e) if isinstance(e, WorkerLost) else None)
+        train(shaken, photos)
+        assert len(lost) == workers[0].lost > 0
+        assert workers[0].answered_late >= shaken.refused
+        assert equal(whole_scene(steady), whole_scene(shaken))
+        assert steady.state.to_json() | {"seconds": 0} == shaken.state.to_json() | {"seconds": 0}
+
+
+def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(make, photos):
+    run = make(workers=3, density=STILL)
+    out, most, ended = set(), 0, []
+
+    def hear(event) -> None:
+        nonlocal most
+        if isinstance(event, VisitBegan):
+            assert event.block not in out
+            out.add(event.block)
+            most = max(most, len(out))
+        elif isinstance(event, VisitEnded):
+            out.remove(event.block)
+            ended.append(event.visit)
+
+    sweeps = []
+    run.announce.subscribe(hear)
+    run.announce.subscribe(lambda e: sweeps.append(e.sweep) if isinstance(e, SweepEnded) else None)
+    train(run, photos)
+    assert most > 1
+    assert ended == sorted(ended)
+    assert not out
+    assert sweeps == list(range(run.state.sweep + 1))
+    assert run.state.step == 60
+
+
+def test_nobody_who_moves_meanwhile_is_lost(make, photos):
+    """Gaussians that come to wait for a block while it is out are there when it is home."""
+    run = make(workers=3, lag=5, density=STILL, steps=90)
+    total, generator = run.count(), torch.Generator().manual_seed(0)
+    inner = run.workers.wait
+
+    def wait(seconds):
+        reports = inner(seconds)
+        for report in reports:
+            state = report.outcome.state
+            noise = 0.3 * torch.randn(state.gaussians.means.shape, generator=generator)
+            moved = replace(state.gaussians, means=state.gaussians.means + noise)
+            reports = [Finished(report.lease, replace(report.outcome, state=replace(state, gaussians=moved)))]
+        return reports
+
+    run.workers.wait = wait
+    moved = 0
+    while not run.finished:
+        train_step(run, photos)
+        assert run.count() == total
+        moved += run.scene.inbox is not None and len(run.scene.inbox) > 0
+    assert moved > 0
+    for block in range(run.scene.tree.num_blocks):
+        means = with_mail(run.scene, block).gaussians.means
+        assert bool((run.scene.tree.assign(means) == block).all())
+
+
+@pytest.mark.parametrize("goes_on_with", [None, 1, 3])
+def test_a_run_that_stops_goes_on_with_any_number_of_workers(make, photos, goes_on_with):
+    """Also alone: what was out is planned again."""
+    stopped = make(workers=2, lag=4, density=STILL)
+    while stopped.state.step < 20 or not stopped.state.in_flight:
+        train_step(stopped, photos)
+    out = [visit.geometry.block for visit in stopped.state.in_flight]
+    stopped.save()
+    stopped.close()
+    resumed = make(workers=goes_on_with, resume=True, density=STILL)
+    assert resumed.state.step == stopped.state.step
+    assert [plan.block for plan in resumed.state.queue][: len(out)] == out
+    train(resumed, photos)
+    assert resumed.state.step == 60
+    assert len(whole_scene(resumed)) == len(whole_scene(stopped))
+
+
+def test_a_visit_that_ends_every_worker_ends_the_run_with_one_line(make, photos):
+    run = make(workers=lambda r: Unreliable(in_process(r, photos, 2), lambda leases: (leases[0], "lost")))
+    with pytest.raises(WorkersError, match=rf"lost {LOSSES} workers.*abcd plan"):
+        train(run, photos)
+    assert run.state.step == 0
+
+
+def test_a_limit_on_gaussians_holds_for_all_that_are_out(make, photos):
+    density = replace(GROWING, max_gaussians=100, cull_alpha_thresh=0.0)
+    run = make(workers=3, density=density)
+    while not run.finished:
+        train_step(run, photos)
+        assert run.count() <= 100
+    assert run.count() > 90

@@ -1,0 +1,188 @@
+"""Workers over Ray, as real processes that really end; every test is bounded in time."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from abcd_ns.cluster import connect as connecting
+from abcd_ns.cluster.connect import check_installed, connect, keep_to_ourselves
+from abcd_ns.cluster.dispatcher import Dispatcher
+from abcd_ns.cluster.lease import WorkersError
+from abcd_ns.cluster.visit_worker import VisitWorker
+from abcd_ns.engine.events import WorkerLost, WorkersSeen
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train
+from abcd_ns.errors import UserError
+from tests.cluster.conftest import in_process, setup_of
+from tests.cluster.test_dispatcher import equal
+from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+
+keep_to_ourselves(starts=True)  # before Ray is imported
+ray = pytest.importorskip("ray")
+from ray.cluster_utils import Cluster  # noqa: E402
+
+from abcd_ns.cluster import ray_workers  # noqa: E402 - needs Ray
+from abcd_ns.cluster.ray_workers import RayWorkers  # noqa: E402
+
+pytestmark = pytest.mark.timeout(240)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+
+
+def make_worker(setup, photos, seconds: float = 0.0) -> VisitWorker:
+    """In a worker's process.
+
+    Args:
+        seconds: that each photo takes, so that visits last.
+    """
+
+    def target(sample):
+        time.sleep(seconds)
+        return photos(sample.view.index, sample.crop), None
+
+    return VisitWorker(setup, TorchRasterizer(compile="off"), target)
+
+
+def refuse():
+    raise UserError("the photos are not here")
+
+
+@pytest.fixture(scope="module")
+def steady(tmp_path_factory, views, photos):
+    """What two workers in this process make of a run, and the setup of its workers."""
+    run = make_run(tmp_path_factory.mktemp("alone"), views, lambda run: in_process(run, photos, 2))
+    train(run, photos)
+    return whole_scene(run), setup_of(run.run)
+
+
+@pytest.fixture(scope="module")
+def workers(steady, photos):
+    """Two real ones on a head of their own, for one run after the other."""
+    try:
+        connect(None, cores=3, object_store_bytes=100 << 20)
+    except WorkersError as error:
+        if "timed out during startup" not in str(error):
+            raise
+        pytest.skip("this machine is too busy to start Ray, which gives itself 30 s")
+    found = RayWorkers(2, partial(make_worker, steady[1], photos))
+    yield found
+    found.close()
+    ray.shutdown()
+
+
+@pytest.fixture
+def lent(tmp_path, views, workers):
+    """The same run, whose blocks are lent to them."""
+    return make_run(tmp_path, views, lambda _: workers)
+
+
+def make_run(folder, views, workers_of):
+    def kind(run):
+        return Dispatcher(Coordinator(run), workers_of(run), lag=4)
+
+    options = {"blocks": 6, "steps": 60, "density": GROWING}
+    return make_coordinator(folder, random_gaussians(90, seed=2), views, kind=kind, **options)
+
+
+def deaths(workers: RayWorkers) -> int:
+    return sum(worker.deaths for worker in workers.seen())
+
+
+def test_two_processes_make_of_a_run_what_one_makes_of_it(steady, lent, photos):
+    seen = []
+    lent.announce.subscribe(lambda e: seen.append(e.workers) if isinstance(e, WorkersSeen) else None)
+    train(lent, photos)
+    assert equal(whole_scene(lent), steady[0])
+    assert any(all(worker.block is not None for worker in workers) for workers in seen)
+    assert all(worker.visits > 0 and worker.deaths == 0 for worker in lent.workers.seen())
+
+
+def test_a_worker_that_is_killed_takes_nothing_along(steady, lent, photos):
+    before, lost = deaths(lent.workers), []
+    lent.announce.subscribe(lambda e: lost.append(e) if isinstance(e, WorkerLost) else None)
+    lent_first(lent)
+    os.kill(lent.workers.pids[0], signal.SIGKILL)
+    train(lent, photos)
+    assert (deaths(lent.workers) - before, len(lost)) == (1, 1)
+    assert equal(whole_scene(lent), steady[0])
+
+
+def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos, monkeypatch):
+    """As behind a cut cable: it lives, and whatever it may still say counts no more."""
+    monkeypatch.setattr(ray_workers, "SILENCE", 3.0)
+    lost = []
+    lent.announce.subscribe(lambda e: lost.append(e.why) if isinstance(e, WorkerLost) else None)
+    lent_first(lent)
+    os.kill(lent.workers.pids[0], signal.SIGSTOP)
+    train(lent, photos)
+    assert lost == ["silent for 3 s"]
+    assert equal(whole_scene(lent), steady[0])
+
+
+def lent_first(run: Dispatcher) -> None:
+    """Have both workers at it."""
+    while len(run.state.in_flight) < 2:
+        run.workers.wait(0.1)
+        run._lend()
+
+
+@pytest.mark.usefixtures("workers")
+def test_a_worker_that_cannot_begin_says_why():
+    refusing = RayWorkers(1, refuse)
+    with pytest.raises(WorkersError, match="worker 1: the photos are not here"):
+        refusing.wait(60.0)
+    refusing.close()
+
+
+@pytest.mark.usefixtures("workers")
+def test_a_stranger_without_the_token_is_refused():
+    address = ray.get_runtime_context().gcs_address
+    assert address.startswith("127.0.0.1:")
+    code = "import sys; from abcd_ns.cluster.connect import connect; connect(sys.argv[1], cores=1)"
+    stranger = {**os.environ, "RAY_AUTH_TOKEN": "0" * 64}
+    found = subprocess.run(
+        [sys.executable, "-c", code, address],
+        env=stranger,
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert found.returncode != 0
+    assert "WorkersError: No Ray cluster answers" in found.stderr
+
+
+def test_where_ray_is_not_installed_one_line_says_so(monkeypatch):
+    monkeypatch.setattr(connecting.importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(WorkersError, match=r"pip install 'abcd-ns\[cluster\]'"):
+        check_installed()
+
+
+@pytest.mark.slow
+def test_a_machine_that_is_lost_takes_nothing_along(steady, tmp_path, views, photos):
+    """Two machines, as Ray sees it, one of which ends: all its processes at once."""
+    ray.shutdown()
+    system = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500}
+    head = {"num_cpus": 1, "_system_config": {**system, "health_check_failure_threshold": 3}}
+    machines = Cluster(initialize_head=True, head_node_args=head)
+    try:
+        other = machines.add_node(num_cpus=1)
+        connect(machines.address, cores=2)
+        workers = RayWorkers(2, partial(make_worker, steady[1], photos, 0.01))
+        lent = make_run(tmp_path, views, lambda _: workers)
+        lent_first(lent)
+        machines.remove_node(other, allow_graceful=False)
+        train(lent, photos)
+        assert deaths(workers) > 0
+        assert equal(whole_scene(lent), steady[0])
+    finally:
+        ray.shutdown()
+        machines.shutdown()
