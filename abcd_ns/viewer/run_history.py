@@ -80,6 +80,7 @@ class RunHistory:
             block = None if active.is_whole else active.geometry.block
             seen = len(active.geometry.views)
             history._begin(VisitBegan(active.number, state.sweep, block, active.steps, seen, 0))
+            history.steps[active.number] = active.done
         return history
 
     def note(self, event: Event, seconds: float) -> None:

@@ -33,8 +33,9 @@ def worker_words(worker: WorkerSeen) -> str:
     what = "waits" if worker.visits else "is starting"
     if worker.block is not None:
         what = f"block {worker.block + 1}, step {worker.done} of {worker.steps}"
-    lost = f", replaced {worker.deaths} times" if worker.deaths else ""
-    return f"Worker {worker.worker + 1}: {what}; {worker.visits} visits{lost}"
+    lost = f", replaced {worker.deaths}x" if worker.deaths else ""
+    visits = "1 visit" if worker.visits == 1 else f"{worker.visits} visits"
+    return f"Worker {worker.worker + 1}: {what}; {visits}{lost}"
 
 
 def sweep_line(sweep: int, over: int, visits: int, left: float | None) -> str:

@@ -4,14 +4,21 @@ import math
 
 import pytest
 
-from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded, WorkerSeen
 from abcd_ns.engine.layers.visit_layers import VisitGeometry
-from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
 from abcd_ns.viewer.run_history import MOST_POINTS, BlockRow, RunHistory, Status, seconds_left, sweep_share
-from abcd_ns.viewer.texts import MOST_ROWS, block_table, clock, headline, memory_table, sweep_line
+from abcd_ns.viewer.texts import (
+    MOST_ROWS,
+    block_table,
+    clock,
+    headline,
+    memory_table,
+    sweep_line,
+    workers_line,
+)
 
 
 def began(visit: int, block: int | None, sweep: int = 0, steps: int = 10) -> VisitBegan:
@@ -118,13 +125,12 @@ def test_a_long_curve_is_thinned_and_keeps_its_end():
 def test_progress_through_the_sweep():
     history, state = RunHistory(), RunState(queue=[VisitPlan(1, 10), VisitPlan(2, 10), VisitPlan(3, 10)])
     history.note(began(0, 0), 4.0)
-    state.active = active(0, done=5)
+    history.note(StepTaken(5, visit=0, visit_step=5, psnr=20.0), 5.0)
     assert history.sweep_began == 4.0
     assert sweep_share(history, state) == pytest.approx(0.5 / 4)
     history.note(ended(0, 0), 6.0)
     history.note(began(1, 1), 6.0)
     state.queue.pop(0)
-    state.active = active(1)
     assert sweep_share(history, state) == pytest.approx(1 / 4)
     assert history.sweep_began == 4.0
     history.note(ended(1, 1), 8.0)
@@ -134,11 +140,42 @@ def test_progress_through_the_sweep():
 
 
 def test_visits_without_planned_steps_count_when_they_are_over():
-    state = RunState(queue=[VisitPlan(1, 10)], active=active(0, done=500, steps=UNLIMITED))
-    assert sweep_share(RunHistory(), state) == 0.0
-    assert sweep_share(RunHistory(sweep_visits=1), state) == pytest.approx(1 / 3)
-    assert sweep_share(RunHistory(), RunState()) == 0.0
-    assert sweep_share(RunHistory(), RunState(active=active(WHOLE))) == 0.0
+    history, state = RunHistory(), RunState(queue=[VisitPlan(1, 10)])
+    assert sweep_share(history, state) == 0.0
+    history.note(began(0, 0, steps=UNLIMITED), 0.0)
+    history.note(StepTaken(500, visit=0, visit_step=500, psnr=20.0), 1.0)
+    assert sweep_share(history, state) == 0.0
+    history.sweep_visits = 1
+    assert sweep_share(history, state) == pytest.approx(1 / 3)
+    warming = RunHistory()
+    warming.note(began(0, None), 0.0)
+    assert sweep_share(warming, RunState()) == 0.0
+
+
+def test_visits_of_workers_are_under_way_together():
+    history, state = RunHistory(), RunState(queue=[VisitPlan(3, 10)])
+    for visit, block in ((4, 0), (5, 2)):
+        history.note(began(visit, block), 1.0)
+        history.note(StepTaken(0, visit, visit_step=visit, psnr=10.0 * block), 2.0)
+    assert [history.status(block, 9) for block in range(3)] == [
+        Status.ACTIVE,
+        Status.UNTRAINED,
+        Status.ACTIVE,
+    ]
+    assert sweep_share(history, state) == pytest.approx((0.4 + 0.5) / 3)
+    history.note(ended(4, 0), 3.0)
+    assert history.status(0, 9) is Status.DONE
+    assert history.psnr == {0: 0.0}
+    history.note(ended(5, 2), 3.0)
+    assert history.psnr == {0: 0.0, 2: 20.0}
+
+
+def test_what_workers_do_in_words():
+    seen = [WorkerSeen(0, 2, 7, 40, 3, 1, 0.1), WorkerSeen(1, None, 0, 0, 0, 0, 0.0)]
+    assert workers_line(seen).splitlines() == [
+        "Worker 1: block 3, step 7 of 40; 3 visits, replaced 1x  ",
+        "Worker 2: is starting; 0 visits",
+    ]
 
 
 @pytest.mark.parametrize(
