@@ -57,8 +57,6 @@ def dispatcher_for(local: Coordinator, config: TrainerConfig, budget: int) -> Di
     Raises:
         WorkersError: they cannot be had.
     """
-    from abcd_ns.cluster.ray_workers import RayWorkers
-
     pipeline, run, count = config.pipeline, local.run, config.pipeline.workers
     on_gpu = config.machine.device_type == "cuda"
     room = local.source.room
@@ -78,6 +76,10 @@ def dispatcher_for(local: Coordinator, config: TrainerConfig, budget: int) -> Di
             "ask for fewer."
         )
     connect(pipeline.cluster, cores=count * threads)
+    from abcd_ns.cluster.ray_workers import (
+        RayWorkers,
+    )  # imports Ray, which reads the environment that this set
+
     make = partial(make_worker, config, setup, 0 if not on_gpu else int(PHOTO_SHARE * budget))
     workers = RayWorkers(count, make, gpus=int(on_gpu), cores=threads)
     CONSOLE.print(f"{count} workers are starting.", highlight=False)
