@@ -1,4 +1,4 @@
-"""The one error that is the user's to mend."""
+"""The one error that is the user's to mend, and what is said where packages are missing."""
 
 
 class UserError(Exception):
@@ -7,3 +7,15 @@ class UserError(Exception):
     The command line prints the message alone, without a traceback. Derive from this class for every
     error that a user can cause; any other exception that reaches the command line is a bug of ours.
     """
+
+
+IMPORT_TROUBLE = (ImportError, OSError, RuntimeError, AttributeError, TypeError, ValueError)
+"""What imports end with where packages or system libraries are missing or do not fit together."""
+
+
+def missing(error: Exception) -> str:
+    """What to tell a user whose import of this package ended with one of IMPORT_TROUBLE."""
+    what = f"abcd_ns cannot start here ({type(error).__name__}: {error})"
+    if getattr(error, "name", None) == "fcntl":
+        return f"{what}: it needs Linux or macOS."
+    return f"{what}: install it again, by pip install in this environment; `abcd doctor` looks closer."

@@ -1,102 +1,47 @@
-"""The methods that `ns-train` offers. Imports nothing that can fail on a machine with nerfstudio."""
+"""The methods that `ns-train` offers, as nerfstudio's entry points name them.
 
-from nerfstudio.configs.base_config import ViewerConfig
+nerfstudio loads this for each of its commands, other methods' too, and an exception here would end them all.
+So where something that ABCD needs is missing or does not start, its methods say so when they are asked for.
+"""
+
+from dataclasses import dataclass
+
+import tyro
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
 
-from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
-from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
-from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
-from abcd_ns.viewer.request_rules import THIS_MACHINE
+from abcd_ns.errors import IMPORT_TROUBLE, missing
 
-PAPER = TrainingConfig(
-    recipe=Recipe(
-        ownership="means",
-        visit_steps=5000,
-        keep_moments=False,
-        sh_restart=True,
-        migrate=False,
-        pixel_loss="l2",
-    ),
-    warmup=0.0,
-    batch=1,
-    visit_views=10**6,
-    heal=False,
-    ssim_lambda=0.0,
-    point_pixels=0.0,
-    density=DensityConfig(price=0.0),
-)
-"""What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""
+try:
+    from abcd_ns.nerfstudio import method_configs as _methods
+except IMPORT_TROUBLE as error:
+    _methods, _trouble = None, missing(error)
 
 
-PEER_BLOCKS = 8
-"""Of the methods to compare with: they are about blocks, needed or not."""
+@dataclass
+class UnavailableConfig(TrainerConfig):
+    """In place of a method that cannot start here."""
+
+    trouble: tyro.conf.Suppress[str] = ""
+    """Why not, and what helps."""
+
+    def print_to_terminal(self) -> None:
+        """Say so and end; it is the first that `ns-train` calls."""
+        CONSOLE.print(f"error: {self.trouble}", style="red", markup=False, soft_wrap=True, highlight=False)
+        raise SystemExit(2)
 
 
-def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
-    return AbcdTrainerConfig(
-        method_name=method_name,
-        steps_per_eval_image=500,
-        steps_per_eval_batch=0,
-        steps_per_eval_all_images=2000,
-        steps_per_save=500,
-        max_num_iterations=30_000,
-        mixed_precision=False,
-        pipeline=AbcdPipelineConfig(**pipeline),
-        optimizers={
-            name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
-            for name, rate in LEARNING_RATES.items()
-        },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host=THIS_MACHINE),
-        vis="viewer",
-    )
+def _method(name: str) -> MethodSpecification:
+    if _methods is not None:
+        return getattr(_methods, name)
+    config = UnavailableConfig(method_name=name.replace("_", "-"), trouble=_trouble)
+    return MethodSpecification(config, f"[cannot start here] {_trouble}")
 
 
-def _quiet(config: AbcdTrainerConfig) -> AbcdTrainerConfig:
-    # ABCD reports its own progress, by visit; nerfstudio's table would run through it.
-    config.logging.local_writer.enable = False
-    return config
-
-
-abcd = MethodSpecification(
-    config=_quiet(_trainer("abcd")),
-    description="ABCD: Gaussian Splatting block by block, each within alpha-composited frozen layers.",
-)
-abcd_ablated = MethodSpecification(
-    config=_quiet(
-        _trainer("abcd-ablated", blocks=PEER_BLOCKS, training=TrainingConfig(recipe=Recipe(layers=False)))
-    ),
-    description="ABCD without its layers: each block alone against the photos (the paper's ablation).",
-)
-abcd_partition = MethodSpecification(
-    config=_quiet(
-        _trainer(
-            "abcd-partition",
-            blocks=PEER_BLOCKS,
-            training=TrainingConfig(
-                recipe=Recipe(layers=False, overlap=0.2, migrate=False),
-                warmup=0.0,
-                density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
-            ),
-        )
-    ),
-    description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
-)
-abcd_exact = MethodSpecification(
-    config=_quiet(
-        _trainer(
-            "abcd-exact", blocks=PEER_BLOCKS, training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0)
-        )
-    ),
-    description="Exact joint training over blocks, one on the device at a time: slow, the reference.",
-)
-abcd_paper = MethodSpecification(
-    config=_quiet(_trainer("abcd-paper", blocks=PEER_BLOCKS, partition="grid", training=PAPER)),
-    description="ABCD by its paper's recipe: MSE, fixed steps for each cell, a new Adam at each visit.",
-)
-abcd_monolithic = MethodSpecification(
-    config=_quiet(_trainer("abcd-monolithic", blocks=1)),
-    description="3D Gaussian Splatting in ABCD's engine: one block, no layers. Runs without a GPU.",
-)
+abcd = _method("abcd")
+abcd_ablated = _method("abcd_ablated")
+abcd_partition = _method("abcd_partition")
+abcd_exact = _method("abcd_exact")
+abcd_paper = _method("abcd_paper")
+abcd_monolithic = _method("abcd_monolithic")

@@ -18,6 +18,8 @@ from abcd_ns.data.split_lists import read_list_files
 
 MODEL_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
 """Where a model may lie under the data folder; the first that holds one wins."""
+IMAGES = Path("images")
+"""Where its photos lie, if nothing else is said."""
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """COLMAP's guess of down (+y) becomes nerfstudio's down (-z). A permutation: it rounds nothing."""
@@ -48,12 +50,14 @@ def find_model(data: Path) -> Path | None:
     return next((c for c in candidates if (c / "cameras.bin").exists() or (c / "cameras.txt").exists()), None)
 
 
-def read_colmap(data: Path, model: Path) -> Scene:
-    """The scene of a COLMAP model; its photos are looked for in `data`/images.
+def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | None = None) -> Scene:
+    """The scene of a COLMAP model.
 
     Args:
         data: the data root.
         model: the folder with cameras, images and points3D, as .bin or else .txt.
+        images: the folder of photos, from `data`.
+        masks: the folder of masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg.
 
     Returns:
         The scene in a z-up world: `applied_transform` is the change of axes from COLMAP's.
@@ -67,15 +71,15 @@ def read_colmap(data: Path, model: Path) -> Scene:
     with problems.collect():
         lenses = (_cameras_bin if binary else _cameras_txt)(model / f"cameras{suffix}")
     with problems.collect():
-        images = (_images_bin if binary else _images_txt)(model / f"images{suffix}")
+        posed = (_images_bin if binary else _images_txt)(model / f"images{suffix}")
     with problems.collect():
         xyz, rgb = (_points_bin if binary else _points_txt)(model / f"points3D{suffix}")
     problems.raise_if_any()
     for number, lens in lenses.items():
         with problems.collect():
             check_lens(lens, f"{model}/cameras{suffix}: camera {number}")
-    frames = []
-    for name, quat, translation, camera in images:
+    frames, photos = [], data / images
+    for name, quat, translation, camera in posed:
         label = f"{model}/images{suffix}: {name}"
         if camera not in lenses:
             problems.add(
@@ -83,20 +87,27 @@ def read_colmap(data: Path, model: Path) -> Scene:
             )
             continue
         with problems.collect():
-            inside(data / "images", name, model / f"images{suffix}")
-            frames.append(Frame(name, _camera_to_world(quat, translation, label), lenses[camera]))
+            inside(photos, name, model / f"images{suffix}")
+            mask = None if masks is None else _mask(data / masks, name)
+            frames.append(Frame(name, _camera_to_world(quat, translation, label), lenses[camera], mask))
     problems.raise_if_any()
     frames.sort(key=lambda frame: frame.name)
     return Scene(
         model=model,
         root=data,
-        photo_folder=data / "images",
+        photo_folder=photos,
         frames=frames,
         points_xyz=xyz @ Z_UP[:, :3].T,
         points_rgb=rgb,
         applied_transform=Z_UP,
         split_lists=read_list_files(data, [frame.name for frame in frames]),
     )
+
+
+def _mask(folder: Path, name: str) -> Path:
+    """The mask of a photo: the first name that is there, or else the first."""
+    names = (Path(name).with_suffix(".png"), f"{name}.png", name)
+    return next((folder / each for each in names if (folder / each).exists()), folder / names[0])
 
 
 def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> np.ndarray:

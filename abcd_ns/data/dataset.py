@@ -6,20 +6,22 @@ import numpy as np
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
+from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.photos import Photos
 
 
 class AbcdDataset(InputDataset):
-    """The photos that AbcdDataParser found, at the size of their cameras and without distortion.
+    """The photos that a dataparser found, at the size of their cameras and without distortion.
 
     Args:
-        dataparser_outputs: of AbcdDataParser; `metadata["photos"]` holds one PhotoSource per camera.
+        dataparser_outputs: of AbcdDataParser or any of nerfstudio's.
         scale_factor: must be 1: the dataparser's `downscale_factor` sets the size of photos.
         budget_bytes: see Photos.
+        needs_photos: see `with_photos`.
 
     Raises:
-        InputError: another scale_factor.
+        InputError: another scale_factor, or as `with_photos`.
     """
 
     def __init__(
@@ -27,13 +29,15 @@ class AbcdDataset(InputDataset):
         dataparser_outputs: DataparserOutputs,
         scale_factor: float = 1.0,
         budget_bytes: int | None = None,
+        needs_photos: bool = True,
     ):
         if scale_factor != 1.0:
             raise InputError(
                 "camera_res_scale_factor is not used here; set --downscale-factor of the dataparser instead."
             )
-        super().__init__(dataparser_outputs, scale_factor)
-        self.photos = Photos(dataparser_outputs.metadata["photos"], budget_bytes)
+        outputs = with_photos(dataparser_outputs, needs_photos)
+        super().__init__(outputs, scale_factor)
+        self.photos = Photos(outputs.metadata[PHOTOS], budget_bytes)
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """uint8 [H, W, 3 or 4], shared with later callers: do not write to it."""

@@ -36,6 +36,8 @@ class PhotoSource:
     """From the reduced photo to the final one; None leaves the pixels as they are."""
     mask_path: Path | None = None
     """A picture of the stored size or in the same proportion; pixels that are not 0 are used."""
+    alpha_color: tuple[float, float, float] | None = None
+    """What lies behind transparent pixels, 0 to 1; None keeps the alpha channel."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -114,7 +116,7 @@ def _decode(path: Path, keeps_alpha: Callable[[Image.Image], bool]) -> np.ndarra
     try:
         with open_picture(path) as picture:
             return np.array(picture.convert("RGBA" if keeps_alpha(picture) else "RGB"))
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise undecodable(path, error) from None
 
 
@@ -125,10 +127,18 @@ def _read_photo(source: PhotoSource) -> Tensor:
         raise InputError(
             f"{source.path} is {image.shape[1]} x {image.shape[0]} px, not {wanted}; put the photo back."
         )
+    if source.alpha_color is not None and image.shape[2] == 4:
+        image = _on_color(image, source.alpha_color)
     image = area_reduce(image, source.reduced)
     if source.undistortion:
         image = source.undistortion.apply(image)
     return torch.from_numpy(image)
+
+
+def _on_color(image: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
+    """A picture with alpha on one colour, uint8 [H, W, 3]."""
+    alpha = image[..., 3:].astype(np.float32) / 255
+    return np.rint(image[..., :3] * alpha + 255 * np.float32(color) * (1 - alpha)).astype(np.uint8)
 
 
 def _read_mask(source: PhotoSource) -> Tensor:

@@ -86,21 +86,26 @@ def undecodable(path: Path, error: Exception) -> InputError:
     return InputError(f"{path} cannot be decoded ({error}); copy the photo again.")
 
 
-def read_header(path: Path) -> Header:
-    """The header of a photo; reads a few hundred bytes. Not thread-safe (it sets warning filters).
+def read_header(path: Path, check_kind: bool = True) -> Header:
+    """The header of a photo or mask; reads a few hundred bytes. Not thread-safe (it sets warning filters).
+
+    Args:
+        check_kind: refuse what is not converted to 8-bit RGB without loss; of masks it does not matter.
 
     Raises:
-        InputError: missing, empty, a pipe, no picture of FORMATS, over 89 Mpx, 16 bits deep or CMYK.
+        InputError: missing, empty, a pipe, no picture of FORMATS, over 89 Mpx; or 16 bits deep or CMYK.
     """
     check_regular(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with open_picture(path) as picture:
-                _check_kind(path, picture)
+                if check_kind:
+                    _check_kind(path, picture)
                 return Header(picture.width, picture.height, picture.format or "")
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
-        raise InputError(f"{path} has more than 89 Mpx; reduce the photo and make the model again.") from None
+        fix = "reduce the photo and make the model again" if check_kind else "reduce the mask"
+        raise InputError(f"{path} has more than 89 Mpx; {fix}.") from None
     except UnidentifiedImageError:
         raise InputError(
             f"{path} is not a picture of a known kind; save it as JPEG, PNG, WebP, TIFF or BMP."

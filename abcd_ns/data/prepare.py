@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from abcd_ns.data.colmap_model import MODEL_FOLDERS, find_model, read_colmap
+from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_model, read_colmap
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
 from abcd_ns.data.photo_folders import PhotoFile, assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
-from abcd_ns.data.picture_files import check_regular
+from abcd_ns.data.picture_files import read_header
 from abcd_ns.data.scene import Frame, Lens, Scene, check_layout
-from abcd_ns.data.transforms_json import read_transforms
+from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read_transforms
 from abcd_ns.data.undistort import Undistortion, undistortion
 from abcd_ns.progress_bar import ProgressBar
 
@@ -36,6 +36,8 @@ class SceneOptions:
     center_method: Center
     auto_scale_poses: bool
     scale_factor: float
+    images_path: Path = IMAGES
+    masks_path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -60,22 +62,27 @@ class Prepared:
     """What was chosen where the user said nothing."""
 
 
-def read_scene(data: Path) -> Scene:
-    """The model in `data`, COLMAP's before transforms.json.
+def read_scene(data: Path, images: Path = IMAGES, masks: Path | None = None) -> Scene:
+    """The model in `data`, COLMAP's before transforms.json, and that before transforms_train.json.
+
+    Args:
+        images, masks: folders of a COLMAP model's photos and masks, from `data`.
 
     Raises:
         InputError: nothing there; says what was looked for, and where known scenes come from.
     """
-    if data.suffix == ".json" and data.exists():
-        return read_transforms(data)
-    model, transforms = find_model(data), data / "transforms.json"
+    whole = data if data.suffix == ".json" else data / f"{TRANSFORMS}.json"
+    model = find_model(data)
     if model is not None:
-        scene = read_colmap(data, model)
-        if transforms.exists():
-            scene.notes.append(f"{model} is used; give --data {transforms} for the other.")
+        scene = read_colmap(data, model, images, masks)
+        if whole.exists():
+            scene.notes.append(f"{model} is used; give --data {whole} for the other.")
         return scene
-    if transforms.exists():
-        return read_transforms(transforms)
+    found = next((path for path in (whole, data / f"{TRANSFORMS}_train.json") if path.exists()), None)
+    if found is not None and (images, masks) != (IMAGES, None):
+        raise InputError(f"{found} names photos and masks itself: leave out --images-path and --masks-path.")
+    if found is not None:
+        return read_transforms(found) if found == whole else read_split_transforms(data)
     if data.name in MIP_NERF_360:
         hint = f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there."
     else:
@@ -99,7 +106,7 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
         raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
     try:
-        scene = read_scene(options.data)
+        scene = read_scene(options.data, options.images_path, options.masks_path)
         factor = automatic_factor(scene) if wanted is None else int(wanted)
         files, notes = _check_layout_and_photos(scene, factor, needs_photos)
     except OSError as error:
@@ -180,8 +187,8 @@ def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoFil
     problems = Problems()
     for frame in scene.frames:
         if frame.mask_path is not None:
-            with problems.collect():
-                check_regular(frame.mask_path)
+            with problems.collect():  # measured before it is decoded
+                read_header(frame.mask_path, check_kind=False)
     try:
         with problems.collect():
             files, notes = locate_photos(scene, factor)

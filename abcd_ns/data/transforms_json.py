@@ -4,6 +4,7 @@ import json
 import math
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from abcd_ns.data.ply import read_points
 from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
 from abcd_ns.data.split_lists import SPLITS, SplitLists, split_lists
 
+TRANSFORMS = "transforms"
+"""What the file is called, before its ending or the name of a split."""
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYES = ("OPENCV_FISHEYE",)
 LARGEST = sys.float_info.max
@@ -69,6 +72,32 @@ def read_transforms(path: Path) -> Scene:
     frames.sort(key=lambda frame: frame.name)
     lists = _split_lists(path, meta, folder.relative_to(root), [frame.name for frame in frames])
     return Scene(path, root, folder, frames, xyz, rgb, transform, scale, lists)
+
+
+def read_split_transforms(folder: Path) -> Scene:
+    """The scene of transforms_train.json and of transforms_test.json, or else transforms_val.json.
+
+    Returns:
+        The scene, with the points of the first. Its frames are named from `folder` on.
+
+    Raises:
+        InputError: as `read_transforms`, or the two are in different worlds.
+    """
+    paths = [folder / f"{TRANSFORMS}_{split}.json" for split in ("train", "test", "val")]
+    scenes = [read_transforms(path) for path in paths if path.exists()][:2]
+    train, lists = scenes[0], []
+    for scene in scenes:
+        same = np.array_equal(train.applied_transform, scene.applied_transform)
+        if not same or train.applied_scale != scene.applied_scale:
+            raise InputError(
+                f"{scene.model} has another applied_transform than {train.model}; make both new."
+            )
+        at = os.path.relpath(scene.photo_folder, folder)
+        lists.append([replace(f, name=os.path.normpath(f"{at}/{f.name}")) for f in scene.frames])
+    frames = sorted((frame for frames in lists for frame in frames), key=lambda frame: frame.name)
+    names = [frozenset(frame.name for frame in frames) for frames in lists]
+    split = SplitLists(*names) if len(names) > 1 else None
+    return replace(train, photo_folder=folder, frames=frames, split_lists=split)
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -2,35 +2,96 @@
 
 import random
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.flags import hidden
 
 BATCH = "abcd_batch"
 """The key of a camera's metadata under which what to train on travels from here to the model."""
 
 
+OUR_READER = "abcd-data"
+READERS: dict[str, DataParserConfig] = {
+    **all_dataparsers,
+    OUR_READER: AbcdDataParserConfig(),
+    "nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True),  # as splatfacto has it
+}
+"""What reads data, as splatfacto offers it, by the name on the command line."""
+DataFormat = tyro.conf.OmitSubcommandPrefixes[
+    tyro.extras.subcommand_type_from_defaults(READERS, prefix_names=False) | None
+]
+"""A subcommand for each of READERS; None by default."""
+
+UNUSED = {
+    "cache_images": "photos are kept on the device and in RAM as far as --pipeline.ram-budget-gb and "
+    "--pipeline.device-budget-gb allow",
+    "cache_images_type": "photos are kept as they are stored, 8 bits a channel",
+    "images_on_gpu": "photos are kept on the device as far as --pipeline.device-budget-gb allows",
+    "masks_on_gpu": "masks are kept on the device as far as --pipeline.device-budget-gb allows",
+    "max_thread_workers": "photos are decoded when they are needed, beside the training",
+    "train_cameras_sampling_strategy": "each block takes its views in shuffled turns",
+    "train_cameras_sampling_seed": "the order of views follows --pipeline.training.seed",
+    "fps_reset_every": "each block takes its views in shuffled turns",
+    "camera_res_scale_factor": "the reader of data reduces photos, by its --downscale-factor",
+    "eval_num_images_to_sample_from": "all held-out photos are evaluated",
+    "eval_num_times_to_repeat_images": "all held-out photos are evaluated",
+    "eval_image_indices": "all held-out photos are evaluated",
+}
+"""Options of nerfstudio's datamanager that ABCD has no use for, and why."""
+
+
+def reader_name(config: DataParserConfig) -> str:
+    """The name of a reader on the command line; of one that nerfstudio does not know, its class's."""
+    kind = type(config)
+    return next((name for name, known in READERS.items() if type(known) is kind), kind.__name__)
+
+
+@hidden(*UNUSED)
 @dataclass
 class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     """Photos, served by crop to the block in training."""
 
     _target: type = field(default_factory=lambda: AbcdDataManager)
-    dataparser: AbcdDataParserConfig = field(default_factory=AbcdDataParserConfig)
-    """Where photos, poses and points come from: a COLMAP folder or a transforms.json."""
+    dataparser: DataParserConfig = field(default_factory=AbcdDataParserConfig)
+    """Where photos, poses and points come from: a COLMAP folder or a transforms.json. Another reader takes
+    its place by its name at the end of the command, as in `ns-train abcd --data DIR colmap`."""
+    data_format: DataFormat = None
+    """Another reader of data, with its options; becomes `dataparser`."""
+    cache_images: Literal["cpu", "gpu"] = "cpu"
+    """Of no use: see UNUSED. nerfstudio would speak of it where it is "gpu"."""
     photo_cache_gb: float = 0.0
     """RAM for decoded photos, GB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
+
+    def __post_init__(self) -> None:
+        if self.data_format is None:
+            return
+        if self.dataparser != AbcdDataParserConfig():
+            raise ValueError(
+                "--pipeline.datamanager.dataparser.* are options of abcd-data: give another reader its own, "
+                "without that prefix, after its name"
+            )
+        self.dataparser, self.data_format = self.data_format, None
+
+    def reader(self) -> DataParserConfig:
+        """What reads the data, told where it is."""
+        return self.dataparser if self.data is None else replace(self.dataparser, data=self.data)
 
 
 class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
@@ -58,12 +119,18 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def create_train_dataset(self) -> AbcdDataset:
         """The training photos, under their share of RAM."""
         budget = int(self.config.photo_cache_gb * 2**30) if self.config.photo_cache_gb else None
-        return AbcdDataset(self.train_dataparser_outputs, budget_bytes=budget)
+        outputs = self.train_dataparser_outputs
+        return AbcdDataset(outputs, budget_bytes=budget, needs_photos=self._needs_photos)
+
+    @property
+    def _needs_photos(self) -> bool:
+        """Whoever views and exports a scene may have no photos."""
+        return self.test_mode != "inference"
 
     def create_eval_dataset(self) -> AbcdDataset:
         """The held-out photos; looked at one after the other, so none is kept."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
-        return AbcdDataset(outputs, budget_bytes=0)
+        return AbcdDataset(outputs, budget_bytes=0, needs_photos=self._needs_photos)
 
     def follow(self, coordinator: Trainer) -> None:
         """Serve what this coordinator asks for from now on."""

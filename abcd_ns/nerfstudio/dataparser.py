@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import (
@@ -15,9 +16,12 @@ from nerfstudio.data.dataparsers.base_dataparser import (
     transform_poses_to_original_space,
 )
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from abcd_ns.data.colmap_model import IMAGES
+from abcd_ns.data.foreign_outputs import PHOTOS, pinhole_cameras
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.normalize import Center, Orientation
 from abcd_ns.data.prepare import Prepared, SceneOptions, check_masks, prepare
@@ -31,7 +35,13 @@ class AbcdDataParserConfig(DataParserConfig):
     """target class to instantiate"""
     data: Path = Path()
     """A folder with sparse/0, colmap/sparse/0 or sparse (COLMAP, .bin or .txt) and images, or with
-    transforms.json; or a transforms.json file itself. Where both are, COLMAP's model is taken."""
+    transforms.json or transforms_train.json; or a transforms.json file itself. Where several are, COLMAP's
+    model is taken."""
+    images_path: Path = IMAGES
+    """The folder of a COLMAP model's photos, from `data`."""
+    masks_path: Path | None = None
+    """The folder of their masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg. Black is
+    not trained on. None for no masks."""
     downscale_factor: int | None = None
     """Divides the photos' width and height. None takes the smallest of 1, 2, 4, ... with which no photo is
     wider or higher than 1,600 px, as splatfacto's data parsers do; 1 keeps photos as they are. images_N is
@@ -48,12 +58,18 @@ class AbcdDataParserConfig(DataParserConfig):
     """What becomes the origin: the mean of the cameras, the point that they look at, or nothing."""
     auto_scale_poses: bool = True
     """Scale the scene until all camera coordinates lie within -1 to 1."""
-    eval_mode: Literal["auto", "interval", "all"] = "auto"
+    eval_mode: Literal["auto", "interval", "fraction", "all"] = "auto"
     """"auto" follows train_list.txt, val_list.txt and test_list.txt, or transforms.json's train_filenames,
-    val_filenames and test_filenames; without them it is "interval", which holds out every eval_interval-th
-    view. "all" trains and evaluates on all views."""
+    val_filenames and test_filenames, or transforms_test.json; without them it is "interval", which holds out
+    every eval_interval-th view. "fraction" trains on evenly spaced views, train_split_fraction of all, as
+    splatfacto's nerfstudio-data does. "all" trains and evaluates on all views."""
     eval_interval: int = 8
     """Views 0, n, 2n, ... of the list sorted by name are held out; at least 2."""
+    train_split_fraction: float = 0.9
+    """Share of the views that is trained on by "fraction"."""
+    as_stored: tyro.conf.Suppress[bool] = False
+    """Give the cameras of the files as they lie on the disk, distortion included: for methods that read
+    photos by nerfstudio's means."""
 
 
 @dataclass
@@ -120,6 +136,8 @@ class AbcdDataParser(DataParser):
         """
         if self._prepared is None:
             options = {field.name: getattr(self.config, field.name) for field in fields(SceneOptions)}
+            if self.config.as_stored and self.config.downscale_factor is None:
+                options["downscale_factor"] = 1
             self._prepared = prepare(SceneOptions(**options), needs_photos=self.downscale_factor is None)
             for note in (*self._prepared.chosen, *self._prepared.notes):
                 self.tell(note)
@@ -146,12 +164,13 @@ class AbcdDataParser(DataParser):
         masks = [source.mask_path for source in sources if source.mask_path]
         original = prepared.similarity.after(prepared.scene.applied_transform, prepared.scene.applied_scale)
         reach = self.config.scene_scale
+        as_stored = self.config.as_stored
         return AbcdDataparserOutputs(
             image_filenames=[source.path for source in sources],
-            cameras=_cameras(prepared, rows),
+            cameras=stored_cameras(prepared, rows) if as_stored else _cameras(prepared, rows),
             scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3], dtype=torch.float32)),
             mask_filenames=masks or None,
-            metadata={"photos": sources, **prepared.points},
+            metadata={**({} if as_stored else {PHOTOS: sources}), **prepared.points},
             dataparser_transform=torch.from_numpy(original.matrix),
             dataparser_scale=original.scale,
         )
@@ -171,6 +190,14 @@ def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int
         raise ValueError(f"There is no split {split}; there are train, val and test.")
     if config.eval_mode == "all":
         return list(range(count))
+    if config.eval_mode == "fraction":
+        trained, held_out = get_train_eval_split_fraction(range(count), config.train_split_fraction)
+        if not 0 < len(trained) < count:
+            raise InputError(
+                f"--train-split-fraction {config.train_split_fraction} parts {count} views into "
+                f"{len(trained)} to train on and {len(held_out)} to hold out; neither may be 0."
+            )
+        return (trained if split == "train" else held_out).tolist()
     if config.eval_interval < 2:
         raise InputError(
             f"--eval-interval is {config.eval_interval}; it must be at least 2, or --eval-mode all."
@@ -179,16 +206,34 @@ def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int
 
 
 def _cameras(prepared: Prepared, rows: list[int]) -> Cameras:
-    """nerfstudio's cameras [len(rows)], perspective, without distortion, float32."""
-    lenses = [prepared.lenses[row] for row in rows]
+    """What is trained on: cameras [len(rows)] of reduced, undistorted photos."""
     poses = np.stack([prepared.scene.frames[row].camera_to_world for row in rows])
+    poses = torch.from_numpy(prepared.similarity.poses(poses))
+    return pinhole_cameras([prepared.lenses[row] for row in rows], poses)
 
-    def column(name: str, dtype: torch.dtype) -> Tensor:
-        return torch.tensor([[getattr(lens, name)] for lens in lenses], dtype=dtype)
 
-    return Cameras(
-        camera_to_worlds=torch.from_numpy(prepared.similarity.poses(poses).astype(np.float32)),
-        **{name: column(name, torch.float32) for name in ("fx", "fy", "cx", "cy")},
-        **{name: column(name, torch.int64) for name in ("width", "height")},
-        camera_type=CameraType.PERSPECTIVE,
+def stored_cameras(prepared: Prepared, rows: list[int]) -> Cameras:
+    """The cameras [len(rows)] of the files, distortion included.
+
+    Raises:
+        InputError: photos would have to be reduced first, or have a distortion that nerfstudio does not know.
+    """
+    lenses = []
+    for source, frame in ((prepared.sources[row], prepared.scene.frames[row]) for row in rows):
+        if source.stored != source.reduced:
+            raise InputError(
+                f"{source.path} is {source.stored[0]} x {source.stored[1]} px, and only ABCD's methods "
+                "reduce photos as they read them: give --downscale-factor 1."
+            )
+        lenses.append(frame.lens.resized(*source.stored))
+    cameras = pinhole_cameras(lenses, _cameras(prepared, rows).camera_to_worlds)
+    padded = [(*lens.distortion, *[0.0] * (8 - len(lens.distortion))) for lens in lenses]
+    if any(any(row[5:]) for row in padded):
+        raise InputError(f"{prepared.scene.model}: only ABCD's methods undistort FULL_OPENCV cameras.")
+    order = [[0, 1, 2, 3, 5, 5] if lens.fisheye else [0, 1, 4, 5, 2, 3] for lens in lenses]
+    cameras.distortion_params = torch.tensor(
+        [[row[k] for k in places] for row, places in zip(padded, order, strict=True)], dtype=torch.float32
     )
+    kinds = [CameraType.FISHEYE if lens.fisheye else CameraType.PERSPECTIVE for lens in lenses]
+    cameras.camera_type = torch.tensor([[kind.value] for kind in kinds])
+    return cameras

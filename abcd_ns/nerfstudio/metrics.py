@@ -1,5 +1,6 @@
 """How close a picture is to its photo, by the measures splatfacto reports."""
 
+import os
 from functools import cache
 from pathlib import Path
 
@@ -9,9 +10,12 @@ from pytorch_msssim import ssim
 from torch import Tensor
 
 from abcd_ns.engine.render.loss import SSIM_WINDOW, psnr
+from abcd_ns.errors import UserError
 
 ALEXNET = "alexnet-owt-7be5be79.pth"
 """The file of AlexNet's weights, as torchvision names it in torch's hub folder."""
+FETCH = "ABCD_FETCH_LPIPS"
+"""The environment variable that allows torchvision to download them; ns-eval has no options for it."""
 
 
 def image_metrics(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> dict[str, float]:
@@ -29,15 +33,21 @@ def image_metrics(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"
 
 
 def lpips_missing() -> str | None:
-    """Why LPIPS cannot be computed, or None. Nothing is ever downloaded."""
+    """Why LPIPS cannot be computed, or None. Nothing is downloaded unless FETCH is set."""
     weights = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET
-    if weights.is_file():
+    if weights.is_file() or os.environ.get(FETCH):
         return None
-    return f"LPIPS needs AlexNet's weights: put torchvision's {ALEXNET} into {weights.parent}"
+    return (
+        f"LPIPS needs AlexNet's weights, 233 MiB: set {FETCH}=1 to have torchvision fetch them, or put its "
+        f"{ALEXNET} into {weights.parent}"
+    )
 
 
 @cache
 def _lpips(device: str) -> torch.nn.Module:
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-    return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).to(device)
+    try:
+        return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).to(device)
+    except OSError as error:  # of the network or the disk
+        raise UserError(f"AlexNet's weights could not be fetched ({error}); unset {FETCH}.") from error

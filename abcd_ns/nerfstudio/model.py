@@ -10,17 +10,20 @@ import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.model_components import renderers
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
+from pytorch_msssim import SSIM
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
+from abcd_ns.data.ply import GREY
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
 from abcd_ns.engine.render import Raster, Rasterizer, make_rasterizer
-from abcd_ns.engine.render.loss import photometric_loss, psnrs, ssim_windows
+from abcd_ns.engine.render.loss import photometric_loss, psnr, psnrs, ssim_windows
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import BlockScene, MemoryScene, StoredScene
@@ -32,7 +35,9 @@ from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
 from abcd_ns.nerfstudio.fit import FREE_SHARE
+from abcd_ns.nerfstudio.flags import hidden
 from abcd_ns.nerfstudio.metrics import image_metrics
+from abcd_ns.nerfstudio.options import HIDDEN
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.viewer.pictures import BlockPictures, Choice, Cropped, Show, asked_by_viewer, bounded
 
@@ -40,6 +45,7 @@ VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
 
 
+@hidden(*HIDDEN)
 @dataclass
 class AbcdModelConfig(SplatfactoModelConfig):
     """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""
@@ -75,6 +81,9 @@ class AbcdModel(SplatfactoModel):
         self._tree = build_kd(torch.zeros(0, 3), 1)
         self.near = NEAR_PLANE
         self.step = 0
+        # For classes derived from this one, as splatfacto has them; here images are measured by `metrics`.
+        self.psnr = psnr
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.crop_box: OrientedBox | None = None
         random = self.config.background_color == "random"
         self.background_color = (
@@ -130,6 +139,8 @@ class AbcdModel(SplatfactoModel):
             points, colors = random_points(config.num_random, config.random_scale)
         else:
             points, colors = (values.cpu().float() for values in self.seed_points)
+            if len(colors) != len(points):  # as of a .ply without colours
+                colors = torch.full_like(points, GREY)
             points, colors = thin_points(points, colors, views, point_pixels)
         return gaussians_from_points(points.float(), colors, sh_degree=config.sh_degree)
 
@@ -201,7 +212,9 @@ class AbcdModel(SplatfactoModel):
         }
 
     def _whole_outputs(self, view: View) -> dict[str, Tensor]:
-        background = self.background_color.to(self.device)
+        # ns-render's crop has a background of its own.
+        override = renderers.BACKGROUND_COLOR_OVERRIDE
+        background = (self.background_color if override is None else override).to(self.device)
         if asked_by_viewer():
             view = bounded(view)
             raster = self.draw_for_viewer(view)
@@ -219,6 +232,13 @@ class AbcdModel(SplatfactoModel):
             "accumulation": 1 - transmittance,
             "background": background.expand(view.height, view.width, 3),
         }
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """A picture of `get_outputs` without its background, [H, W, 4], alpha not multiplied in: ns-render's
+        `rgba`."""
+        alpha = outputs["accumulation"]
+        color = (outputs[output_name] - (1 - alpha) * outputs["background"]) / alpha.clamp_min(1e-10)
+        return torch.cat((color.clamp(0, 1), alpha), dim=-1)
 
     @torch.no_grad()
     def draw_merged(self, view: View) -> Raster:

@@ -9,6 +9,8 @@ import torch
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.events import HeldOutScored
@@ -32,9 +34,13 @@ from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
+from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.fit import FITTED, Demand, Fit, device_budget, find_fit, ram_budget, share_out
+from abcd_ns.nerfstudio.flags import named_too
+from abcd_ns.nerfstudio.inspection import factor_of
+from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
-from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.options import SAME, mirror
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import MadeFor, RunRequest, new_store, take_over
@@ -49,6 +55,8 @@ from abcd_ns.viewer.panel import AbcdPanel
 # What makes a method and what memory decides stand in config.yml, and are no flags of `ns-train`.
 for _not_offered in (Recipe, Limits):
     tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
+for _config, _flags in SAME.items():
+    named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
 
 
 @dataclass
@@ -125,8 +133,10 @@ class AbcdPipeline(VanillaPipeline):
         self.panel.follow(self._coordinator)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
-        def end_step(step: int) -> None:  # noqa: ARG001 - the coordinator counts
+        def end_step(step: int) -> None:
             self._after_step()
+            if step_check(step, trainer.config.logging.steps_per_log, run_at_zero=True):
+                writer.put_dict("ABCD", report.scalars(), step)
             if self._coordinator.finished:
                 trainer.stop_training = True
 
@@ -161,6 +171,8 @@ class AbcdPipeline(VanillaPipeline):
         found = super().get_average_eval_image_metrics(step, output_path, get_std)
         if self._coordinator is not None:
             self._coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
+        elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
+            found |= {"lpips": None, "lpips_missing": lpips_missing()}
         return found
 
     def _after_step(self) -> None:
@@ -260,7 +272,7 @@ class AbcdPipeline(VanillaPipeline):
             points,
             config.training,
             most=config.training.density.limit,
-            factor=self.datamanager.dataparser.factor,
+            factor=factor_of(self.datamanager.dataparser),
             blocks=blocks,
             on_cpu=self._on_cpu,
         )
@@ -325,6 +337,9 @@ class AbcdPipeline(VanillaPipeline):
         return 0 if self.model.seed_points is None else len(self.model.seed_points[0])
 
     def _tell_of_points(self, begun: int) -> None:
+        if not self._points and not isinstance(self.datamanager.dataparser, AbcdDataParser):  # which says so
+            words = f"The data has no points: {begun:,} Gaussians begin at random places, as splatfacto's do."
+            CONSOLE.print(words, highlight=False)
         if begun < self._points:
             words = f"{self._points:,} points begin as {begun:,} Gaussians: photos of this size show no more."
             CONSOLE.print(words, highlight=False)

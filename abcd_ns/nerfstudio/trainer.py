@@ -15,15 +15,17 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
 from abcd_ns.engine.events import Event, LayersDrawn, WorkersSeen
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
-from abcd_ns.nerfstudio.options import check_options
+from abcd_ns.nerfstudio.flags import hidden
+from abcd_ns.nerfstudio.inspection import Inspected, inspect
+from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, find_start, pin_name
@@ -31,6 +33,7 @@ from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_
 from abcd_ns.viewer.request_rules import THIS_MACHINE, WILDCARDS
 
 
+@hidden("max_norm")
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam as 3DGS uses it, one pass over memory for each parameter."""
@@ -51,6 +54,7 @@ def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerCon
     return dataclasses.replace(viewer, websocket_host=THIS_MACHINE)
 
 
+@hidden(*UNUSED)
 @dataclass
 class AbcdTrainerConfig(TrainerConfig):
     """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""
@@ -65,7 +69,7 @@ class AbcdTrainerConfig(TrainerConfig):
     def print_to_terminal(self) -> None:
         """A few lines instead of nerfstudio's some hundred; all of it is in config.yml."""
         pipeline = self.pipeline
-        what = f"{self.method_name} on {pipeline.datamanager.data}"
+        what = f"{self.method_name} on {pipeline.datamanager.reader().data}"
         seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
         blocks = {0: "as few blocks as fit", 1: "1 block"}.get(pipeline.blocks, f"{pipeline.blocks} blocks")
         CONSOLE.print(f"{what}: {blocks}, {self.max_num_iterations:,} steps{seconds}", highlight=False)
@@ -85,23 +89,19 @@ class AbcdTrainerConfig(TrainerConfig):
             CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
         with exit_on_user_error():
             check_options(self)
-            parser = self.pipeline.datamanager.dataparser
-            if self.pipeline.datamanager.data is not None:
-                parser = dataclasses.replace(parser, data=self.pipeline.datamanager.data)
-            parser = parser.setup()
-            parser.check()
+            found = inspect(self.pipeline.datamanager.reader())
             if self.pipeline.blocks == 0:
-                self._check_fit(parser)
+                self._check_fit(found)
 
-    def _check_fit(self, parser: AbcdDataParser) -> None:
+    def _check_fit(self, found: Inspected) -> None:
         """See that some block fits on the device."""
         pipeline, model = self.pipeline, self.pipeline.model
         demand = Demand(
-            parser.largest_image,
-            model.num_random if model.random_init else parser.points or model.num_random,
+            found.pixels,
+            model.num_random if model.random_init else found.points or model.num_random,
             pipeline.training,
             most=pipeline.training.density.limit,
-            factor=parser.factor,
+            factor=found.factor,
             on_cpu=self.machine.device_type == "cpu",
         )
         find_fit(device_budget(pipeline.device_budget_gb, self.machine.device_type), demand)
@@ -176,6 +176,11 @@ class AbcdTrainer(Trainer):
             with suppress(StoreError):  # what went wrong first is what matters
                 self.pipeline.coordinator.scene.flush()
             raise
+
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """As nerfstudio's, with values alone: what is logged needs no graph, and torch warns of it."""
+        loss, losses, metrics = super().train_iteration(step)
+        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     def _memory_is_full(self) -> str:
         limit = self.pipeline.coordinator.config.limits.block_limit

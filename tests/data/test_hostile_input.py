@@ -1,8 +1,10 @@
 """Faults rarer than a missing photo: each is one line, found before training, and all at once."""
 
+import io
 import json
 import os
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -24,6 +26,16 @@ from tests.data.dataparser_scenes import (
 
 def rewrite(scene: Path, meta: dict) -> None:
     (scene / "transforms.json").write_text(json.dumps(meta))
+
+
+def png_that_claims(size: tuple[int, int]) -> bytes:
+    """A small PNG whose header names a size."""
+    file = io.BytesIO()
+    Image.new("L", (4, 4), 255).save(file, format="PNG")
+    data = bytearray(file.getvalue())
+    struct.pack_into(">II", data, 16, *size)
+    struct.pack_into(">I", data, 29, zlib.crc32(bytes(data[12:29])))
+    return bytes(data)
 
 
 def check_refusal(scene: Path, **options) -> list[str]:
@@ -222,6 +234,23 @@ def test_masks_of_no_use_are_all_found_before_training(scene):
     ):
         assert sum(str(path) in line and message in line for line in lines) == 1
     assert len(lines) == 3
+
+
+@pytest.mark.parametrize("size", [(12_000, 9_000), (60_000, 60_000)])
+def test_masks_are_measured_before_they_are_decoded(scene, size, monkeypatch):
+    """A picture of few bytes may fill all memory; Pillow warns of the first size and refuses the other."""
+    mask = write_masks(scene)[0]
+    mask.write_bytes(png_that_claims(size))
+    decoded = []
+    monkeypatch.setattr("abcd_ns.data.photos._decode", lambda path, _: decoded.append(path))
+    assert check_refusal(scene) == [f"{mask} has more than 89 Mpx; reduce the mask."]
+    assert decoded == []
+
+
+def test_a_deep_mask_is_a_mask(scene):
+    mask = write_masks(scene)[0]
+    Image.fromarray(np.full(Image.open(mask).size[::-1], 40_000, np.uint16)).save(mask)
+    parser(scene).check()
 
 
 def test_mask_that_is_a_pipe_does_not_block(scene):

@@ -1,15 +1,23 @@
 """What the command line offers of training, and what it leaves to the method and the device's memory."""
 
 import copy
+import dataclasses
+import re
+from pathlib import Path
 
 import pytest
 import tyro
 import yaml
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, method_configs
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from abcd_ns import methods
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
+from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.options import HONOURED, SAME, UNUSED, check_options, mirror
 from abcd_ns.nerfstudio.run.settings import flat_options
 
 METHODS = {
@@ -42,6 +50,124 @@ def test_recipe_and_limits_are_no_flags(flag, capsys):
     with pytest.raises(SystemExit):
         tyro.cli(AnnotatedBaseConfigUnion, args=["abcd", f"--pipeline.{flag}", "1"])
     assert f"--pipeline.{flag}" in capsys.readouterr().err
+
+
+def parsed(*words: str):
+    """What `ns-train abcd` makes of its words."""
+    return tyro.cli(AnnotatedBaseConfigUnion, args=["abcd", *words])
+
+
+def test_what_means_nothing_here_is_not_in_the_help(capsys):
+    with pytest.raises(SystemExit):
+        parsed("--help")
+    said = capsys.readouterr().out
+    words = set(re.findall(r"--[\w.-]+", said))
+    flag = "--pipeline.model.{}".format
+    assert {flag("random-init"), flag("num-random"), flag("random-scale"), flag("rasterize-mode")} <= words
+    assert {flag("rasterizer"), flag("render"), flag("sh-degree"), flag("cull-alpha-thresh")} <= words
+    theirs = {option.name for option in dataclasses.fields(SplatfactoModelConfig)}
+    offered = {name for name in theirs if flag(name.replace("_", "-")) in words}
+    same = {name.replace("-", "_") for group in SAME.values() for name in group.values()}
+    assert offered == HONOURED | same
+    assert "camera-optimizer" not in said
+    for name in (*UNUSED, *UNUSED_OF_DATA, "max_norm"):
+        assert not any(word.endswith(f".{name.replace('_', '-')}") for word in words), name
+        assert f"--{name.replace('_', '-')}" not in words
+    assert "--pipeline.datamanager.dataparser.downscale-factor" in words
+    assert {"colmap", "nerfstudio-data", "blender-data"} <= set(re.findall(r"[\w-]+", said))
+
+
+def test_the_same_options_of_splatfacto_are_taken():
+    model = "--pipeline.model."
+    training = parsed(
+        f"{model}sh-degree", "2", f"{model}ssim_lambda", "0.3", f"{model}background-color", "white",
+        f"{model}cull_alpha_thresh=0.01", f"{model}densify-grad-thresh", "0.0004", f"{model}use-absgrad",
+        "False", f"{model}refine-every", "50",
+    ).pipeline.training  # fmt: skip
+    density = training.density
+    assert (training.sh_degree, training.ssim_lambda, training.background) == (2, 0.3, "white")
+    assert (density.cull_alpha_thresh, density.densify_grad_thresh) == (0.01, 0.0004)
+    assert (density.use_absgrad, density.refine_every) == (False, 50)
+
+
+def test_the_antialiased_mode_of_splatfacto_is_ours():
+    pipeline = parsed("--pipeline.model.rasterize-mode", "antialiased").pipeline
+    mirror(pipeline.training, pipeline.model)
+    assert pipeline.training.antialiased
+    assert pipeline.model.rasterize_mode == "antialiased"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda c: setattr(c, "gradient_accumulation_steps", {"means": 2}), "--pipeline.training.batch"),
+        (lambda c: setattr(c, "use_grad_scaler", True), "float32"),
+        (lambda c: setattr(c.pipeline.datamanager, "cache_images", "gpu"), "--pipeline.device-budget-gb"),
+        (lambda c: setattr(c.pipeline.datamanager, "train_cameras_sampling_strategy", "fps"), "shuffled"),
+        (
+            lambda c: setattr(c.pipeline.datamanager, "max_thread_workers", 2),
+            "--pipeline.datamanager.max-thread",
+        ),
+        (lambda c: setattr(c.pipeline.datamanager, "camera_res_scale_factor", 0.5), "--downscale-factor"),
+        (lambda c: setattr(c.optimizers["means"]["optimizer"], "max_norm", 1.0), "means.optimizer.max-norm"),
+        (lambda c: setattr(c.pipeline.model, "stop_split_at", 99), "training.density.refine-stop"),
+        (lambda c: setattr(c.pipeline.model, "cull_alpha_thresh", 0.2), "density.cull-alpha-thresh"),
+        (lambda c: setattr(c.pipeline.model.camera_optimizer, "mode", "SO3xR3"), "camera-optimizer"),
+        (lambda c: setattr(c.pipeline.model, "collider_params", None), "collider-params"),
+    ],
+)
+def test_what_has_no_effect_is_refused_from_files_too(change, says):
+    config = copy.deepcopy(METHODS["abcd"])
+    check_options(config)
+    change(config)
+    with pytest.raises(UserError) as refused:
+        check_options(config)
+    assert says in str(refused.value)
+
+
+def test_what_ns_render_sets_is_let_be():
+    config = copy.deepcopy(METHODS["abcd"])
+    config.pipeline.model.eval_num_rays_per_chunk = 1
+    mirror(config.pipeline.training, config.pipeline.model)
+
+
+def test_checkpoints_are_as_far_apart_as_splatfactos():
+    assert METHODS["abcd"].steps_per_save == method_configs["splatfacto"].steps_per_save
+
+
+def test_our_reader_of_data_keeps_its_flags():
+    config = parsed("--data", "x", "--pipeline.datamanager.dataparser.downscale-factor", "4")
+    assert config.pipeline.datamanager.dataparser == AbcdDataParserConfig(downscale_factor=4)
+    named = parsed("--data", "x", "abcd-data", "--downscale-factor", "4")
+    assert named.pipeline.datamanager.dataparser == AbcdDataParserConfig(downscale_factor=4)
+    assert named.pipeline.datamanager == config.pipeline.datamanager
+
+
+def test_any_reader_of_nerfstudios_is_named_as_with_splatfacto():
+    words = ("colmap", "--colmap-path", "sparse/0", "--downscale-factor", "2")
+    ours, theirs = (
+        tyro.cli(AnnotatedBaseConfigUnion, args=[method, "--data", "x", *words])
+        for method in ("abcd", "splatfacto")
+    )
+    parser = ours.pipeline.datamanager.dataparser
+    assert parser == theirs.pipeline.datamanager.dataparser
+    assert parser.colmap_path == Path("sparse/0")
+    assert ours.pipeline.datamanager.data_format is None
+    assert ours.pipeline.datamanager.reader().data == Path(".")  # nerfstudio's main takes --data over
+    assert parsed("nerfstudio-data").pipeline.datamanager.dataparser.load_3D_points
+
+
+def test_options_of_our_reader_are_not_given_to_another(capsys):
+    with pytest.raises((SystemExit, ValueError)) as refused:
+        parsed("--pipeline.datamanager.dataparser.downscale-factor", "4", "colmap")
+    assert "are options of abcd-data" in f"{refused.value}{capsys.readouterr().err}"
+
+
+def test_other_methods_may_read_by_ours():
+    config = tyro.cli(
+        AnnotatedBaseConfigUnion, args=["splatfacto", "--data", "x", "abcd-data", "--eval-mode", "all"]
+    )
+    assert config.pipeline.datamanager.dataparser == AbcdDataParserConfig(eval_mode="all", as_stored=True)
 
 
 def test_methods_differ_in_their_recipes():

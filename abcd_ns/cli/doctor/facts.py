@@ -31,7 +31,7 @@ def gather() -> Facts:
         if "torch" not in packages.broken:
             hardware = look_at_hardware()
         bar.advance()
-        if hardware is not None and "abcd_ns.methods" not in packages.broken:
+        if hardware is not None and "abcd_ns.nerfstudio.method_configs" not in packages.broken:
             kernels = look_at_kernels(on_gpu=hardware.gpu is not None)
         bar.advance()
     return Facts(packages, hardware, kernels)

@@ -11,19 +11,18 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from abcd_ns import __version__
+from abcd_ns.errors import IMPORT_TROUBLE
 from abcd_ns.machine import own_commit, package_version
 
 VERSIONS = ("torch", "torchvision", "nerfstudio", "gsplat", "viser", "pycolmap", "numpy", "pillow")
 """Distributions that are listed."""
-STARTED = ("torch", "torchvision", "cv2", "pycolmap", "gsplat", "abcd_ns.methods")
+STARTED = ("torch", "torchvision", "cv2", "pycolmap", "gsplat", "abcd_ns.nerfstudio.method_configs")
 """Modules that are imported, each after what it needs. The last one brings nerfstudio."""
 EXPORT = "open3d"
 """What `ns-export` needs besides; heavy, so imported in a process of its own."""
-IMPORT_TROUBLE = (ImportError, OSError, RuntimeError, AttributeError, TypeError, ValueError)
-"""What imports end with where packages or system libraries do not fit together."""
 
 
-@dataclass(frozen=True)
+@dataclass @ dataclass(frozen=True)
 class Packages:
     """The Python environment."""
 

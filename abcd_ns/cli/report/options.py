@@ -1,10 +1,11 @@
 """What a run's options say: those that differ from the defaults, and the command that trains it again."""
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from abcd_ns.cli.report.run_folder import default_config
 from abcd_ns.machine import without_home
+from abcd_ns.nerfstudio.datamanager import OUR_READER
 from abcd_ns.nerfstudio.options import MIRRORED
 from abcd_ns.nerfstudio.run.settings import Plain, Settings, flat_options
 
@@ -24,6 +25,7 @@ ABOUT_THE_PLACE = {
 """Options that say where a run was made and kept, not how it was trained."""
 TAKEN_OVER = {f"pipeline.model.{name}" for name in (*MIRRORED, "ownership")}
 """Options that follow others."""
+READER = "pipeline.datamanager.dataparser."
 NO_FLAGS = ("pipeline.training.recipe.", "pipeline.training.limits.")
 """What these begin is no option of `ns-train`; the method sets it, or the device's memory."""
 
@@ -44,7 +46,7 @@ class Changed:
 
 def changed_options(settings: Settings) -> list[Changed]:
     """Options that differ from this version's defaults; of a method that it has not, none are known."""
-    config = default_config(settings.method)
+    config = default_config(settings.method, settings.reader)
     if config is None:
         return []
     defaults, passed_over = flat_options(config), ABOUT_THE_PLACE | TAKEN_OVER
@@ -57,8 +59,14 @@ def changed_options(settings: Settings) -> list[Changed]:
 
 def training_command(settings: Settings) -> str:
     """The command line that trains the run again, an option a line."""
+    changed = [c for c in changed_options(settings) if not c.name.startswith(NO_FLAGS)]
+    # Options of another reader of data stand after its name, without a prefix.
+    readers = () if settings.reader == OUR_READER else tuple(c for c in changed if c.name.startswith(READER))
     words = [["ns-train", settings.method, "--data", settings.data]]
-    words += [c.words for c in changed_options(settings) if not c.name.startswith(NO_FLAGS)]
+    words += [c.words for c in changed if c not in readers]
+    if settings.reader != OUR_READER:
+        words.append([settings.reader])
+    words += [replace(c, name=c.name.removeprefix(READER)).words for c in readers]
     return " \\\n  ".join(map(shlex.join, words))
 
 

@@ -19,6 +19,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_record
 from abcd_ns.lab.runs.configs import registered
 from abcd_ns.lab.runs.options import set_options
+from abcd_ns.nerfstudio.datamanager import OUR_READER, READERS
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STORE
@@ -91,7 +92,7 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     Raises:
         UserError: the data is gone, or the run's options or checkpoint do not fit this version.
     """
-    versions, config = run.settings.versions, _registered(run.settings.method)
+    versions, config = run.settings.versions, _registered(run.settings.method, run.settings.reader)
     wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
     where = f"{run.path / 'abcd' / SETTINGS_FILE} (written by {wrote})"
     prefix = "pipeline."
@@ -108,21 +109,24 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     return pipeline
 
 
-def default_config(method: str) -> AbcdTrainerConfig | None:
+def default_config(method: str, reader: str = OUR_READER) -> AbcdTrainerConfig | None:
     """The method as this version registers it, options taken over as in training; None for an unknown one."""
     try:
-        config = _registered(method)
+        config = _registered(method, reader)
     except UserError:
         return None
     mirror(config.pipeline.training, config.pipeline.model)
     return config
 
 
-def _registered(method: str) -> AbcdTrainerConfig:
-    found = registered(method)
+def _registered(method: str, reader: str) -> AbcdTrainerConfig:
+    found = copy.deepcopy(registered(method))
     if found is None:
         raise UserError(f"The run's method {method!r} is none of this version of abcd_ns.")
-    return copy.deepcopy(found)
+    if reader not in READERS:
+        raise UserError(f"The run's data was read by {reader}, which nerfstudio does not know here.")
+    found.pipeline.datamanager.dataparser = copy.deepcopy(READERS[reader])
+    return found
 
 
 def _hint(path: Path) -> str:

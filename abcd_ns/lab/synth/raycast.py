@@ -3,12 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from abcd_ns.errors import UserError
 from abcd_ns.lab.synth.geometry import Soup
 from abcd_ns.lab.synth.noise import Array
+
+try:
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+except ImportError as error:
+    raise UserError(
+        f"Synthetic scenes are drawn with embreex, which does not start here ({error}): pip install embreex"
+    ) from error
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,24 @@ class ProgressReport:
                     f"{_block(event.block)}: visit undone, it raised the loss of its views by {rise:.0%}"
                 )
 
+    def scalars(self) -> dict[str, float]:
+        """Where the training stands, by name, for TensorBoard, wandb and comet.
+
+        Blocks count from 1; 0 is the warm-up, or a method that has no visits.
+        """
+        coordinator, block = self._coordinator, None if self._visit is None else self._visit.block
+        found = {
+            "block": 0 if block is None else block + 1,
+            "blocks": coordinator.scene.tree.num_blocks,
+            "sweep": self._sweep,
+            "gaussians": coordinator.count(),
+            "share of time for layers": self._share_for_layers(),
+            "RAM (GB)": psutil.Process().memory_info().rss / 2**30,
+        }
+        if torch.cuda.is_available():
+            found["GPU (GB)"] = torch.cuda.memory_allocated() / 2**30
+        return found
+
     def close(self) -> None:
         """Take the live line away and say what became of the run."""
         if self._live is not None:
@@ -109,8 +127,12 @@ class ProgressReport:
 
     def _summary(self) -> str:
         quality = "-" if self._psnr is None else f"{self._psnr:.2f} dB on training crops"
-        share = self._layer_seconds / self._visit_seconds if self._visit_seconds else 0.0
+        share = self._share_for_layers()
         return f"{quality}, {self._coordinator.count():,} Gaussians, {share:.0%} of the time for layers"
+
+    def _share_for_layers(self) -> float:
+        """Of all visits that have ended."""
+        return self._layer_seconds / self._visit_seconds if self._visit_seconds else 0.0
 
     def _show(self, what: str) -> None:
         if CONSOLE.is_terminal:

@@ -17,6 +17,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.machine import Machine, Versions, describe_machine, describe_versions
+from abcd_ns.nerfstudio.datamanager import OUR_READER, reader_name
 
 SETTINGS_FILE = "settings.json"
 SCHEMA = 1
@@ -43,6 +44,8 @@ class Settings:
     """Every option by its dotted name, as on `ns-train`'s command line."""
     versions: Versions
     machine: Machine
+    reader: str = OUR_READER
+    """What read the data: its name on `ns-train`'s command line."""
 
 
 def write_settings(config: TrainerConfig, folder: Path) -> None:
@@ -59,6 +62,7 @@ def write_settings(config: TrainerConfig, folder: Path) -> None:
         options=flat_options(config),
         versions=describe_versions(),
         machine=describe_machine(),
+        reader=reader_name(config.pipeline.datamanager.dataparser),
     )
     content = json.dumps(dataclasses.asdict(settings), indent=2, allow_nan=False)
     write_file(folder / SETTINGS_FILE, (content + "\n").encode())

@@ -1,0 +1,101 @@
+"""What other readers of nerfstudio's found, as the photos and cameras that ABCD trains on.
+
+They name files and cameras; what they leave to nerfstudio's datamanager, undistorting and putting photos onto
+a background, is done here as for our own reader: in memory, and checked beforehand.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from torch import Tensor
+
+from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.photos import PhotoSource
+from abcd_ns.data.picture_files import check_complete, read_header
+from abcd_ns.data.scene import Lens, check_lens
+from abcd_ns.data.undistort import undistortion
+
+PHOTOS = "photos"
+"""The entry of the metadata that holds one PhotoSource for each camera."""
+_BROWN, _FISHEYE = CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value
+
+
+def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> DataparserOutputs:
+    """The same with PHOTOS, and with the cameras of photos that are undistorted; our own reader's unchanged.
+
+    Args:
+        needs_photos: False for viewing and exporting, which look at no file.
+
+    Raises:
+        InputError: lists all files that are missing, damaged or unlike their cameras, and other cameras.
+    """
+    if PHOTOS in outputs.metadata:
+        return outputs
+    if outputs.metadata.get("mask_color") is not None:
+        raise InputError("--mask-color has no effect here: masked pixels are not trained on. Leave it out.")
+    color = outputs.alpha_color
+    alpha_color = None if color is None else tuple(float(value) for value in color)
+    sources, lenses, problems = [], [], Problems()
+    for row, path in enumerate(outputs.image_filenames):
+        with problems.collect():
+            lens = _lens(outputs.cameras, row, str(path))
+            stored = lens.size
+            if needs_photos:
+                header = read_header(path)
+                check_complete(path, header)
+                stored = header.size
+                _check_shape(str(path), stored, lens.size)
+            flat = undistortion(lens) if lens.distorted else None
+            mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
+            if mask is not None and needs_photos:
+                read_header(mask, check_kind=False)
+            sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
+            lenses.append(flat.pinhole if flat else lens)
+    problems.raise_if_any()
+    cameras = pinhole_cameras(lenses, outputs.cameras.camera_to_worlds)
+    return dataclasses.replace(outputs, cameras=cameras, metadata={**outputs.metadata, PHOTOS: sources})
+
+
+def pinhole_cameras(lenses: Sequence[Lens], poses: Float[Tensor, "n 3 4"]) -> Cameras:
+    """nerfstudio's cameras [n], perspective, without distortion, float32."""
+
+    def column(name: str, dtype: torch.dtype) -> Tensor:
+        return torch.tensor([[getattr(lens, name)] for lens in lenses], dtype=dtype)
+
+    return Cameras(
+        camera_to_worlds=poses.float(),
+        **{name: column(name, torch.float32) for name in ("fx", "fy", "cx", "cy")},
+        **{name: column(name, torch.int64) for name in ("width", "height")},
+        camera_type=CameraType.PERSPECTIVE,
+    )
+
+
+def _lens(cameras: Cameras, row: int, label: str) -> Lens:
+    kind = int(cameras.camera_type[row])
+    if kind not in (_BROWN, _FISHEYE):
+        name = CameraType(kind).name.lower()
+        raise InputError(f"{label} is {name}; photos must be perspective or fisheye ones.")
+    given = cameras.distortion_params
+    k1, k2, k3, k4, p1, p2 = [0.0] * 6 if given is None else given[row].double().tolist()
+    if kind == _BROWN and k4 != 0:
+        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
+    fx, fy, cx, cy = (float(getattr(cameras, name)[row]) for name in ("fx", "fy", "cx", "cy"))
+    coefficients = (k1, k2, k3, k4) if kind == _FISHEYE else (k1, k2, p1, p2, k3)
+    size = int(cameras.width[row]), int(cameras.height[row])
+    lens = Lens(*size, fx, fy, cx, cy, coefficients, kind == _FISHEYE)
+    check_lens(lens, label)
+    return lens
+
+
+def _check_shape(label: str, stored: tuple[int, int], size: tuple[int, int]) -> None:
+    """A photo may be larger than its camera, then it is reduced; but it must show the same."""
+    (wide, high), (width, height) = stored, size
+    if wide < width or high < height or abs(wide / high * height - width) > max(1.0, width / height):
+        raise InputError(
+            f"{label} is {wide} x {high} but its camera is {width} x {height}; put the photos there that the "
+            "model was made from."
+        )

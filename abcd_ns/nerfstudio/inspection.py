@@ -1,0 +1,72 @@
+"""What there is to train on, read and checked before a run begins."""
+
+from dataclasses import dataclass
+
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+
+from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.prepare import check_masks
+from abcd_ns.nerfstudio.datamanager import reader_name
+from abcd_ns.nerfstudio.dataparser import AbcdDataParser
+
+TROUBLE = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What readers of nerfstudio's end with where data is not what they expect."""
+
+
+@dataclass(frozen=True)
+class Inspected:
+    """A capture, as far as memory hangs on it."""
+
+    pixels: int
+    """Of the largest photo as it is trained on."""
+    points: int
+    """0 where Gaussians begin at random."""
+    factor: int
+    """By which the photos' width and height are divided."""
+
+
+def inspect(config: DataParserConfig) -> Inspected:
+    """Read the model, look at every photo and decode every mask.
+
+    Raises:
+        InputError: the data cannot be used.
+    """
+    parser = config.setup()
+    if isinstance(parser, AbcdDataParser):
+        parser.check()
+        return Inspected(parser.largest_image, parser.points, parser.factor)
+    parts = [with_photos(_read(parser, split)) for split in ("train", "val")]
+    sources = [source for part in parts for source in part.metadata[PHOTOS]]
+    if not parts[0].image_filenames:
+        raise InputError(f"{config.data} has no photos to train on.")
+    check_masks(sources)
+    largest = max(width * height for width, height in (source.size for source in sources))
+    return Inspected(largest, len(parts[0].metadata.get("points3D_xyz", ())), factor_of(parser))
+
+
+def factor_of(parser: DataParser) -> int:
+    """By which the photos' width and height are divided, once the parser has read; 1 if it does not say."""
+    given = (getattr(parser, name, None) for name in ("factor", "downscale_factor", "_downscale_factor"))
+    return int(next((factor for factor in given if factor), 1))
+
+
+def _read(parser: DataParser, split: str) -> DataparserOutputs:
+    try:
+        return parser.get_dataparser_outputs(split=split)
+    except TROUBLE as error:
+        name, data = reader_name(parser.config), parser.config.data
+        raise InputError(
+            f"{name} cannot read {data} ({type(error).__name__}: {error}); `ns-train abcd {name} --help` "
+            "lists its options."
+        ) from error

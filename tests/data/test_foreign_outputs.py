@@ -1,0 +1,185 @@
+"""Photos and cameras of nerfstudio's own readers: as nerfstudio makes them, but checked and in our hands."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
+
+from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.nerfstudio.inspection import Inspected, factor_of, inspect
+from tests.data.dataparser_scenes import NAMES, SIZES, parser, write_model, write_photos, write_transforms
+from tests.data.test_layouts import write_blender
+
+PINHOLE = {"fx": 40.0, "fy": 40.0, "cx": 16.0, "cy": 12.0, "width": 32, "height": 24}
+
+
+def colmap(data: Path, **options) -> ColmapDataParserConfig:
+    given = {"downscale_factor": 1, "colmap_path": Path("sparse/0"), **options}
+    return ColmapDataParserConfig(data=data, **given)
+
+
+def outputs_of(path: Path, **camera) -> DataparserOutputs:
+    """Of one photo."""
+    given = {**PINHOLE, **camera}
+    cameras = Cameras(camera_to_worlds=torch.eye(4)[None, :3], **given)
+    return DataparserOutputs(image_filenames=[path], cameras=cameras)
+
+
+@pytest.fixture
+def photo(tmp_path) -> Path:
+    pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "photo.png")
+    return tmp_path / "photo.png"
+
+
+@pytest.mark.parametrize(
+    ("kind", "extra"),
+    [("SIMPLE_PINHOLE", []), ("OPENCV", [0.1, 0.01, 1e-3, 2e-3]), ("OPENCV_FISHEYE", [0.05, 0.01, 0.0, 0.0])],
+)
+def test_photos_and_cameras_are_those_that_splatfacto_trains_on(tmp_path, kind, extra):
+    def params(w, h):
+        return kind, [w, *([] if kind.startswith("SIMPLE") else [w]), w / 2, h / 2, *extra]
+
+    write_model(tmp_path / "sparse/0", params=params)
+    write_photos(tmp_path / "images")
+    config = FullImageDatamanagerConfig(dataparser=colmap(tmp_path), cache_images_type="uint8")
+    theirs = FullImageDatamanager[InputDataset](config).fixed_indices_eval_dataloader
+    ours = AbcdDataset(colmap(tmp_path).setup().get_dataparser_outputs("val"))
+    assert len(theirs) == len(ours) > 0
+    for row, (camera, data) in enumerate(theirs):
+        wanted = ours.cameras[row]
+        for name in ("fx", "fy", "cx", "cy", "width", "height"):
+            assert torch.allclose(getattr(camera, name).ravel(), getattr(wanted, name).ravel(), atol=1e-3), (
+                name
+            )
+        difference = data["image"].int() - ours.get_data(row, "uint8")["image"].int()
+        assert difference.abs().max() <= 1
+    assert ours.cameras.distortion_params is None
+
+
+def test_our_own_reader_is_left_alone(scene):
+    outputs = parser(scene).get_dataparser_outputs()
+    assert with_photos(outputs) is outputs
+
+
+def test_transparent_photos_lie_on_the_readers_colour(tmp_path):
+    data = write_blender(tmp_path)
+    ours, theirs = (
+        kind(BlenderDataParserConfig(data=data).setup().get_dataparser_outputs("train"))
+        for kind in (AbcdDataset, InputDataset)
+    )
+    assert torch.allclose(ours[0]["image"], theirs[0]["image"], atol=0.5 / 255 + 1e-6)
+    kept = BlenderDataParserConfig(data=data, alpha_color=None).setup().get_dataparser_outputs("train")
+    assert AbcdDataset(kept)[0]["image"].shape == (24, 32, 4)
+
+
+def test_masks_come_along(scene):
+    meta = write_transforms(scene)
+    for i, name in enumerate(NAMES):
+        (scene / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
+        mask = np.full(SIZES[i % 2][::-1], 255, np.uint8)
+        mask[:5] = 0
+        Image.fromarray(mask).save(scene / "masks" / name)
+    assert meta["frames"]
+    outputs = with_photos(parser(scene).get_dataparser_outputs())
+    masks = [scene / "masks" / path.relative_to(scene / "images") for path in outputs.image_filenames]
+    outputs.metadata.pop(PHOTOS)
+    outputs.mask_filenames = masks
+    dataset = AbcdDataset(outputs)
+    assert not dataset[1]["mask"][:5].any()
+    assert dataset[1]["mask"][5:].all()
+
+
+def test_a_larger_photo_is_reduced_to_its_camera(photo):
+    dataset = AbcdDataset(outputs_of(photo, fx=20.0, fy=20.0, cx=8.0, cy=6.0, width=16, height=12))
+    whole = np.array(Image.open(photo)).astype(float)
+    means = whole.reshape(12, 2, 16, 2, 3).mean(axis=(1, 3))
+    assert np.abs(dataset.get_numpy_image(0) - means).max() <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        ({"width": 64, "height": 48}, "is 32 x 24 but its camera is 64 x 48"),
+        ({"width": 24, "height": 24}, "is 32 x 24 but its camera is 24 x 24"),
+        ({"camera_type": CameraType.EQUIRECTANGULAR}, "is equirectangular"),
+        ({"distortion_params": torch.tensor([[0.0, 0, 0, 0.1, 0, 0]])}, "k4 = 0.1"),
+        ({"fx": 1e9}, "focal length"),
+    ],
+)
+def test_cameras_that_cannot_be_are_named(photo, camera, says):
+    with pytest.raises(InputError) as refused:
+        with_photos(outputs_of(photo, **camera))
+    assert str(photo) in str(refused.value)
+    assert says in str(refused.value)
+
+
+def test_files_that_are_not_there_are_named_unless_nobody_looks_at_them(tmp_path):
+    outputs = outputs_of(tmp_path / "gone.png")
+    with pytest.raises(InputError, match=r"gone\.png cannot be read"):
+        with_photos(outputs)
+    (source,) = with_photos(outputs, needs_photos=False).metadata[PHOTOS]
+    assert source.size == (32, 24)
+
+
+def test_a_colour_for_masked_pixels_is_refused(photo):
+    outputs = outputs_of(photo)
+    outputs.metadata = {"mask_color": (0, 0, 0)}
+    with pytest.raises(InputError, match="--mask-color has no effect here"):
+        with_photos(outputs)
+
+
+# Looked at before training
+
+
+def test_a_capture_is_measured(scene):
+    assert inspect(colmap(scene)) == Inspected(SIZES[0][0] * SIZES[0][1], 20, 1)
+    write_photos(scene / "images_2", divide=2)
+    half = (SIZES[0][0] // 2) * (SIZES[0][1] // 2)
+    assert inspect(colmap(scene, downscale_factor=2)) == Inspected(half, 20, 2)
+
+
+def test_a_capture_without_points_has_none(tmp_path):
+    assert inspect(BlenderDataParserConfig(data=write_blender(tmp_path))) == Inspected(32 * 24, 0, 1)
+
+
+def test_a_reader_that_says_nothing_of_its_factor_has_one():
+    assert factor_of(BlenderDataParserConfig().setup()) == 1
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        (lambda data: ColmapDataParserConfig(data=data), "colmap cannot read"),
+        (lambda data: NerfstudioDataParserConfig(data=data), "nerfstudio-data cannot read"),
+        (lambda data: BlenderDataParserConfig(data=data), "blender-data cannot read"),
+    ],
+)
+def test_what_another_reader_stumbles_over_is_one_line(scene, config, says):
+    with pytest.raises(InputError) as refused:
+        inspect(config(scene))
+    assert says in str(refused.value)
+    assert str(scene) in str(refused.value)
+    assert "--help` lists its options" in str(refused.value)
+    assert len(refused.value.lines) == 1
+
+
+def test_a_damaged_photo_of_another_reader_is_named(scene):
+    path = scene / "images" / NAMES[1]
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="is empty"):
+        inspect(colmap(scene))

@@ -1,0 +1,333 @@
+"""Nerfstudio's tools on a run of ours, and on data of other readers: in this process, on a tiny scene."""
+
+import copy
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.scripts import render
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.utils import writer
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from abcd_ns.cli.report.options import training_command
+from abcd_ns.cli.report.run_folder import load_pipeline, open_run
+from abcd_ns.engine.render.loss import psnr
+from abcd_ns.nerfstudio import metrics
+from abcd_ns.nerfstudio.model import AbcdModel
+from tests.data.test_layouts import write_blender
+from tests.nerfstudio.test_training import configure, run
+from tests.reference.colmap_scene import HEIGHT, HELD_OUT, VIEWS, WIDTH, write_scene
+
+STEPS = 24
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "wall")
+
+
+class Events(writer.Writer):
+    """What wandb or comet would be given."""
+
+    def __init__(self) -> None:
+        self.scalars: dict[str, list[tuple[int, float]]] = {}
+
+    def write_scalar(self, name, scalar, step):
+        self.scalars.setdefault(name, []).append((step, float(scalar)))
+
+    def write_image(self, name, image, step): ...
+
+    def write_config(self, name, config_dict, step): ...
+
+
+@pytest.fixture(scope="module")
+def events() -> Events:
+    return Events()
+
+
+@pytest.fixture(scope="module")
+def trained(data, events, tmp_path_factory) -> Path:
+    """The folder of a run."""
+    config = configure(data, tmp_path_factory.mktemp("out"), steps=STEPS)
+    config.steps_per_eval_all_images = 10
+    writer.EVENT_WRITERS.append(events)
+    try:
+        return run(config).base_dir
+    finally:
+        writer.EVENT_WRITERS.remove(events)
+
+
+def pictures(folder: Path) -> dict[str, np.ndarray]:
+    found = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*.png"))}
+    return {name: np.asarray(Image.open(path)).astype(float) for name, path in found.items()}
+
+
+def camera_path(folder: Path, **extra) -> Path:
+    """As the viewer writes it: three cameras before the wall, in its scaled coordinates."""
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    dataset = config.pipeline.setup(device="cpu", test_mode="val").datamanager.train_dataset
+    frames = []
+    for row in range(3):
+        pose = torch.eye(4)
+        pose[:3] = dataset.cameras.camera_to_worlds[row]
+        field = float(2 * torch.rad2deg(torch.atan(HEIGHT / 2 / dataset.cameras.fy[row, 0])))
+        frames.append({"camera_to_world": pose.flatten().tolist(), "fov": field, "aspect": WIDTH / HEIGHT})
+    path = {"render_width": WIDTH, "render_height": HEIGHT, "camera_type": "perspective", "seconds": 1}
+    file = folder / "camera_path.json"
+    file.write_text(json.dumps({**path, "camera_path": frames, "fps": 3, **extra}))
+    return file
+
+
+@pytest.fixture
+def rendered(trained, tmp_path, monkeypatch):
+    """Writes pictures of a camera path, and reads them."""
+    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)
+
+    def draw(names: list[str], **extra) -> dict[str, np.ndarray]:
+        out = tmp_path / "_".join([*names, *extra])
+        render.RenderCameraPath(
+            load_config=trained / "config.yml",
+            output_path=out / "frames.mp4",
+            image_format="png",
+            output_format="images",
+            rendered_output_names=names,
+            eval_num_rays_per_chunk=7,
+            camera_path_filename=camera_path(trained, **extra),
+        ).main()
+        return pictures(out / "frames")
+
+    return draw
+
+
+def test_a_camera_path_is_rendered_with_depth_and_accumulation(rendered):
+    frames = rendered(["rgb", "depth", "accumulation"])
+    assert list(frames) == [f"{k:05d}.png" for k in range(3)]
+    for frame in frames.values():
+        assert frame.shape == (HEIGHT, 3 * WIDTH, 3)
+    photos = rendered(["rgb"])
+    assert all((frames[name][:, :WIDTH] == photos[name]).all() for name in photos)
+
+
+def test_a_crop_box_leaves_what_is_in_it_on_its_own_background(rendered):
+    whole = rendered(["rgb"])["00001.png"]
+    crop = {"crop_bg_color": {"r": 255, "g": 0, "b": 255}, "crop_center": [9.0, 9.0, 9.0]}
+    nothing = rendered(["rgb"], crop={**crop, "crop_scale": [0.1, 0.1, 0.1]})["00001.png"]
+    assert (nothing == [255, 0, 255]).all()
+    wide = {**crop, "crop_scale": [99.0, 99.0, 99.0]}
+    viewer = dict(zip("rgb", (38, 42, 55), strict=True))
+    everything = rendered(["rgb"], crop={**wide, "crop_bg_color": viewer})["00001.png"]
+    assert np.abs(everything - whole).max() <= 1
+    assert np.abs(everything - rendered(["rgb"], crop=wide)["00001.png"]).max() > 9  # where it shines through
+
+
+def test_pictures_without_background_have_alpha(rendered):
+    rgba, rgb = rendered(["rgba"])["00001.png"], rendered(["rgb"])["00001.png"]
+    assert rgba.shape == (HEIGHT, WIDTH, 4)
+    alpha = rgba[..., 3:] / 255
+    background = 255 * np.array([0.1490, 0.1647, 0.2157])
+    assert np.abs(rgba[..., :3] * alpha + (1 - alpha) * background - rgb).max() < 3
+
+
+def test_interpolated_views_are_rendered(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)
+    render.RenderInterpolated(
+        load_config=trained / "config.yml",
+        output_path=tmp_path / "way.mp4",
+        image_format="png",
+        output_format="images",
+        interpolation_steps=2,
+    ).main()
+    assert {frame.shape for frame in pictures(tmp_path / "way").values()} == {(HEIGHT, WIDTH, 3)}
+
+
+def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
+    render.DatasetRender(
+        load_config=trained / "config.yml", output_path=tmp_path, image_format="png", split="train+test"
+    ).main()
+    found = pictures(tmp_path)
+    kinds = ("gt-rgb", "rgb", "depth", "accumulation", "background")
+    assert len(found) == len(kinds) * VIEWS
+    names = [name.split("/")[-1] for name in found if name.startswith("test/rgb/")]
+    assert len(names) == HELD_OUT
+    for name in names:
+        drawn, photo = (torch.from_numpy(found[f"test/{kind}/{name}"]) / 255 for kind in ("rgb", "gt-rgb"))
+        assert float(psnr(drawn, photo)) > 12
+
+
+# Scores
+
+
+def evaluated(trained: Path, out: Path) -> dict:
+    ComputePSNR(load_config=trained / "config.yml", output_path=out / "scores.json").main()
+    return json.loads((out / "scores.json").read_text())["results"]
+
+
+def test_without_weights_lpips_is_null_and_says_why(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    monkeypatch.delenv(metrics.FETCH, raising=False)
+    found = evaluated(trained, tmp_path)
+    assert found["lpips"] is None
+    assert found["psnr"] > 12
+    assert "ABCD_FETCH_LPIPS=1" in found["lpips_missing"]
+    assert str(tmp_path / "hub") in found["lpips_missing"]
+    assert not (tmp_path / "hub").exists()
+
+
+def test_weights_are_fetched_when_that_is_allowed(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    monkeypatch.setenv(metrics.FETCH, "1")
+    asked = []
+    monkeypatch.setattr(metrics, "_lpips", lambda device: asked.append(device) or (lambda a, b: 0.25))
+    found = evaluated(trained, tmp_path)
+    assert found["lpips"] == 0.25
+    assert len(asked) == HELD_OUT
+    assert "lpips_missing" not in found
+
+
+def test_a_network_that_fails_is_one_line(tmp_path, monkeypatch):
+    def fails(**_):
+        raise OSError("no route to host")
+
+    monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", fails)
+    with pytest.raises(metrics.UserError, match="no route to host"):
+        metrics._lpips.__wrapped__("cpu")
+
+
+# What TensorBoard, wandb and comet are given
+
+NAMES = ("block", "blocks", "sweep", "gaussians", "share of time for layers", "RAM (GB)")
+
+
+def test_writers_are_told_where_the_training_stands(trained, events):
+    for name in NAMES:
+        written = events.scalars[f"ABCD/{name}"]
+        assert [step for step, _ in written] == [0, 10, 20], name
+    blocks = [value for _, value in events.scalars["ABCD/block"]]
+    assert blocks[0] == 0  # the warm-up
+    assert blocks[-1] in (1, 2, 3)
+    assert events.scalars["ABCD/blocks"][-1][1] == 3
+    assert events.scalars["ABCD/gaussians"][-1][1] > 100
+    assert 0 < events.scalars["ABCD/RAM (GB)"][-1][1] < 1000
+    assert "Eval Images Metrics Dict (all images)/psnr" in events.scalars
+
+
+def test_tensorboard_has_it(trained):
+    file = EventAccumulator(str(trained))
+    file.Reload()
+    assert {f"ABCD/{name}" for name in NAMES} <= set(file.Tags()["scalars"])
+    assert [event.step for event in file.Scalars("ABCD/block")] == [0, 10, 20]
+
+
+# Classes derived from ours
+
+
+class Tinted(AbcdModel):
+    """Splatfacto's kind of derived model: a module of its own, an output, a loss, an optimizer, a score."""
+
+    def populate_modules(self):
+        super().populate_modules()
+        self.tint = torch.nn.Linear(3, 3)
+
+    def get_param_groups(self):
+        return {**super().get_param_groups(), "tint": list(self.tint.parameters())}
+
+    def get_outputs(self, camera):
+        outputs = super().get_outputs(camera)
+        if not self.training:
+            outputs["tinted"] = self.tint(outputs["rgb"])
+        return outputs
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None):
+        losses = super().get_loss_dict(outputs, batch, metrics_dict)
+        return {**losses, "tint": self.tint.weight.square().sum()}
+
+    def get_image_metrics_and_images(self, outputs, batch):
+        scores, images = super().get_image_metrics_and_images(outputs, batch)
+        photo, drawn = (x.permute(2, 0, 1)[None] for x in (self.get_gt_img(batch["image"]), outputs["rgb"]))
+        again = {"psnr_again": self.psnr(drawn, photo), "ssim_again": self.ssim(drawn, photo)}
+        return {**scores, **{name: float(value) for name, value in again.items()}}, images
+
+
+def test_a_derived_model_trains_is_saved_and_loads(data, tmp_path):
+    config = configure(data, tmp_path, steps=8)
+    config.pipeline.model._target = Tinted
+    config.optimizers = copy.deepcopy(config.optimizers)
+    config.optimizers["tint"] = {"optimizer": AdamOptimizerConfig(lr=0.1), "scheduler": None}
+    trainer = run(config)
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    assert isinstance(pipeline.model, Tinted)
+    tint = pipeline.model.tint.weight
+    assert torch.equal(tint, trainer.pipeline.model.tint.weight)
+    assert float(tint.detach().square().sum()) < 0.2  # a Linear begins at about 1
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    assert pipeline.model.get_outputs_for_camera(camera)["tinted"].shape == (HEIGHT, WIDTH, 3)
+    found = pipeline.get_average_eval_image_metrics()
+    assert found["psnr_again"] == pytest.approx(found["psnr"], abs=1e-3)
+    assert found["ssim_again"] == pytest.approx(found["ssim"], abs=1e-3)
+
+
+def test_cameras_stay_as_they_are(data, tmp_path):
+    assert SplatfactoModelConfig().camera_optimizer.mode == "off"
+    trainer = run(configure(data, tmp_path, steps=2))
+    assert trainer.config.pipeline.model.camera_optimizer.mode == "off"
+    assert not list(trainer.pipeline.model.camera_optimizer.parameters())
+    assert "camera_opt" not in trainer.pipeline.get_param_groups()
+
+
+# Data of other readers
+
+
+def test_a_scene_that_nerfstudios_colmap_reader_reads_trains_as_ours_does(data, tmp_path):
+    config = configure(data, tmp_path, steps=8)
+    config.pipeline.datamanager.dataparser = ColmapDataParserConfig(colmap_path=Path("sparse/0"))
+    theirs = run(config)
+    ours = run(configure(data, tmp_path / "ours", steps=8))
+    for name in ("train_dataset", "eval_dataset"):
+        a, b = (getattr(trainer.pipeline.datamanager, name) for trainer in (theirs, ours))
+        assert [p.name for p in a.image_filenames] == [p.name for p in b.image_filenames]
+        assert torch.allclose(a.cameras.camera_to_worlds, b.cameras.camera_to_worlds, atol=1e-5)
+    assert theirs.pipeline.coordinator.count() == pytest.approx(ours.pipeline.coordinator.count(), rel=0.1)
+    config = yaml.load((theirs.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
+    assert isinstance(config.pipeline.datamanager.dataparser, ColmapDataParserConfig)
+    assert "psnr" in evaluated(theirs.base_dir, tmp_path)
+    found = open_run(theirs.base_dir)
+    assert isinstance(load_pipeline(found, found.checkpoint).model, AbcdModel)
+    again = shlex.split(training_command(found.settings).replace("\\\n", ""))
+    assert again[again.index("colmap") :] == ["colmap", "--colmap-path", "sparse/0"]
+
+
+def test_a_scene_without_points_begins_at_random_and_says_so(tmp_path, capsys):
+    config = configure(write_blender(tmp_path / "lego"), tmp_path / "out", steps=4, blocks=0)
+    config.pipeline.datamanager.dataparser = BlenderDataParserConfig()
+    config.pipeline.model.num_random = 300
+    trainer = run(config)
+    said = capsys.readouterr().out
+    assert said.count("300 Gaussians begin at random places, as splatfacto's do") == 1
+    assert trainer.pipeline.coordinator.count() == 300
+    (trainer.pipeline.datamanager.config.data / "train" / "r_0.png").unlink()
+    # Who only looks at a scene needs no photos; Blender's reader itself opens the first, for its size.
+    Image.new("RGBA", (32, 24)).save(tmp_path / "lego" / "train" / "r_0.png")
+    (tmp_path / "lego" / "train" / "r_1.png").unlink()
+    eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
+
+
+def test_faults_of_another_reader_end_a_command_before_anything_is_written(data, tmp_path, capsys):
+    config = configure(data, tmp_path)
+    config.pipeline.datamanager.dataparser = ColmapDataParserConfig()  # which looks in colmap/sparse/0
+    config.set_timestamp()
+    with pytest.raises(SystemExit) as stopped:
+        config.save_config()
+    assert stopped.value.code == 2
+    assert "colmap cannot read" in capsys.readouterr().out
+    assert not any(tmp_path.iterdir())
