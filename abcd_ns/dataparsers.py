@@ -3,10 +3,19 @@
 nerfstudio loads this while it is itself half loaded, and for each of its commands: see `abcd_ns.methods`.
 """
 
+import sys
+import warnings
+from pathlib import Path
+
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from abcd_ns.errors import IMPORT_TROUBLE, UserError, missing
+
+if Path(sys.argv[0]).stem == "ns-train" and sys.argv[1:2] and sys.argv[1].startswith("abcd"):
+    # What nerfstudio 1.1.5 calls is still there under these names. It is called when modules are loaded that
+    # come after this one, so later would be too late; other commands' warnings are not ours to hide.
+    warnings.filterwarnings("ignore", r"`torch\.cuda\.amp\.", FutureWarning)
 
 try:
     from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig

@@ -22,7 +22,7 @@ EXPORT = "open3d"
 """What `ns-export` needs besides; heavy, so imported in a process of its own."""
 
 
-@dataclass @ dataclass(frozen=True)
+@dataclass(frozen=True)
 class Packages:
     """The Python environment."""
 
