@@ -29,8 +29,8 @@ BATCH = "abcd_batch"
 
 OUR_READER = "abcd-data"
 READERS: dict[str, DataParserConfig] = {
-    **all_dataparsers,
     OUR_READER: AbcdDataParserConfig(),
+    **{name: config for name, config in all_dataparsers.items() if name != OUR_READER},
     "nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True),  # as splatfacto has it
 }
 """What reads data, as splatfacto offers it, by the name on the command line."""
@@ -73,7 +73,7 @@ class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     """Where photos, poses and points come from: a COLMAP folder or a transforms.json. Another reader takes
     its place by its name at the end of the command, as in `ns-train abcd --data DIR colmap`."""
     data_format: DataFormat = None
-    """Another reader of data, with its options; becomes `dataparser`."""
+    """What reads the data, if not abcd-data as told above; its own options follow its name."""
     cache_images: Literal["cpu", "gpu"] = "cpu"
     """Of no use: see UNUSED. nerfstudio would speak of it where it is "gpu"."""
     photo_cache_gb: float = 0.0

@@ -23,8 +23,10 @@ def test_train_then_evaluate(tmp_path):
     train = shell(
         "ns-train", "abcd", "--data", data, "--output-dir", tmp_path / "out", "--timestamp", "run",
         "--max-num-iterations", 30, "--pipeline.blocks", 2, "--vis", "tensorboard",
+        "colmap", "--colmap-path", "sparse/0",
     )  # fmt: skip
     assert train.returncode == 0, train.stdout[-3000:] + train.stderr[-3000:]
+    assert "Warning" not in train.stdout + train.stderr
     assert "training on the CPU" in train.stdout or "GPU" in train.stdout
     assert "30 steps" in train.stdout
     run = tmp_path / "out" / "wall" / "abcd" / "run"

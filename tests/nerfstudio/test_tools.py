@@ -60,7 +60,8 @@ def events() -> Events:
 def trained(data, events, tmp_path_factory) -> Path:
     """The folder of a run."""
     config = configure(data, tmp_path_factory.mktemp("out"), steps=STEPS)
-    config.steps_per_eval_all_images = 10
+    config.steps_per_eval_all_images = config.steps_per_eval_batch = config.steps_per_eval_image = 10
+    config.log_gradients = True
     writer.EVENT_WRITERS.append(events)
     try:
         return run(config).base_dir
@@ -218,7 +219,9 @@ def test_writers_are_told_where_the_training_stands(events):
     assert events.scalars["ABCD/blocks"][-1][1] == 3
     assert events.scalars["ABCD/gaussians"][-1][1] > 100
     assert 0 < events.scalars["ABCD/RAM (GB)"][-1][1] < 1000
-    assert "Eval Images Metrics Dict (all images)/psnr" in events.scalars
+    for name in ("Eval Images Metrics Dict (all images)/psnr", "Eval Images Metrics/psnr", "Eval Loss"):
+        assert [step for step, _ in events.scalars[name]] == [10, 20], name
+    assert events.scalars["Train Metrics Dict/Gradients/Total"][-1][1] > 0
 
 
 def test_tensorboard_has_it(trained):
