@@ -15,7 +15,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
 from abcd_ns.engine.events import Event, LayersDrawn, WorkersSeen
@@ -177,11 +176,6 @@ class AbcdTrainer(Trainer):
                 self.pipeline.coordinator.scene.flush()
             raise
 
-    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """As nerfstudio's, with values alone: what is logged needs no graph, and torch warns of it."""
-        loss, losses, metrics = super().train_iteration(step)
-        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
-
     def _memory_is_full(self) -> str:
         limit = self.pipeline.coordinator.config.limits.block_limit
         room = f"blocks of {limit:,} Gaussians" if limit else f"{self.config.pipeline.blocks} blocks"
@@ -192,10 +186,11 @@ class AbcdTrainer(Trainer):
         )
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
-        """As nerfstudio's; where workers train, what one of them did counts."""
+        """As nerfstudio's, without graphs, which no log needs; where workers train, one's doing counts."""
         coordinator = self.pipeline.coordinator
         if coordinator is None or not coordinator.trains_elsewhere:
-            return super().train_iteration(step)
+            loss, losses, metrics = super().train_iteration(step)
+            return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
         coordinator.await_step()
         return torch.zeros(()), {}, {}
 

@@ -11,7 +11,7 @@ import pytest
 from tests.test_house_rules import PACKAGE_FILES, PYPROJECT, ROOT
 
 NEEDED = ("viser", "msgspec", "cv2", "fcntl", "safetensors", "pytorch_msssim")
-NOT_NEEDED = ("embreex", "trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "lmdb")
+NOT_NEEDED = ("embreex", "trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray")
 SCRIPT = """
 import json, sys
 import nerfstudio.configs.method_configs  # what is stock is there
@@ -97,7 +97,8 @@ def test_what_is_imported_is_declared():
     names &= set(installed) - {"abcd_ns"} - set(sys.stdlib_module_names)
     assert len(names) > 15
     project = PYPROJECT["project"]
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["demo"]]
+    extras = [names for extra, names in project["optional-dependencies"].items() if extra != "dev"]
+    wanted = [*project["dependencies"], *(name for names in extras for name in names)]
     declared = {normal(re.match(r"[\w.-]+", requirement).group()) for requirement in wanted}
     assert {name for name in names if not declared & set(map(normal, installed[name]))} == set()
 

@@ -227,7 +227,7 @@ def test_the_saved_config_is_the_config(trained):
     [
         (lambda c: setattr(c.pipeline.model, "warmup_length", 7), "--pipeline.model.warmup-length"),
         (lambda c: setattr(c.pipeline.model, "sh_degree", 1), "--pipeline.training.sh-degree"),
-        (lambda c: setattr(c.machine, "num_devices", 2), "one device"),
+        (lambda c: setattr(c.machine, "num_devices", 2), "--pipeline.workers"),
         (lambda c: setattr(c, "mixed_precision", True), "float32"),
         (lambda c: setattr(c.pipeline, "blocks", -1), "--pipeline.blocks"),
         (lambda c: setattr(c, "vis", "viewer_legacy"), "viewer_legacy"),
