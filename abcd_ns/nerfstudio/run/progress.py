@@ -178,9 +178,11 @@ def _block(block: int | None) -> str:
 def _at_work(workers: Sequence[WorkerSeen], blocks: int) -> str:
     """What workers are doing, in few words."""
     busy = [worker for worker in workers if worker.block is not None]
-    steps = ", ".join(f"{worker.block + 1}: {worker.done}/{worker.steps}" for worker in busy[:4])
+    which = ", ".join(f"{worker.block + 1} ({worker.done}/{worker.steps})" for worker in busy[:4])
     more = ", ..." if len(busy) > 4 else ""
-    return f"{len(busy)} of {len(workers)} workers at blocks of {blocks} {steps}{more}".rstrip()
+    return f"{len(busy)} of {len(workers)} workers busy" + (
+        f": blocks {which}{more} of {blocks}" if busy else ""
+    )
 
 
 def _memory() -> str:
