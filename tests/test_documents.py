@@ -66,7 +66,7 @@ def parse(line: str) -> None:
         return
     command = cli.find_command(words[0], cli.COMMANDS)
     if command.hands_on:
-        tyro.cli(AnnotatedBaseConfigUnion, args=[*train.command_line(ROOT / words[1]), *words[2:]])
+        tyro.cli(AnnotatedBaseConfigUnion, args=[*train.command_line(Path(words[1])), *words[2:]])
         return
     tyro.cli(no_deed(command.load()), args=words[1:])
 

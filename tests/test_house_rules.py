@@ -136,7 +136,7 @@ def config_files() -> list[Path]:
         for p in ROOT.iterdir()
         if p.suffix in wanted or p.name in ("Makefile", ".importlinter", ".gitignore")
     ]
-    folders = [ROOT / name for name in (".ci", ".github", "configs", "scripts")]
+    folders = [ROOT / name for name in (".ci", ".github", "docker", "scripts")]
     return sorted(top + [p for folder in folders for p in folder.rglob("*") if p.is_file()])
 
 

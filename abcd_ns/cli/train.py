@@ -14,10 +14,11 @@ USAGE = """usage: abcd train FILE.toml [OPTIONS]
 
 Run `ns-train` with the options of a TOML file, then those given here: what comes later counts.
 
-  abcd train configs/small-gpu.toml --data garden
+  abcd train small-gpu --data garden
 
 The file says `method = "abcd"`, or another method of ns-train, and options under their names, in tables:
---pipeline.device-budget-gb 6 stands in [pipeline] as device-budget-gb = 6. configs/ has examples.
+--pipeline.device-budget-gb 6 stands in [pipeline] as device-budget-gb = 6. small-gpu, cpu and garden
+come with abcd; a file of your own is named by its path.
 `ns-train abcd --help` lists all options."""
 METHOD = "method"
 
@@ -44,7 +45,7 @@ def command_line(path: Path) -> list[str]:
     Raises:
         UserError: the file is absent, is no TOML, names no method, or holds what no option can be.
     """
-    data = read_toml(path, f"{path} does not exist; configs/ has examples.")
+    data = read_toml(path, f"{path} does not exist.")
     method = data.pop(METHOD, None)
     if not isinstance(method, str):
         raise UserError(f'{path} names no method; begin it with: method = "abcd"')

@@ -9,7 +9,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
-from abcd_ns.viewer.request_rules import THIS_MACHINE
+from abcd_ns.viewer.guard.rules import THIS_MACHINE
 
 PAPER = TrainingConfig(
     recipe=Recipe(

@@ -29,7 +29,7 @@ from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, find_start, pin_name
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
-from abcd_ns.viewer.request_rules import THIS_MACHINE, WILDCARDS
+from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
 
 @hidden("max_norm")

@@ -9,6 +9,7 @@ import numpy as np
 import psutil
 import torch
 import viser
+from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
@@ -33,7 +34,7 @@ from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Choice
 from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, seconds_left, sweep_share
 from abcd_ns.viewer.scenery import Scenery, first_look, views_that_see
-from abcd_ns.viewer.texts import block_table, headline, memory_table, sweep_line, workers_line
+from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, sweep_line, workers_line
 
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 5.0
@@ -82,6 +83,8 @@ class AbcdPanel(ViewerControl):
         share, server = viewer.config.make_share_url, viewer.viser_server
         if (rules := rules_of(server)) is not None:
             rules.share = share
+        if not share and (line := reach(viewer.config.websocket_host)) is not None:
+            CONSOLE.print(line, highlight=False)
         # nerfstudio's title bar fetches a picture from its site; viser's offers everyone a public tunnel.
         server.gui.configure_theme(
             control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105), show_share_button=share

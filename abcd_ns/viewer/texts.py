@@ -1,14 +1,31 @@
-"""The panel's texts, as Markdown."""
+"""The panel's texts, as Markdown, and the terminal's."""
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from datetime import timedelta
+from pathlib import Path
 
 from abcd_ns.engine.events import WorkerSeen
+from abcd_ns.viewer.guard.rules import THIS_MACHINE
 from abcd_ns.viewer.run_history import BlockRow, Status
 
 MOST_ROWS = 24
 """Of the table of blocks; with more blocks those that are active or under-observed come first."""
+
+CONTAINER_MARKS = (Path("/.dockerenv"), Path("/run/.containerenv"))
+"""What docker and podman leave in their containers."""
+
+
+def reach(host: str) -> str | None:
+    """How to reach a viewer that listens on `host` of a container; None where there is no more to say."""
+    inside = any(mark.exists() for mark in CONTAINER_MARKS) or "KUBERNETES_SERVICE_HOST" in os.environ
+    if not inside or host not in (THIS_MACHINE, "localhost"):
+        return None
+    return (
+        f"The viewer listens on {host}, which from outside this container cannot be reached; "
+        "--viewer.websocket-host 0.0.0.0 and a published port let it be. It has no password."
+    )
 
 
 def clock(seconds: float | None) -> str:

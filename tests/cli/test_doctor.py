@@ -95,8 +95,8 @@ def test_a_healthy_machine_has_no_findings():
         (with_packages(registered=False), "error", "not-registered", "pip install ."),
         (with_packages(has_ns_train=False), "error", "no-ns-train", "nerfstudio"),
         (with_version(gsplat="1.5.3"), "warning", "untested-version", "gsplat==1.4.0"),
-        (with_version(viser="0.2.7"), "warning", "viewer-hole", "websocket-host 127.0.0.1"),
-        (with_version(viser="1.0.24"), "warning", "viewer-hole", "1.0.24"),
+        (with_version(viser="0.2.7"), "note", "viewer-hole", "websocket-host 127.0.0.1"),
+        (with_version(viser="1.0.24"), "note", "viewer-hole", "1.0.24"),
         (with_hardware(may_write=False), "error", "read-only-folder", "--output-dir"),
         (with_hardware(disk_free_bytes=GIB), "warning", "little-disk", "1.0 GiB"),
         (with_hardware(ram_free_bytes=GIB), "warning", "little-ram", "1.0 GiB"),
@@ -136,16 +136,32 @@ def test_where_torch_does_not_start_the_rest_is_still_said(capsys, monkeypatch):
 
 
 def test_warnings_leave_the_exit_code_alone(capsys, monkeypatch):
-    monkeypatch.setattr(command, "gather", lambda: with_version(viser="0.2.7"))
+    monkeypatch.setattr(command, "gather", lambda: with_hardware(ram_free_bytes=GIB))
     assert doctor() == 0
-    assert "Training can work here." in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "little-ram" in printed
+    assert "Training can work here." in printed
+
+
+def test_where_all_is_well_the_screen_is_short_and_notes_wait_to_be_asked_for(capsys, monkeypatch):
+    facts = with_kernels(with_version(viser="0.2.7"), lpips_missing="LPIPS needs weights")
+    monkeypatch.setattr(command, "gather", lambda: facts)
+    assert doctor() == 0
+    short = capsys.readouterr().out
+    assert len(short.splitlines()) <= 12
+    assert "viewer-hole" not in short
+    assert "2 notes: abcd doctor --verbose" in short
+    doctor(verbose=True)
+    full = capsys.readouterr().out
+    for said in ("viewer-hole", "no-lpips", "pycolmap", "13.0"):
+        assert said in full
 
 
 def test_the_report_names_no_home(tmp_path, monkeypatch, capsys):
     home = str(Path.home())
     facts = with_kernels(with_packages(broken={"cv2": f"no {home}/lib.so"}), folder=f"{home}/.cache/x")
     monkeypatch.setattr(command, "gather", lambda: facts)
-    doctor(json=tmp_path / "report.json")
+    doctor(json=tmp_path / "report.json", verbose=True)
     text = (tmp_path / "report.json").read_text()
     for said in (text, capsys.readouterr().out):
         assert home + "/" not in said

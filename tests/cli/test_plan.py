@@ -103,13 +103,19 @@ def test_blocks_that_hardly_any_view_sees_are_counted():
     assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
 
 
-def test_the_screen_names_all_that_takes_room(capsys):
+def test_the_screen_is_short_and_says_more_when_asked(capsys):
     found = forecast(capture(), Wanted(blocks=4), Console(quiet=True))
     print_forecast(found, Console(width=120))
+    short = capsys.readouterr().out
+    assert len(short.splitlines()) < 10
+    for word in ("blocks", "400 points", "time", "device", "RAM", "disk"):
+        assert word in short
+    print_forecast(found, Console(width=120), verbose=True)
     shown = capsys.readouterr().out
     for share in (*found.device, *found.ram, *found.disk):
         assert share.what in shown
-    assert "views that see it" in shown
+        assert share.what not in short
+    assert "views by block" in shown
     assert math.isfinite(found.hours[1])
 
 

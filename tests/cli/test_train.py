@@ -10,9 +10,9 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from abcd_ns.cli import main as cli
 from abcd_ns.cli import train
 from abcd_ns.errors import UserError
+from abcd_ns.lab.results.records import own_configs
 
-FOLDER = Path(__file__).resolve().parents[2] / "configs"
-CONFIGS = [path for path in sorted(FOLDER.glob("*.toml")) if "\nmethod = " in path.read_text()]
+CONFIGS = [path for path in own_configs() if "\nmethod = " in path.read_text()]
 
 
 @pytest.fixture
@@ -44,11 +44,21 @@ def test_ns_train_takes_every_file_in_configs(path):
     config = tyro.cli(AnnotatedBaseConfigUnion, args=[*words, "--pipeline.max-seconds", "77"])
     assert config.method_name == words[0] == "abcd"
     assert config.pipeline.max_seconds == 77
-    assert f"abcd train configs/{path.name} --data" in path.read_text()
+    assert f"abcd train {path.stem} --data" in path.read_text()
 
 
 def test_the_examples_are_there():
     assert [path.stem for path in CONFIGS] == ["cpu", "garden", "small-gpu"]
+
+
+def test_those_that_come_with_abcd_go_by_name_from_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    named = [train.command_line(Path(name)) for name in ("cpu", "cpu.toml", "configs/cpu.toml")]
+    assert named[0] == named[1] == named[2]
+    (tmp_path / "cpu.toml").write_text('method = "abcd-exact"\n')
+    assert train.command_line(Path("cpu.toml")) == ["abcd-exact"]  # one's own goes first
+    with pytest.raises(UserError, match=r"absent.*: compare-castle, .*cpu, garden"):
+        train.command_line(Path("absent.toml"))
 
 
 @pytest.mark.parametrize(
@@ -78,5 +88,5 @@ def test_an_absent_file_is_refused(tmp_path, told):
 @pytest.mark.parametrize("words", [[], ["--help"]])
 def test_help_shows_how_to_use_it(words, told, capsys):
     assert cli.main(["train", *words]) == 0
-    assert "abcd train configs/small-gpu.toml" in capsys.readouterr().out
+    assert "abcd train small-gpu" in capsys.readouterr().out
     assert not told

@@ -15,6 +15,7 @@ from websockets.asyncio.server import serve as serve_async
 from websockets.exceptions import InvalidStatus
 
 from abcd_ns.viewer import guard
+from abcd_ns.viewer.guard.server import guarded
 from tests.viewer.client import CAMERA, Browser, ask, free_port, status
 
 SECRET = b"the canary sings"
@@ -200,7 +201,7 @@ def test_the_newer_api_of_websockets_is_guarded_by_the_same_rules():
 
     async def scenario() -> None:
         port = free_port()
-        serve = guard.guard_asyncio(serve_async)
+        serve = guarded(serve_async)
         async with serve(handler, "127.0.0.1", port, process_request=page):
             home = await get(port, "/", f"127.0.0.1:{port}")
             assert status(home) == HTTPStatus.OK

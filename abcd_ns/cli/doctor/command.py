@@ -18,6 +18,8 @@ SCHEMA = 1
 CANNOT_TRAIN = 1
 """Exit code where something makes training impossible."""
 UNKNOWN = "unknown, as torch does not start"
+MAIN = ("torch", "nerfstudio", "gsplat", "viser")
+"""Packages whose versions are always shown."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +32,15 @@ class Report:
     """The most serious first."""
 
 
-def doctor(*, json: Path | None = None) -> int:
+def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     """Look at this machine and environment: versions, hardware, compiled kernels; and say what to mend.
 
     Compiles nothing, and writes nothing unless --json is given. What it prints is fit to be copied into an
     issue: it names no user and no folder of theirs. The exit code is 1 if training cannot work, else 0.
 
     Args:
-        json: Also write what was found into this file.
+        json: Also write all that was found into this file.
+        verbose: Show all of it here too, notes on what works as it is included.
 
     Raises:
         UserError: the JSON file cannot be written.
@@ -45,11 +48,16 @@ def doctor(*, json: Path | None = None) -> int:
     check_json(json)
     report = diagnose(gather())
     console = Console()
-    for line in _lines(report.facts):
+    for line in _lines(report.facts, verbose):
         console.print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
-    print_findings(report.findings, console)
+    shown = [finding for finding in report.findings if verbose or finding.level != "note"]
+    print_findings(shown, console)
     ill = any(finding.level == "error" for finding in report.findings)
     verdict = "Training cannot work here yet: mend the errors." if ill else "Training can work here."
+    if not verbose:
+        left = len(report.findings) - len(shown)
+        notes = f" and {left} note{'s' * (left > 1)}" if left else ""
+        verdict += f" All versions{notes}: abcd doctor --verbose"
     console.print(f"\n{verdict}", highlight=False)
     write_report(json, report)
     return CANNOT_TRAIN if ill else 0
@@ -61,39 +69,44 @@ def diagnose(facts: Facts) -> Report:
     return without_home(Report(SCHEMA, facts, tuple(by_level(found))))
 
 
-def _lines(facts: Facts) -> Iterator[str]:
+def _lines(facts: Facts, verbose: bool) -> Iterator[str]:
     packages = facts.packages
-    versions = {name: version or "not installed" for name, version in packages.versions.items()}
     commit = f", commit {packages.commit}" if packages.commit else ""
-    rows = {
-        "abcd_ns": f"{packages.abcd_ns}{commit}",
-        "Python": packages.python,
-        **versions,
-        **(_hardware(facts.hardware) if facts.hardware else {"machine": UNKNOWN}),
-        **(_kernels(facts.kernels) if facts.kernels else {"kernels": "unknown, as packages do not start"}),
-    }
+    rows = {"abcd_ns": f"{packages.abcd_ns}{commit}; Python {packages.python}"}
+    named = packages.versions if verbose else MAIN
+    versions = {name: packages.versions.get(name) or "not installed" for name in named}
+    rows |= (
+        versions if verbose else {"packages": ", ".join(f"{n} {version}" for n, version in versions.items())}
+    )
+    rows |= _hardware(facts.hardware, verbose) if facts.hardware else {"machine": UNKNOWN}
+    if facts.kernels is None:
+        rows["kernels"] = "unknown, as packages do not start"
+    else:
+        rows |= _kernels(facts.kernels, verbose or bool(facts.hardware and facts.hardware.gpu), verbose)
     width = max(map(len, rows))
     for name, value in rows.items():
         yield f"{name:<{width}}  {value}"
 
 
-def _hardware(hardware: Hardware) -> dict[str, str]:
-    gpu = hardware.gpu
-    device = "none"
+def _hardware(hardware: Hardware, verbose: bool) -> dict[str, str]:
+    gpu, device = hardware.gpu, "none: training runs on the CPU, which is meant for small pictures"
     if gpu is not None:
         device = f"{gpu.name}, {_gib(gpu.memory_bytes)}, capability {gpu.capability}"
-    return {
-        "OS": hardware.os,
+    rows = {
+        "GPU": device,
         "CPU": f"{hardware.cpu}, {hardware.cores} cores",
         "RAM": f"{_gib(hardware.ram_bytes)}, {_gib(hardware.ram_free_bytes)} free",
         "disk": f"{_gib(hardware.disk_free_bytes)} free",
-        "GPU": device,
+    }
+    more = {
+        "OS": hardware.os,
         "driver": hardware.driver or "none",
         "torch's CUDA": hardware.torch_cuda or "none",
     }
+    return {**rows, **more} if verbose else rows
 
 
-def _kernels(kernels: Kernels) -> dict[str, str]:
+def _kernels(kernels: Kernels, on_gpu: bool, verbose: bool) -> dict[str, str]:
     compilers = (
         kernels.compiler or "no C++ compiler",
         f"nvcc {kernels.nvcc}" if kernels.nvcc else "no nvcc",
@@ -101,13 +114,17 @@ def _kernels(kernels: Kernels) -> dict[str, str]:
     )
     checks = [f"{name} differs by {error:.0e}" for name, error in kernels.self_check.items()]
     checks += [f"{name} FAILED" for name in kernels.failed]
-    return {
-        "CPU kernels": f"{kernels.built} of {kernels.wanted} built, in {kernels.folder}",
-        "gsplat's": kernels.gsplat or "not built",
-        "compilers": ", ".join(compilers),
-        "self-check": ", ".join(checks),
-        "LPIPS": "no weights" if kernels.lpips_missing else "weights are there",
-    }
+    built = f"{kernels.built} of {kernels.wanted} built"
+    if kernels.built < kernels.wanted and not on_gpu:
+        built += "; the first training builds the others, in two or three minutes"
+    rows = {"CPU kernels": f"{built}, in {kernels.folder}" if verbose else built}
+    if on_gpu:
+        rows["gsplat's"] = kernels.gsplat or "not built: the first training compiles them"
+    rows["self-check"] = ", ".join(checks)
+    if verbose:
+        rows["compilers"] = ", ".join(compilers)
+        rows["LPIPS"] = "no weights" if kernels.lpips_missing else "weights are there"
+    return rows
 
 
 def _gib(count: int) -> str:

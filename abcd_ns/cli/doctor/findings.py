@@ -91,7 +91,7 @@ def viewer(facts: Facts) -> Iterator[Finding]:
     version = facts.packages.versions.get("viser")
     if version is not None and _numbers(version) < VISER_MENDED:
         yield Finding(
-            "warning",
+            "note",
             "viewer-hole",
             f"viser {version} sends every file that you can read to whoever reaches the viewer's port, and "
             "nerfstudio listens on all networks unless told. `ns-train abcd` listens on this machine alone.",

@@ -1,7 +1,6 @@
 """`abcd plan`: what a run on these photos will need, and what would not fit."""
 
 import shutil
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,6 @@ import psutil
 import torch
 import tyro
 from jaxtyping import Float
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -54,6 +52,7 @@ def plan(
     device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0,
     max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000,
+    verbose: bool = False,
 ) -> int:
     """Say what a run on these photos will need, and what would not fit; trains nothing, writes nothing.
 
@@ -68,6 +67,7 @@ def plan(
         device_budget_gb: memory of the device that training may take; 0 takes what is free.
         max_gaussians: limit on Gaussians in the whole scene; 0 is none, and five for each point are expected.
         steps: of the run.
+        verbose: show what takes the room, and how points and views are spread over the blocks.
 
     Returns:
         0; 1 if something would not fit.
@@ -84,7 +84,7 @@ def plan(
     console = Console()
     options = (blocks, device_budget_gb, max_gaussians, steps)
     found = forecast(read(data, downscale, console), Wanted(*options), console)
-    print_forecast(found, console)
+    print_forecast(found, console, verbose)
     return 1 if found.warnings else 0
 
 
@@ -206,52 +206,50 @@ def warnings_of(
     return lines
 
 
-def print_forecast(found: Forecast, console: Console) -> None:
-    """Tables for people."""
+def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> None:
+    """A few lines and a table for people; `verbose` says where the figures come from."""
     fit = found.fit
-    console.print(f"[bold]{fit.in_words()}[/]", highlight=False)
-    if fit.blocks_at_the_end > fit.blocks:
-        console.print(
-            f"In the end {fit.blocks_at_the_end} blocks, if {fit.gaussians:,} Gaussians come of it.",
-            highlight=False,
-        )
-    if fit.blocks > 1:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-        for title in ("by block", "least", "median", "most"):
-            table.add_column(title, justify="left" if title == "by block" else "right")
-        for what, values in (("points", found.points_of_block), ("views that see it", found.views_of_block)):
-            table.add_row(what, f"{min(values):,}", f"{median(values):,.0f}", f"{max(values):,}")
-        console.print(table)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("memory and disk, at most")
-    table.add_column("GB", justify="right")
-    for title, shares in (("device", found.device), ("RAM", found.ram), ("disk", found.disk)):
-        table.add_row(f"[bold]{title}[/]", f"[bold]{_total(shares) / GB:.2f}[/]")
-        for share in shares:
-            table.add_row(f"  {share.what}", f"{share.nbytes / GB:.2f}")
-    console.print(table)
+    at_the_end = f", {fit.blocks_at_the_end} in the end" if fit.blocks_at_the_end > fit.blocks else ""
     low, high = found.hours
-    console.print(
-        f"{found.steps:,} steps of {found.batch} view{'s' * (found.batch > 1)}: {_hours(low)} with as many "
-        f"Gaussians as points, {_hours(high)} with {fit.gaussians:,}; a step on the initial points took "
-        f"{found.seconds_per_step:.3f} s.",
-        highlight=False,
-    )
+    rows = {
+        "blocks": f"{fit.blocks}{at_the_end}",
+        "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
+        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {_count(found.batch, 'view')}",
+    }
+    for title, shares, free in (
+        ("device", found.device, fit.budget),
+        ("RAM", found.ram, psutil.virtual_memory().available),
+        ("disk", found.disk, shutil.disk_usage(Path.cwd()).free),
+    ):
+        rows[title] = f"{_total(shares) / GB:.2f} GB at most, of {free / GB:.1f} GB"
+        if verbose:
+            rows |= {f"  {share.what}": f"{share.nbytes / GB:.2f} GB" for share in shares}
+    if verbose:
+        for what, values in (("points", found.points_of_block), ("views", found.views_of_block)):
+            spread = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"
+            rows[f"{what} by block"] = spread
+        rows["a step on the points"] = f"{found.seconds_per_step:.3f} s"
+        rows["limits"] = fit.in_words()
+    table = Table.grid(padding=(0, 2))
+    for name, value in rows.items():
+        table.add_row(name, value)
+    console.print(table, highlight=False)
     for line in found.warnings:
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
 
 
 def _said(console: Console, what: str, work: Callable[[], R]) -> R:
-    """Do something that may take seconds, and say what."""
-    began = time.monotonic()
+    """Do something that may take seconds, and say what meanwhile."""
     with console.status(what):
-        done = work()
-    console.print(f"{what}: {time.monotonic() - began:.1f} s", style="dim", highlight=False)
-    return done
+        return work()
 
 
 def _total(shares: tuple[Share, ...]) -> int:
     return sum(share.nbytes for share in shares)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number > 1)}"
 
 
 def _hours(hours: float) -> str:

@@ -23,6 +23,7 @@ else:
     import tomli as tomllib
 
 R = TypeVar("R")
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 class RecordError(UserError):
@@ -92,17 +93,27 @@ def read_toml(path: Path, absent: str) -> dict[str, Any]:
     """A user's options in TOML.
 
     Args:
-        absent: what to say where there is no such file.
+        path: of the file. Where there is none, `small-gpu` and `configs/small-gpu.toml` are one of ours.
+        absent: what to say where there is no such file either.
 
     Raises:
         RecordError: the file is absent, or is no TOML.
     """
+    if not path.is_file() and path.parent in (Path(), Path("configs")):
+        path = next((own for own in own_configs() if own.stem == path.name.removesuffix(".toml")), path)
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise RecordError(absent) from None
+        raise RecordError(
+            f"{absent} Those that come with abcd: {', '.join(p.stem for p in own_configs())}."
+        ) from None
     except (ValueError, OSError) as error:
         raise RecordError(f"{path} cannot be read as TOML: {error}.") from None
+
+
+def own_configs() -> list[Path]:
+    """The option files that come with abcd."""
+    return sorted(CONFIGS.glob("*.toml"))
 
 
 def read_record(path: Path, cls: type[R], schema: int) -> R:

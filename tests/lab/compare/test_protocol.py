@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, make_plan, read_options
 from abcd_ns.lab.job import METHODS, Settings
+from abcd_ns.lab.results.records import own_configs
 from abcd_ns.lab.runs.configs import trainer_config
 
 CONFIGS = [
     path
-    for path in sorted((Path(__file__).resolve().parents[3] / "configs").glob("*.toml"))
+    for path in own_configs()
     if "method = " not in path.read_text()  # those are for `abcd train`
 ]
 

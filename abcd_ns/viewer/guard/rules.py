@@ -1,4 +1,4 @@
-"""Who may talk to the viewer, and about what: rules over requests and messages. They know no server.
+"""The rules: who may talk to the viewer, and about what.
 
 A viewer on 127.0.0.1 is still open to every page in the user's browser: a page may connect a websocket to
 any address (its Origin tells), and a name that its owner points at 127.0.0.1 makes the viewer look like the
@@ -7,12 +7,13 @@ owner is us; an address needs no trust, since nobody can point an address elsewh
 """
 
 import ipaddress
+import itertools
 import math
 import re
 import socket
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 THIS_MACHINE = "127.0.0.1"
 """The host to listen on: reached from this machine alone."""
@@ -29,14 +30,6 @@ _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::[0-9]{1,5})?")
 _PATH = re.compile(r"/|(/[A-Za-z0-9_~-][A-Za-z0-9_~.,-]*)+")
 
 
-class Headers(Protocol):
-    """The header fields of a request, under names of any case."""
-
-    def get_all(self, key: str) -> list[str]:
-        """All values of a field, none if it is missing."""
-        ...
-
-
 @dataclass
 class Rules:
     """What one server answers to.
@@ -49,8 +42,12 @@ class Rules:
     host: str
     share: bool = False
 
-    def refusal(self, path: str, headers: Headers) -> str | None:
-        """Why a request is not answered, for a person to read; None if it is."""
+    def refusal(self, path: str, headers: Any) -> str | None:
+        """Why a request is not answered, for a person to read; None if it is.
+
+        Args:
+            headers: of the package websockets.
+        """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self.knows(hosts[0]):
             return f"the Host {_quoted(hosts)} is not this viewer's"
@@ -101,17 +98,15 @@ def same_origin(origin: str, host: str) -> bool:
 
 def is_camera(message: Any) -> bool:
     """Whether a camera message describes a camera; nerfstudio's training loop computes with it unseen."""
-    sizes = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}
-    vectors = [getattr(message, name, None) for name in sizes]
-    if not all(isinstance(vector, (tuple, list)) for vector in vectors):
+    vectors = [getattr(message, name, None) for name in ("wxyz", "position", "look_at", "up_direction")]
+    if [len(v) if isinstance(v, (tuple, list)) else 0 for v in vectors] != [4, 3, 3, 3]:
         return False
     aspect = getattr(message, "aspect", 1.0)  # viser 1 sends a size instead
-    numbers = [message.fov, aspect, *(x for vector in vectors for x in vector)]
+    numbers = [message.fov, aspect, *itertools.chain(*vectors)]
     if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers):
         return False
     turned = any(abs(x) > 1e-6 for x in vectors[0])
-    sized = [len(vector) for vector in vectors] == list(sizes.values())
-    return sized and turned and 0 < message.fov < math.pi and ASPECTS[0] <= aspect <= ASPECTS[1]
+    return turned and 0 < message.fov < math.pi and ASPECTS[0] <= aspect <= ASPECTS[1]
 
 
 def content_policy(hosts: Iterable[str]) -> str:

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 from websockets.datastructures import Headers
 
-from abcd_ns.viewer import request_rules as rules_module
-from abcd_ns.viewer.request_rules import Rules, content_policy, is_camera, plain_path
+from abcd_ns.viewer.guard import rules as rules_module
+from abcd_ns.viewer.guard.rules import Rules, content_policy, is_camera, plain_path
 
 
 def headers(host: str = "127.0.0.1:7007", origin: str | None = None) -> Headers:

@@ -1,0 +1,143 @@
+"""Puts the rules in front of every viser server that this process starts."""
+
+import importlib
+import inspect
+import sys
+import warnings
+from collections.abc import Callable
+from http import HTTPStatus
+from importlib.metadata import version
+from typing import Any
+
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+
+from abcd_ns.viewer.guard.rules import Rules, content_policy
+
+UNREADABLE = (AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+"""What viser's deserialisation raises on frames that are no message, beside msgspec's own errors."""
+
+_rules: dict[int, Rules] = {}
+_told: set[str] = set()
+
+
+def install() -> bool:
+    """Guard every viser server that is started from now on; harmless when done again.
+
+    Returns:
+        Whether they are guarded. If not, a warning was printed: this viser is built otherwise.
+    """
+    importlib.import_module("viser")
+    # Its private module: looked up by name, so that another viser costs a warning and no import.
+    infra = sys.modules.get("viser.infra._infra")
+    package = getattr(infra, "websockets", None)
+    if isinstance(package, _Overlay):
+        return True
+    if hasattr(infra, "WebSocketServerProtocol") and hasattr(package, "server"):  # viser 0.2
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of the older API, which is viser's choice
+            serve = package.server.serve
+        infra.websockets = _Overlay(package, server=_Overlay(package.server, serve=guarded(serve)))
+    elif hasattr(infra, "ServerConnection") and hasattr(package, "asyncio"):  # viser 1
+        server = _Overlay(package.asyncio.server, serve=guarded(package.asyncio.server.serve))
+        infra.websockets = _Overlay(package, asyncio=_Overlay(package.asyncio, server=server))
+    else:
+        CONSOLE.print(
+            f"[bold yellow]warning:[/] the viewer is unguarded: viser {version('viser')} is built otherwise "
+            "than the versions that are known. Use --vis tensorboard on a machine that others use, too."
+        )
+        return False
+    return True
+
+
+def rules_of(server: Any) -> Rules | None:
+    """The rules of a running `viser.ViserServer`; None if it was started before `install`."""
+    return _rules.get(server.get_port())
+
+
+def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
+    """`websockets.serve` behind rules for the host it listens on.
+
+    Args:
+        serve: of the older API, where requests are (path, headers) and answers tuples (viser 0.2), or of the
+            newer one, with (connection, request) and responses (viser 1).
+    """
+
+    def start(handler: Any, host: str, port: int, *, process_request: Any = None, **options: Any) -> Any:
+        rules = _rules[port] = Rules(host)
+
+        async def answer(first: Any, second: Any) -> Any:
+            older = isinstance(first, str)
+            path, headers = (first, second) if older else (second.path, second.headers)
+            if (reason := rules.refusal(path, headers)) is not None:
+                _tell(reason)
+                return (
+                    (HTTPStatus.FORBIDDEN, {}, b"403")
+                    if older
+                    else first.respond(HTTPStatus.FORBIDDEN, "403")
+                )
+            found = None if process_request is None else process_request(first, second)
+            if inspect.isawaitable(found):
+                found = await found
+            if found is None:
+                return None
+            fields = {"Content-Security-Policy": content_policy(headers.get_all("Host"))}
+            fields["X-Content-Type-Options"] = "nosniff"
+            if older:
+                return found[0], {**found[1], **fields}, found[2]
+            found.headers.update(fields)
+            return found
+
+        def read(connection: Any) -> Any:
+            return handler(_Reader(connection, rules))
+
+        return serve(read, host, port, process_request=answer, **options)
+
+    return start
+
+
+def read_message(frame: Any) -> Any:
+    """A client's frame as viser's message; None if it is none."""
+    import msgspec
+    from viser._messages import Message
+
+    if not isinstance(frame, bytes):
+        return None
+    try:
+        return Message.deserialize(frame)
+    except (*UNREADABLE, msgspec.MsgspecError):
+        return None
+
+
+class _Overlay:
+    """A module or package as it is, but for some names."""
+
+    def __init__(self, original: Any, **instead: Any) -> None:
+        self.__dict__.update(instead)
+        self._original = original
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._original, name)
+
+
+class _Reader(_Overlay):
+    """A connection that passes on only frames that are messages and that the rules admit."""
+
+    def __init__(self, connection: Any, rules: Rules) -> None:
+        super().__init__(connection, _rules=rules)
+
+    async def recv(self, *args: Any, **kwargs: Any) -> Any:
+        while True:
+            frame = await self._original.recv(*args, **kwargs)
+            message = read_message(frame)
+            if message is not None and self._rules.admits(message):
+                return frame
+            what = "a frame that is no message" if message is None else type(message).__name__
+            _tell(f"{what} is not acted on")
+
+
+def _tell(reason: str) -> None:
+    """Say once for each reason what was refused."""
+    if reason not in _told and len(_told) < 20:
+        _told.add(reason)
+        CONSOLE.print(f"The viewer refused a request: {escape(reason)}.", highlight=False)
