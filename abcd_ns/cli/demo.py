@@ -10,20 +10,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import matplotlib
 import tyro
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.pictures import draw_comparison, read_picture
+from abcd_ns.lab.compare.pictures import PictureArray, draw_comparison, psnr_of, read_picture
 from abcd_ns.lab.job import evenly
+from abcd_ns.lab.results.style import STYLE
 from abcd_ns.lab.runs.runner import take_folder
 
-SCENE = {"courts": 2, "views_per_court": 20, "width": 192, "height": 144, "points_per_court": 3000}
+SCENE = {"courts": 1, "views_per_court": 56, "width": 288, "height": 216, "points_per_court": 30_000}
+"""What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
 MARKER = "abcd-demo.txt"
 """Marks a folder that this command made."""
 SHOWN = 3
-"""Held-out views of which pictures are made."""
+"""Held-out views of which pictures with errors are made."""
+CLOSING = "court.png"
+"""A held-out view, as the photo has it and as the Gaussians draw it."""
+CLOSING_INCHES = 6.4
+"""Width of either."""
 
 
 class StepFailed(Exception):
@@ -119,7 +127,7 @@ def demo(
 
 def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Console) -> None:
     scene = out / "scene"
-    steps.begin("1/5  A scene: two walled courts, seen by 40 cameras")
+    steps.begin(f"1/5  A scene: a walled court, seen by {SCENE['views_per_court']} cameras")
     flags = [word for name, value in SCENE.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     steps.run("synth", [*_abcd("synth"), str(scene), *flags])
     steps.begin(f"2/5  Training in {blocks} blocks for {seconds:g} s")
@@ -130,7 +138,10 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     ply = out / "splat.ply"
     export = [_tool("ns-export"), "gaussian-splat", "--load-config", str(trained.config)]
     steps.run("ns-export", [*export, "--output-dir", str(out), "--output-filename", ply.name])
-    pictures = _draw(out)
+    pictures = [
+        _draw_closing(out, f"{blocks} blocks, {seconds:g} s of training on this machine"),
+        *_draw(out),
+    ]
     steps.begin("5/5  A report about the run")
     page = out / "report.html"
     steps.run("report", [*_abcd("report"), str(trained.config.parent), "--out", str(page)])
@@ -141,7 +152,8 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
         "Gaussians": f"{count_vertices(ply):,}",
         "peak RAM of training": f"{trained.peak_rss_bytes / 2**30:.2f} GiB",
         "time": f"{steps.seconds:.0f} s, training {trained.seconds:.0f} s of it",
-        "pictures": "\n".join(map(str, pictures)),
+        "the picture": str(pictures[0]),
+        "with its errors": "\n".join(map(str, pictures[1:])),
         "Gaussians for viewers": str(ply),
         "all about the run": str(page),
     }
@@ -177,17 +189,38 @@ def _evaluate(steps: Steps, out: Path, trained: Trained) -> dict[str, float]:
     return json.loads(found.read_text(encoding="utf-8"))["results"]
 
 
+def _pairs(out: Path) -> list[tuple[PictureArray, PictureArray]]:
+    """Photo and rendering of each held-out view, which ns-eval leaves side by side."""
+    wide = [read_picture(path) for path in sorted((out / "eval").glob("eval_img_*.png"))]
+    return [(pair[:, : pair.shape[1] // 2], pair[:, pair.shape[1] // 2 :]) for pair in wide]
+
+
+def _draw_closing(out: Path, how: str) -> Path:
+    """A view of average quality, large: neither the best nor the worst."""
+    pairs = sorted(_pairs(out), key=lambda pair: psnr_of(*pair))
+    photo, picture = pairs[len(pairs) // 2]
+    captions = ("held out from training", f"{how}: {psnr_of(picture, photo):.1f} dB")
+    height = CLOSING_INCHES * photo.shape[0] / photo.shape[1]
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(2 * CLOSING_INCHES, height + 0.35), layout="constrained")
+        for axes, pixels, caption in zip(figure.subplots(1, 2), (photo, picture), captions, strict=True):
+            axes.imshow(pixels, interpolation="bicubic")
+            axes.set_title(caption, fontsize=12)
+            axes.axis("off")
+        figure.savefig(out / CLOSING, dpi=150)
+    return out / CLOSING
+
+
 def _draw(out: Path) -> list[Path]:
-    """Photo, picture and error of a few held-out views, from ns-eval's photo and picture side by side."""
-    pairs = sorted((out / "eval").glob("eval_img_*.png"))
+    """Photo, picture and error of a few held-out views."""
+    pairs = _pairs(out)
     folder = out / "pictures"
     folder.mkdir(exist_ok=True)
     paths = []
     for row in evenly(len(pairs), SHOWN):
-        pair = read_picture(pairs[row])
-        width = pair.shape[1] // 2
+        photo, picture = pairs[row]
         paths.append(folder / f"view-{row:04d}.png")
-        draw_comparison(pair[:, :width], {"abcd": pair[:, width:]}, f"held-out view {row}", paths[-1])
+        draw_comparison(photo, {"abcd": picture}, f"held-out view {row}", paths[-1])
     return paths
 
 

@@ -41,7 +41,7 @@ elif name == "ns-eval":
     folder.mkdir(parents=True, exist_ok=True)
     for row in range(5):
         pair = Image.new("RGB", (64, 24), (200, 100, 50))
-        pair.paste((100, 100, 50), (32, 0, 64, 24))
+        pair.paste((100 + 20 * row, 100, 50), (32, 0, 64, 24))
         pair.save(folder / f"eval_img_{{row:04d}}.png")
     given("--output-path").write_text(json.dumps({{"results": {{"psnr": 21.5, "ssim": 0.75}}}}))
 elif name == "ns-export":
@@ -110,18 +110,30 @@ def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capf
     assert "output of ns-eval" in (out / "logs" / "ns-eval.log").read_text()
 
 
+def count_pixels(path: Path, colour: tuple[int, int, int]) -> int:
+    with Image.open(path) as image:
+        return int((np.asarray(image.convert("RGB")) == colour).all(axis=2).sum())
+
+
 @pytest.mark.usefixtures("commands")
 def test_pictures_are_photo_picture_and_error_of_views_far_apart(tmp_path, capfd):
     demo(out=tmp_path / "demo", seconds=1.0)
     paths = sorted((tmp_path / "demo" / "pictures").iterdir())
     assert [path.name for path in paths] == ["view-0000.png", "view-0002.png", "view-0004.png"]
     printed = capfd.readouterr().out
-    for path in paths:
+    for path, row in zip(paths, (0, 2, 4), strict=True):
         assert str(path) in printed
-        with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
-        for colour in ((200, 100, 50), (100, 100, 50)):
-            assert (pixels == colour).all(axis=1).sum() > 10_000
+        for colour in ((200, 100, 50), (100 + 20 * row, 100, 50)):
+            assert count_pixels(path, colour) > 10_000
+
+
+@pytest.mark.usefixtures("commands")
+def test_the_closing_picture_is_a_view_of_average_quality_beside_its_photo(tmp_path, capfd):
+    demo(out=tmp_path / "demo", seconds=1.0)
+    path = tmp_path / "demo" / "court.png"
+    assert str(path) in capfd.readouterr().out
+    for colour in ((200, 100, 50), (140, 100, 50)):  # the third of five renderings, by how far they are off
+        assert count_pixels(path, colour) > 200_000
 
 
 @pytest.mark.parametrize(

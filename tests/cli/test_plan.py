@@ -108,6 +108,7 @@ def test_the_screen_is_short_and_says_more_when_asked(capsys):
     print_forecast(found, Console(width=120))
     short = capsys.readouterr().out
     assert len(short.splitlines()) < 10
+    assert "All of it fits" in short
     for word in ("blocks", "400 points", "time", "device", "RAM", "disk"):
         assert word in short
     print_forecast(found, Console(width=120), verbose=True)

@@ -221,7 +221,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         ("RAM", found.ram, psutil.virtual_memory().available),
         ("disk", found.disk, shutil.disk_usage(Path.cwd()).free),
     ):
-        rows[title] = f"{_total(shares) / GB:.2f} GB at most, of {free / GB:.1f} GB"
+        rows[title] = f"{_total(shares) / GB:.2f} GB at most, {free / GB:.1f} GB may be taken"
         if verbose:
             rows |= {f"  {share.what}": f"{share.nbytes / GB:.2f} GB" for share in shares}
     if verbose:
@@ -236,6 +236,8 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     console.print(table, highlight=False)
     for line in found.warnings:
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
+    if not (found.warnings or verbose):
+        console.print("\nAll of it fits. What takes the room: abcd plan --verbose", highlight=False)
 
 
 def _said(console: Console, what: str, work: Callable[[], R]) -> R:

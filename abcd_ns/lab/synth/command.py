@@ -22,7 +22,7 @@ from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points
 from abcd_ns.lab.synth.world import World
 from abcd_ns.progress_bar import ProgressBar
 
-FORMAT = 1
+FORMAT = 2
 """Raised whenever the same settings would draw another scene."""
 MARKER = "synth.json"
 LIMITS = {
@@ -46,7 +46,7 @@ class Settings:
     layout: Layout = "grid"
     """Courts in a near-square grid or in one row."""
     views_per_court: int = 24
-    """Pictures taken inside each court."""
+    """Pictures taken of each court."""
     width: int = 320
     """Of the pictures, in pixels."""
     height: int = 240
@@ -118,7 +118,7 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[list[Camera]
     lens = Lens(settings.width, settings.height)
     world = World(site)
     count = settings.views_per_court
-    cameras = [c for k in range(settings.courts) for c in court_cameras(site, k, count, lens, world.caster)]
+    cameras = [c for k in range(settings.courts) for c in court_cameras(site, k, count)]
     (out / "images").mkdir(exist_ok=True)
 
     def draw(camera: Camera) -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from abcd_ns.lab.synth.geometry import Soup, patch
-from abcd_ns.lab.synth.props import CENTREPIECES, FURNITURE, Workshop, banner, column, shelter, tower
+from abcd_ns.lab.synth.props import CENTREPIECES, FURNITURE, Workshop, banner, shelter, tower
 from abcd_ns.lab.synth.textures import Color, Material, MaterialTable
 from abcd_ns.lab.synth.walls import CELL, INNER, Opening, WallFinish, wall
 
@@ -17,11 +17,11 @@ _SIDES = ((0, 1), (-1, 0), (0, -1), (1, 0))
 
 _STYLES: tuple[tuple[Color, Color, Color, tuple[float, float]], ...] = (
     # base, second (mortar), third, block size: sandstone, red brick, grey stone, lime-washed, slate
-    ((0.52, 0.42, 0.27), (0.34, 0.29, 0.21), (0.60, 0.50, 0.34), (0.62, 0.31)),
-    ((0.42, 0.17, 0.11), (0.46, 0.42, 0.36), (0.52, 0.26, 0.16), (0.42, 0.19)),
-    ((0.36, 0.37, 0.37), (0.22, 0.22, 0.21), (0.48, 0.47, 0.44), (0.70, 0.36)),
-    ((0.62, 0.56, 0.44), (0.40, 0.36, 0.29), (0.55, 0.46, 0.32), (0.55, 0.28)),
-    ((0.24, 0.29, 0.34), (0.36, 0.36, 0.35), (0.34, 0.38, 0.41), (0.50, 0.22)),
+    ((0.52, 0.42, 0.27), (0.34, 0.29, 0.21), (0.60, 0.50, 0.34), (0.90, 0.45)),
+    ((0.42, 0.17, 0.11), (0.46, 0.42, 0.36), (0.52, 0.26, 0.16), (0.70, 0.35)),
+    ((0.36, 0.37, 0.37), (0.22, 0.22, 0.21), (0.48, 0.47, 0.44), (1.00, 0.50)),
+    ((0.62, 0.56, 0.44), (0.40, 0.36, 0.29), (0.55, 0.46, 0.32), (0.80, 0.40)),
+    ((0.24, 0.29, 0.34), (0.36, 0.36, 0.35), (0.34, 0.38, 0.41), (0.80, 0.36)),
 )
 _ACCENTS: tuple[Color, ...] = (
     (0.48, 0.05, 0.05), (0.05, 0.13, 0.42), (0.55, 0.36, 0.04), (0.05, 0.27, 0.12), (0.30, 0.06, 0.30),
@@ -119,8 +119,8 @@ def build_court(site: Site, court: int, table: MaterialTable) -> Soup:
     shop = Workshop(table, rng, _ACCENTS[(court * 2 + style) % len(_ACCENTS)])
     base, mortar, third, size = _STYLES[style]
     light = tuple(min(0.7, 0.35 + 0.5 * c) for c in base)
-    trim = shop.material("stone", light, mortar, tuple(0.85 * c for c in light))
-    walls = [WallFinish(shop.material("masonry", base, mortar, third, size), trim) for _ in _SIDES]
+    trim = shop.material("clouds", light, mortar, tuple(0.85 * c for c in light))
+    walls = [WallFinish(shop.material("blocks", base, mortar, third, size), trim) for _ in _SIDES]
     height = float(rng.uniform(3.1, 3.7))
     parts = [_floor(shop)]
     for side, finish in enumerate(walls):
@@ -134,7 +134,7 @@ def build_court(site: Site, court: int, table: MaterialTable) -> Soup:
 
 def _floor(shop: Workshop) -> Soup:
     flag, pale = _FLAGS[shop.rng.integers(len(_FLAGS))]
-    side = float(shop.rng.uniform(0.55, 0.8))
+    side = float(shop.rng.uniform(0.9, 1.2))
     ground = shop.material("paving", flag, (0.16, 0.15, 0.10), pale, (side, 0.8 * side))
     h = CELL / 2
     quad = np.array([[-h, -h, 0], [h, -h, 0], [h, h, 0], [-h, h, 0]])
@@ -173,14 +173,13 @@ def _corners(shop: Workshop, finish: WallFinish, height: float) -> list[Soup]:
 
 
 def _middle(shop: Workshop, turn: int) -> list[Soup]:
-    """A centrepiece with columns or furniture about it, inside the ring that the cameras walk."""
+    """A centrepiece with furniture about it."""
     parts = [CENTREPIECES[turn % len(CENTREPIECES)](shop).placed(yaw=shop.rng.uniform(0, 1.5))]
-    things = [column] * 4 if shop.rng.random() < 0.5 else [FURNITURE[k] for k in shop.rng.integers(2, 7, 4)]
     start = shop.rng.uniform(0, np.pi / 2)
-    for k, make in enumerate(things):
+    for k, which in enumerate(shop.rng.integers(2, len(FURNITURE), 4)):
         angle = start + k * np.pi / 2 + shop.rng.uniform(-0.2, 0.2)
         place = (2.35 * np.cos(angle), 2.35 * np.sin(angle), 0.0)
-        parts.append(make(shop).placed(place, angle + np.pi / 2))
+        parts.append(FURNITURE[which](shop).placed(place, angle + np.pi / 2))
     return parts
 
 

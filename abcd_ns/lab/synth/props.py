@@ -31,23 +31,23 @@ class Workshop:
         return self.table.add(Material(kind, base, second, third, size, salt))
 
     def oak(self, plank: float = 0.18) -> int:
-        return self.material("wood", _OAK, _DARK, _PALE_OAK, (plank, 1.0))
+        return self.material("blocks", _OAK, _DARK, _PALE_OAK, (plank, 2.0))
 
     def iron(self) -> int:
-        return self.material("plain", _IRON, _IRON, _IRON)
+        return self.material("clouds", _IRON, _IRON, _IRON)
 
     def marble(self) -> int:
         warm = float(self.rng.uniform(0.85, 1.0))
-        return self.material("stone", _MARBLE, _GREY, (0.48, 0.46 * warm, 0.42 * warm))
+        return self.material("clouds", _MARBLE, _GREY, (0.48, 0.46 * warm, 0.42 * warm))
 
     def leaves(self) -> int:
         warm = float(self.rng.uniform(0.0, 0.10))
         return self.material(
-            "foliage", (0.08 + warm, 0.20, 0.04), (0.02, 0.05, 0.015), (0.22 + warm, 0.34, 0.07)
+            "clouds", (0.08 + warm, 0.20, 0.04), (0.02, 0.05, 0.015), (0.22 + warm, 0.34, 0.07), (0.4, 1.0)
         )
 
     def paint(self) -> int:
-        return self.material("plain", self.accent, self.accent, self.accent)
+        return self.material("clouds", self.accent, self.accent, self.accent)
 
 
 def barrel(shop: Workshop) -> Soup:
@@ -75,7 +75,7 @@ def crates(shop: Workshop) -> Soup:
 
 def _crate(shop: Workshop, side: float) -> Soup:
     h, bar = side / 2, 0.08
-    frame = shop.material("wood", (0.20, 0.12, 0.06), _DARK, _OAK, (0.4, 1.0))
+    frame = shop.material("blocks", (0.20, 0.12, 0.06), _DARK, _OAK, (0.4, 2.0))
     parts = [box((-h, -h, 0), (h, h, side), shop.oak(0.15), 0.9, STANDING)]
     e = h + 0.025
     for x in (-1, 1):
@@ -87,15 +87,6 @@ def _crate(shop: Workshop, side: float) -> Soup:
         parts.append(box((-h, y, side - bar), (h, y + bar, side + 0.02), frame, 1.0))
         parts.append(box((y, -h, side - bar), (y + bar, h, side + 0.02), frame, 1.0))
     return Soup.cat(parts)
-
-
-def stone_ball(shop: Workshop) -> Soup:
-    """A ball on a plinth."""
-    marble, r = shop.marble(), shop.rng.uniform(0.34, 0.45)
-    painted = shop.paint() if shop.rng.random() < 0.5 else shop.marble()
-    base = box((-0.4, -0.4, 0), (0.4, 0.4, 0.5), marble, 0.7, STANDING)
-    lip = box((-0.46, -0.46, 0.5), (0.46, 0.46, 0.6), marble, 0.5)
-    return Soup.cat([base, lip, ball(r, painted).placed((0, 0, 0.58 + r))])
 
 
 def urn(shop: Workshop) -> Soup:
@@ -110,22 +101,16 @@ def urn(shop: Workshop) -> Soup:
         (0.28, 0.6),
         (0, 0.6),
     ]
-    clay = shop.material("stone", (0.45, 0.20, 0.11), (0.30, 0.12, 0.07), (0.52, 0.27, 0.16))
+    clay = shop.material("clouds", (0.45, 0.20, 0.11), (0.30, 0.12, 0.07), (0.52, 0.27, 0.16))
     bush = blob(0.42, 0.25, shop.leaves(), shop.rng).placed((0, 0, 0.95))
     return Soup.cat([lathe(profile, clay, segments=18), bush])
 
 
 def bench(shop: Workshop) -> Soup:
     """A plank on two stones."""
-    oak, marble = shop.material("wood", _OAK, _DARK, _PALE_OAK, (0.12, 1.0)), shop.marble()
+    oak, marble = shop.material("blocks", _OAK, _DARK, _PALE_OAK, (0.12, 2.0)), shop.marble()
     legs = [box((x - 0.1, -0.2, 0), (x + 0.1, 0.2, 0.42), marble, 0.5, STANDING) for x in (-0.6, 0.6)]
     return Soup.cat([*legs, box((-0.9, -0.26, 0.42), (0.9, 0.26, 0.5), oak, 0.5)])
-
-
-def boulder(shop: Workshop) -> Soup:
-    """A rock half in the ground."""
-    rock = shop.material("stone", (0.30, 0.29, 0.27), (0.12, 0.14, 0.08), (0.42, 0.40, 0.36))
-    return blob(shop.rng.uniform(0.4, 0.6), 0.35, rock, shop.rng).placed((0, 0, 0.18))
 
 
 def bush(shop: Workshop) -> Soup:
@@ -133,23 +118,10 @@ def bush(shop: Workshop) -> Soup:
     return blob(shop.rng.uniform(0.5, 0.65), 0.3, shop.leaves(), shop.rng).placed((0, 0, 0.38))
 
 
-def column(shop: Workshop) -> Soup:
-    """A pillar with base and capital."""
-    marble, h = shop.marble(), shop.rng.uniform(2.0, 2.9)
-    shaft = [(0.24, 0.2), (0.26, 0.3), (0.22, h - 0.25), (0.3, h - 0.1)]
-    return Soup.cat(
-        [
-            box((-0.34, -0.34, 0), (0.34, 0.34, 0.2), marble, 0.7, STANDING),
-            lathe(shaft, marble, segments=18),
-            box((-0.36, -0.36, h - 0.1), (0.36, 0.36, h + 0.06), marble, 0.8),
-        ]
-    )
-
-
 def fountain(shop: Workshop) -> Soup:
     """Two bowls with water about a stem, a ball on top."""
     marble = shop.marble()
-    pool = shop.material("water", (0.05, 0.17, 0.20), (0, 0, 0), (0.13, 0.33, 0.36))
+    pool = shop.material("clouds", (0.05, 0.17, 0.20), (0, 0, 0), (0.13, 0.33, 0.36))
     rim = [
         (1.55, 0),
         (1.55, 0.1),
@@ -176,7 +148,7 @@ def fountain(shop: Workshop) -> Soup:
 
 def tree(shop: Workshop) -> Soup:
     """A trunk in a stone ring with a crown of several clumps."""
-    bark = shop.material("wood", (0.20, 0.14, 0.09), _DARK, (0.30, 0.22, 0.14), (0.09, 1.0))
+    bark = shop.material("blocks", (0.20, 0.14, 0.09), _DARK, (0.30, 0.22, 0.14), (0.2, 2.0))
     ring = [(1.05, 0), (1.05, 0.4), (0.85, 0.4), (0.85, 0.25)]
     earth = shop.material("meadow", (0, 0, 0), (0, 0, 0), (0, 0, 0))
     parts = [
@@ -190,40 +162,6 @@ def tree(shop: Workshop) -> Soup:
         out, up = (0.0, 3.5) if k == 4 else (0.7, shop.rng.uniform(2.3, 2.9))
         at = (out * np.cos(angle), out * np.sin(angle), up)
         parts.append(blob(shop.rng.uniform(0.7, 0.95), 0.3, leaves, shop.rng).placed(at))
-    return Soup.cat(parts)
-
-
-def obelisk(shop: Workshop) -> Soup:
-    """A tapering shaft on steps, a painted ball on its tip."""
-    marble = shop.marble()
-    parts = [
-        box((-s, -s, 0.22 * k), (s, s, 0.22 * k + 0.22), marble, 0.7, STANDING)
-        for k, s in enumerate((1.3, 1.0, 0.7))
-    ]
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float64)
-    shaft = shop.material("stone", (0.50, 0.34, 0.28), _DARK, (0.60, 0.45, 0.38))
-    parts.append(
-        hexahedron(corners * 0.42 + [0, 0, 0.66], corners * 0.22 + [0, 0, 3.1], shaft, 0.5, STANDING)
-    )
-    parts.append(ball(0.3, shop.paint()).placed((0, 0, 3.38)))
-    return Soup.cat(parts)
-
-
-def well(shop: Workshop) -> Soup:
-    """A brick well under a tiled roof on posts."""
-    brick = shop.material("masonry", (0.42, 0.20, 0.13), (0.45, 0.42, 0.37), (0.50, 0.28, 0.18), (0.3, 0.13))
-    roof = shop.material("tiles", (0.40, 0.13, 0.07), _DARK, (0.52, 0.22, 0.12), (0.28, 0.24))
-    dark = shop.material("water", (0.02, 0.05, 0.06), (0, 0, 0), (0.05, 0.10, 0.11))
-    oak = shop.oak()
-    parts = [
-        lathe([(0.95, 0), (0.95, 0.85), (0.7, 0.85), (0.7, 0.3)], brick, segments=20),
-        lathe([(0.72, 0.5), (0.0, 0.501)], dark, segments=20),
-        lathe([(1.35, 2.15), (0.0, 3.05)], roof, segments=20),
-        lathe([(0.0, 2.14), (1.35, 2.15)], oak, segments=20),
-        lathe([(0.09, -0.8), (0.09, 0.8)], oak, segments=10),
-    ]
-    parts[-1] = _lying(parts[-1]).placed((0, 0, 1.5))
-    parts += [box((x - 0.07, -0.07, 0), (x + 0.07, 0.07, 2.2), oak, 0.6, STANDING) for x in (-0.85, 0.85)]
     return Soup.cat(parts)
 
 
@@ -246,7 +184,7 @@ def tower(shop: Workshop, wall: int, trim: int, height: float, roofed: bool) -> 
         ),
     ]
     if roofed:
-        tile = shop.material("tiles", (0.36, 0.12, 0.08), _DARK, (0.48, 0.20, 0.12), (0.3, 0.26))
+        tile = shop.material("blocks", (0.36, 0.12, 0.08), _DARK, (0.48, 0.20, 0.12), (0.3, 0.26))
         cone = [(r + 0.19, height + 0.3), (r * 0.5, height + 1.3), (0.0, height + 2.1)]
         parts += [lathe(cone, tile, segments=18), ball(0.12, shop.paint()).placed((0, 0, height + 2.15))]
     else:
@@ -268,7 +206,7 @@ def banner(shop: Workshop, height: float) -> Soup:
 
 def shelter(shop: Workshop, width: float) -> Soup:
     """A tiled lean-to, `width` metres along x, its high edge at y = 0, coming out to y = -1.15."""
-    tile = shop.material("tiles", (0.38, 0.16, 0.09), _DARK, (0.50, 0.25, 0.14), (0.28, 0.24))
+    tile = shop.material("blocks", (0.38, 0.16, 0.09), _DARK, (0.50, 0.25, 0.14), (0.28, 0.24))
     oak, h = shop.oak(), width / 2
     base = np.array([[-h, -1.15, 1.95], [h, -1.15, 1.95], [h, 0, 2.45], [-h, 0, 2.45]], np.float64)
     roof = hexahedron(base, base + np.array([0, 0, 0.1]), tile, 0.6)
@@ -279,5 +217,5 @@ def shelter(shop: Workshop, width: float) -> Soup:
     return Soup.cat([roof, beam, *posts])
 
 
-CENTREPIECES: tuple[Callable[[Workshop], Soup], ...] = (fountain, tree, obelisk, well)
-FURNITURE: tuple[Callable[[Workshop], Soup], ...] = (barrel, crates, stone_ball, urn, bench, boulder, bush)
+CENTREPIECES: tuple[Callable[[Workshop], Soup], ...] = (fountain, tree)
+FURNITURE: tuple[Callable[[Workshop], Soup], ...] = (barrel, crates, urn, bench, bush)
