@@ -32,8 +32,8 @@ class Args:
 
     data: Path
     """A scene; its folder's name is shown."""
-    run: Path
-    """A finished run on it."""
+    run: Path | None = None
+    """A finished run on it; left out, the page of its report stays as it is."""
     downscale: int = 1
     """Divides the photos' size."""
 
@@ -79,6 +79,8 @@ def main(args: Args) -> None:
     screen("check", ["abcd", "check", "--data", data], folder)
     screen("plan", ["abcd", "plan", "--data", data, "--downscale", str(args.downscale)], folder)
     screen("doctor", ["abcd", "doctor"], folder)
+    if args.run is None:
+        return
     with tempfile.TemporaryDirectory() as scratch:
         report = Path(scratch) / "report.html"
         subprocess.run([str(BIN / "abcd"), "report", str(args.run), "--out", str(report)], check=True)

@@ -71,7 +71,8 @@ def diagnose(facts: Facts) -> Report:
 
 def _lines(facts: Facts, verbose: bool) -> Iterator[str]:
     packages = facts.packages
-    commit = f", commit {packages.commit}" if packages.commit else ""
+    number, plus, changes = (packages.commit or "").partition("+")
+    commit = f", commit {number[:10]}{plus}{changes}" if number else ""
     rows = {"abcd_ns": f"{packages.abcd_ns}{commit}; Python {packages.python}"}
     named = packages.versions if verbose else MAIN
     versions = {name: packages.versions.get(name) or "not installed" for name in named}

@@ -9,7 +9,9 @@ from abcd_ns.lab.synth.court import Site
 
 _FOCAL_PER_WIDTH = 0.72
 """Focal length over image width: a horizontal field of view of 70 degrees."""
-_GOLDEN = np.pi * (3 - np.sqrt(5))
+_TURN = 2 * np.pi * (np.sqrt(2) - 1)
+"""From one camera to the next. Eight of them, from one held-out view to the next, go around evenly as well;
+eight golden angles do not."""
 _HEIGHTS = (7.0, 10.5)
 """Metres over the ground: above all towers, so that no camera stands in anything, whatever the court."""
 
@@ -70,14 +72,13 @@ def look_at(center: NDArray, target: NDArray) -> NDArray[np.float64]:
 def court_cameras(site: Site, court: int, count: int) -> list[Camera]:
     """`count` cameras on a rising spiral above one court's walls, all looking into it.
 
-    Each turns by the golden angle from the one before: any part of the list looks from all around, and
-    what a held-out view shows is in its neighbours' views.
+    Any part of the list looks from all around, and what a held-out view shows is in its neighbours' views.
     """
     rng = site.rng("cameras", court)
     phase, middle = rng.uniform(0, 2 * np.pi), site.center(court)
     cameras = []
     for k in range(count):
-        angle, height = phase + k * _GOLDEN, np.interp((k + 0.5) / count, (0, 1), _HEIGHTS)
+        angle, height = phase + k * _TURN, np.interp((k + 0.5) / count, (0, 1), _HEIGHTS)
         radius = 11.0 - 0.3 * height + rng.uniform(-0.3, 0.3)
         at = middle + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
         target = middle + np.append(rng.uniform(-0.5, 0.5, 2), 2.0)
