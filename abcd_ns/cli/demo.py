@@ -22,7 +22,7 @@ from abcd_ns.lab.job import evenly
 from abcd_ns.lab.results.style import STYLE
 from abcd_ns.lab.runs.runner import take_folder
 
-SCENE = {"courts": 1, "views_per_court": 56, "width": 288, "height": 216, "points_per_court": 30_000}
+SCENE = {"courts": 1, "views_per_court": 56, "width": 256, "height": 192, "points_per_court": 24_000}
 """What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
 MARKER = "abcd-demo.txt"
 """Marks a folder that this command made."""
@@ -199,7 +199,7 @@ def _draw_closing(out: Path, how: str) -> Path:
     """A view of average quality, large: neither the best nor the worst."""
     pairs = sorted(_pairs(out), key=lambda pair: psnr_of(*pair))
     photo, picture = pairs[len(pairs) // 2]
-    captions = ("held out from training", f"{how}: {psnr_of(picture, photo):.1f} dB")
+    captions = ("photo, held out from training", f"{how}: {psnr_of(picture, photo):.1f} dB")
     height = CLOSING_INCHES * photo.shape[0] / photo.shape[1]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(2 * CLOSING_INCHES, height + 0.35), layout="constrained")
