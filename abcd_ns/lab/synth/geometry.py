@@ -122,27 +122,17 @@ def box(
     return hexahedron(base, base + np.array([0, 0, z1 - z0]), material, max_edge, faces)
 
 
-def lathe(
-    profile: Sequence[tuple[float, float]], material: int, segments: int = 16, smooth: bool = False
-) -> Soup:
-    """The solid that a profile of (radius, z), given from the bottom up, sweeps around the z axis.
-
-    `smooth` also rounds the shading across the profile's corners (spheres); otherwise its edges stay sharp.
-    """
+def lathe(profile: Sequence[tuple[float, float]], material: int, segments: int = 16) -> Soup:
+    """The solid that a profile of (radius, z), given from the bottom up, sweeps around the z axis."""
     rz = np.asarray(profile, np.float64)
     step = np.diff(rz, axis=0)
     length = np.linalg.norm(step, axis=1)
     slope = np.stack([step[:, 1], -step[:, 0]], axis=1) / length[:, None]
     arc = np.concatenate([[0.0], np.cumsum(length)])
     angle = np.linspace(0, 2 * np.pi, segments + 1)
-    ends = np.stack([slope, slope], axis=1)
-    if smooth:
-        joined = np.concatenate([slope[:1], slope[1:] + slope[:-1], slope[-1:]])
-        joined /= np.linalg.norm(joined, axis=1, keepdims=True)
-        ends = np.stack([joined[:-1], joined[1:]], axis=1)
     parts = []
     for k in range(len(step)):
-        ring, normal = rz[k : k + 2], ends[k]
+        ring, normal = rz[k : k + 2], slope[[k, k]]
         around = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None, :]
         points = _swept(around, ring)
         u = np.broadcast_to(angle[:, None] * rz[:, 0].max(), points.shape[:2])
@@ -157,11 +147,9 @@ def _swept(around: NDArray, rz: NDArray) -> NDArray:
     return np.concatenate([flat, np.broadcast_to(rz[None, :, 1:], (*flat.shape[:2], 1))], axis=-1)
 
 
-def ball(radius: float, material: int, rings: int = 7, segments: int = 14) -> Soup:
+def ball(radius: float, material: int) -> Soup:
     """A sphere about the origin."""
-    tilt = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
-    profile = [(max(0.0, radius * np.cos(a)), radius * np.sin(a)) for a in tilt]
-    return lathe(profile, material, segments, smooth=True)
+    return blob(radius, 0.0, material, np.random.default_rng(0))
 
 
 def blob(
