@@ -1,4 +1,4 @@
-"""`abcd export` to formats other than .ply: independent readers find the scene in them, as finely as they round."""
+"""`abcd export` to formats other than .ply: independent readers find the scene in them."""
 
 import gzip
 import io
@@ -71,23 +71,23 @@ def read_glb(path) -> tuple[dict, dict[str, np.ndarray]]:
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(count=st.integers(1, 60), seed=st.integers(0, 99), degree=st.integers(0, 3), parts=st.integers(1, 4))
 def test_a_glb_holds_the_scene_in_the_units_of_the_extension(tmp_path, count, seed, degree, parts):
-    scene = random_gaussians(count, seed, sh_degree=degree)
-    document, found = read_glb(write(tmp_path / "scene.glb", scene, ".glb", parts))
-    assert np.array_equal(found["POSITION"], scene.means.numpy())
+    made = random_gaussians(count, seed, sh_degree=degree)
+    document, found = read_glb(write(tmp_path / "scene.glb", made, ".glb", parts))
+    assert np.array_equal(found["POSITION"], made.means.numpy())
     box = document["accessors"][0]
-    assert box["min"] == scene.means.amin(0).tolist()
-    assert box["max"] == scene.means.amax(0).tolist()
-    assert np.allclose(found[f"{EXTENSION}:SCALE"], np.exp(scene.scales.numpy()), rtol=1e-6)
-    assert np.allclose(found[f"{EXTENSION}:OPACITY"], 1 / (1 + np.exp(-scene.opacities.numpy())), rtol=1e-6)
-    quats = scene.quats / scene.quats.norm(dim=1, keepdim=True)
+    assert box["min"] == made.means.amin(0).tolist()
+    assert box["max"] == made.means.amax(0).tolist()
+    assert np.allclose(found[f"{EXTENSION}:SCALE"], np.exp(made.scales.numpy()), rtol=1e-6)
+    assert np.allclose(found[f"{EXTENSION}:OPACITY"], 1 / (1 + np.exp(-made.opacities.numpy())), rtol=1e-6)
+    quats = made.quats / made.quats.norm(dim=1, keepdim=True)
     assert off(found[f"{EXTENSION}:ROTATION"][:, [3, 0, 1, 2]], quats) < 1e-6
-    assert np.array_equal(found[f"{EXTENSION}:SH_DEGREE_0_COEF_0"], scene.features_dc.numpy())
+    assert np.array_equal(found[f"{EXTENSION}:SH_DEGREE_0_COEF_0"], made.features_dc.numpy())
     harmonics = [name for name in found if ":SH_DEGREE_" in name]
     wanted = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
     assert harmonics == wanted
     for k, name in enumerate(wanted[1:]):
-        assert np.array_equal(found[name], scene.features_rest[:, k].numpy())
-    shown = (scene.features_dc * SH_C0 + 0.5).clamp(0, 1)
+        assert np.array_equal(found[name], made.features_rest[:, k].numpy())
+    shown = (made.features_dc * SH_C0 + 0.5).clamp(0, 1)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     assert np.abs(found["COLOR_0"][:, :3] / 255 - linear).max() < 0.5 / 255 + 1e-6
     primitive = document["meshes"][0]["primitives"][0]
@@ -118,7 +118,7 @@ def test_a_glb_stands_upright_in_either_frame(run, scene, tmp_path, frame):  # n
 
 def test_more_than_a_glb_can_hold_is_refused(tmp_path):
     with (
-        pytest.raises(UserError, match="and a .glb holds 4; use --by-block"),
+        pytest.raises(UserError, match=r"and a \.glb holds 4; use --by-block"),
         glb_file(tmp_path / "large.glb", 20_000_000, 3, "", Z_TO_Y),
     ):
         pass

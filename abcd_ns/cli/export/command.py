@@ -45,8 +45,8 @@ def export(
     The suffix of --out is the format. .ply is read everywhere and loses nothing; .spz, .sog and
     .compressed.ply are for the web, and 4 to 15 times smaller; .glb is glTF with KHR_gaussian_splatting.
 
-    Reads the blocks at rest; .ply and .glb are written block by block, so that no scene is too large. Also of a
-    run that was stopped or killed. Gaussians that no rasterizer draws, being too transparent, are left out.
+    Reads the blocks at rest; .ply and .glb are written block by block, so that no scene is too large.
+    Also of a run that was stopped or killed. Gaussians too transparent for any rasterizer are left out.
 
     Args:
         run: A run's folder, outputs/SCENE/METHOD/TIME.

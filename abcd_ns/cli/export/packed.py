@@ -1,4 +1,4 @@
-"""Smaller files, by the package gaussforge: .spz, .sog and .compressed.ply. It needs the whole scene at once."""
+"""Smaller files, by the package gaussforge, all at once: .spz, .sog and .compressed.ply."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 
 BYTES_AT_ONCE = 1000
-"""RAM a Gaussian of degree 3 needs while it is packed, measured: its row, and 484 to 755 bytes of the package's."""
+"""RAM that a Gaussian of degree 3 needs while it is packed: its row, and up to 755 bytes (.spz), measured."""
 
 
 def check_installed() -> None:
@@ -20,7 +20,7 @@ def check_installed() -> None:
         import gaussforge  # noqa: F401
     except ImportError as error:
         raise UserError(
-            f"This format is written by gaussforge, which is not there ({error}): pip install 'abcd-ns[export]'."
+            f"gaussforge, which writes this format, is not there ({error}): pip install 'abcd-ns[export]'."
         ) from None
 
 

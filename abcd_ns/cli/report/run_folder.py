@@ -1,6 +1,7 @@
 """A run's folder, read without trusting it: JSON, tensors, and no Python objects."""
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -24,7 +25,7 @@ from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings
+from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Plain, Settings
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 CHECKPOINTS = "nerfstudio_models"
@@ -86,11 +87,16 @@ def open_run(path: Path) -> RunFolder:
     return RunFolder(path, settings, story, checkpoint, _read_state(path / "abcd" / STORE, checkpoint))
 
 
-def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
+def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPipeline:
     """The trained model with its data, for drawing.
 
+    Args:
+        data: the folder of the photos, or its transforms.json. What the run names is not looked at: a run
+            from elsewhere could name anything.
+
     Raises:
-        UserError: the data is gone, or the run's options or checkpoint do not fit this version.
+        UserError: the data is gone, an option leads out of it, or the run's options or checkpoint do not fit
+            this version.
     """
     versions, config = run.settings.versions, _registered(run.settings.method, run.settings.reader)
     wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
@@ -98,7 +104,8 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     prefix = "pipeline."
     options = {n: v for n, v in run.settings.options.items() if n.startswith(prefix)}
     set_options(config.pipeline, {n.removeprefix(prefix): v for n, v in options.items()}, where)
-    config.pipeline.datamanager.data = Path(run.settings.data_path)
+    _check_paths(options, data, where)
+    config.pipeline.datamanager.data = data
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pipeline = config.pipeline.setup(device=device, test_mode="test")
     pipeline.eval()
@@ -107,6 +114,16 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     except (KeyError, RuntimeError) as error:
         raise UserError(f"{checkpoint.path} does not fit the options in {where}: {error}.") from None
     return pipeline
+
+
+def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
+    """Photos, masks and points are those of `data`, whatever a run's options say."""
+    folder = (data if data.is_dir() else data.parent).resolve()
+    for name, value in options.items():
+        if not name.startswith("pipeline.datamanager.") or not isinstance(value, str):
+            continue
+        if not name.endswith(".data") and not (folder / value).resolve().is_relative_to(folder):
+            raise UserError(f"{where}: {name} is {value}, outside of {folder}; nothing there is read.")
 
 
 def default_config(method: str, reader: str = OUR_READER) -> AbcdTrainerConfig | None:
