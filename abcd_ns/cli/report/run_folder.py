@@ -2,7 +2,8 @@
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -15,6 +16,7 @@ from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.parameter_store import StoreError
+from abcd_ns.engine.train.density.shedding import WEIGHED
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_record
@@ -61,6 +63,8 @@ class RunFolder:
     """None where the run ended before its first."""
     state: RunState | None
     """Where the planner stood at the checkpoint, or else when the run was last heard of."""
+    filled: Mapping[int, float] = field(default_factory=dict)
+    """By block, the pixels that a Gaussian fills in all its views, the median, as known then."""
 
 
 def find_run(path: Path) -> Path:
@@ -84,7 +88,7 @@ def open_run(path: Path) -> RunFolder:
     settings = read_record(path / "abcd" / SETTINGS_FILE, Settings, SCHEMA)
     story = read_story(path / "abcd" / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
-    return RunFolder(path, settings, story, checkpoint, _read_state(path / "abcd" / STORE, checkpoint))
+    return RunFolder(path, settings, story, checkpoint, *_read_store(path / "abcd" / STORE, checkpoint))
 
 
 def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPipeline:
@@ -170,13 +174,26 @@ def _newest(folder: Path) -> Checkpoint | None:
         raise UserError(f"{path} cannot be read ({reason}); remove it to use an earlier one.") from None
 
 
-def _read_state(folder: Path, checkpoint: Checkpoint | None) -> RunState | None:
+def _read_store(folder: Path, checkpoint: Checkpoint | None) -> tuple[RunState | None, dict[int, float]]:
     if not folder.is_dir():
-        return None
+        return None, {}
     try:
         store = ParameterStore.open(folder, read_only=True)
         if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
+        state = RunState.from_json(store.state) if store.state else None
+        views = {} if state is None else {block: n for block, n in state.views.items() if n}
+        return state, {
+            block: px for block, n in views.items() if (px := _filled(store, block, n)) is not None
+        }
     except StoreError as error:
         raise UserError(str(error)) from None
-    return RunState.from_json(store.state) if store.state else None
+
+
+def _filled(store: ParameterStore, block: int, views: int) -> float | None:
+    """Pixels; None where nobody was weighed, as by methods that keep everything."""
+    with suppress(KeyError):
+        weight, looks = store.load_names(block, [f"growth.{name}" for name in WEIGHED]).values()
+        if bool((looks > 0).any()):
+            return float((weight * views / looks)[looks > 0].median())
+    return None
