@@ -113,7 +113,9 @@ def _open(folder: Path) -> ParameterStore:
 def _tell_ram(suffix: str, count: int) -> None:
     needed = ram_needed(suffix, count)
     if needed is not None:
-        print(f"{suffix} is packed at once, in about {needed / 2**30:.1f} GiB of RAM; .ply and .glb are not.")
+        print(
+            f"{suffix} is packed at once, in about {needed / 2**20:,.0f} MiB of RAM; .ply and .glb are not."
+        )
 
 
 def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
