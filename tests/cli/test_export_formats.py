@@ -242,4 +242,6 @@ def test_spz_says_where_it_is_too_coarse_or_too_small(run, tmp_path, capsys):  #
     path.write_text(json.dumps({**known, "scale": known["scale"] / 1000}))
     with pytest.raises(UserError, match=r"\.spz reaches 2048 units .*--frame nerfstudio"):
         export(run, out=tmp_path / "huge.spz")
+    with pytest.raises(UserError, match="reaches 2048 units"):
+        export(run, out=tmp_path / "huge-parts.spz", by_block=True)
     assert not list(tmp_path.glob("huge*"))

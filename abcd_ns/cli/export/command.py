@@ -1,6 +1,7 @@
 """`abcd export`: a trained scene as a file that viewers read, whole, by block, or within a box."""
 
 import json
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -129,8 +130,12 @@ def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list
 def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
     out.mkdir()
     written = []
-    for block in _steps([block for block, count in counts.items() if count], "writing"):
-        written += _write(scene, {block: counts[block]}, out / f"block-{block:04d}{suffix}", suffix)
+    try:
+        for block in _steps([block for block, count in counts.items() if count], "writing"):
+            written += _write(scene, {block: counts[block]}, out / f"block-{block:04d}{suffix}", suffix)
+    except UserError:
+        shutil.rmtree(out)
+        raise
     return written
 
 
