@@ -83,7 +83,8 @@ def main(args: Args) -> None:
         return
     with tempfile.TemporaryDirectory() as scratch:
         report = Path(scratch) / "report.html"
-        subprocess.run([str(BIN / "abcd"), "report", str(args.run), "--out", str(report)], check=True)
+        words = ["report", str(args.run), "--data", str(args.data), "--out", str(report)]
+        subprocess.run([str(BIN / "abcd"), *words], check=True)
         page("report", report)
 
 

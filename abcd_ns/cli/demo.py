@@ -144,7 +144,8 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     ]
     steps.begin("5/5  A report about the run")
     page = out / "report.html"
-    steps.run("report", [*_abcd("report"), str(trained.config.parent), "--out", str(page)])
+    where = ["--data", str(scene), "--out", str(page)]
+    steps.run("report", [*_abcd("report"), str(trained.config.parent), *where])
     steps.begin("Done")
     facts = {
         "held-out PSNR": f"{scores['psnr']:.2f} dB",
@@ -260,10 +261,11 @@ def _print_facts(facts: dict[str, str], console: Console) -> None:
 
 
 def _print_next(config: Path, console: Console) -> None:
+    scene = config.parents[4] / "scene"
     commands = {
         f"ns-viewer --load-config {config}": "look around in it",
-        f"abcd report {config.parent}": "a page about any run, such as this one's report.html",
-        f"abcd compare --data {config.parents[4] / 'scene'} --seconds 60 --blocks 4 --out comparison": (
+        f"abcd report {config.parent} --data {scene}": "a page about any run, such as this one's report.html",
+        f"abcd compare --data {scene} --seconds 60 --blocks 4 --out comparison": (
             "hold it against training in one piece"
         ),
         "ns-train abcd --data FOLDER": "train on your own photographs (a COLMAP model or transforms.json)",

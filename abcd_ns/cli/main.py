@@ -46,7 +46,7 @@ COMMANDS = (
         "abcd_ns.cli.report.command:report",
         "show all about a training run on one HTML page",
     ),
-    Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, whole or in parts"),
+    Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
     Command(
         "compare",
         "abcd_ns.lab.compare.command:compare",

@@ -1,22 +1,23 @@
-"""`abcd export`: a trained scene as .ply files, whole, by block, or within a box."""
+"""`abcd export`: a trained scene as a file that viewers read, whole, by block, or within a box."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 import tyro
+from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
+from torch import Tensor
 
-from abcd_ns import __version__
-from abcd_ns.cli.export.ply import ply_file
+from abcd_ns.cli.export.formats import ram_needed, rounding, scene_file, suffix_of
+from abcd_ns.cli.export.glb import Z_TO_Y
 from abcd_ns.cli.export.shown import Box, Shown
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
-from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import STATE, STORE
 
@@ -24,6 +25,7 @@ TRANSFORMS = "dataparser_transforms.json"
 """nerfstudio's file that tells how the data's frame became the run's."""
 LOST_DIGITS = 1e-4
 """A rounding error that is worth a word: this share of the scene's size."""
+FAR_AWAY = ": the data's origin is far away. --frame nerfstudio keeps all digits."
 
 
 def export(
@@ -35,18 +37,22 @@ def export(
     box: Annotated[Box | None, tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="")] = None,
     frame: Literal["data", "nerfstudio"] = "data",
 ) -> int:
-    """Write a trained scene as .ply, as viewers of 3D Gaussian Splatting read it.
+    """Write a trained scene as viewers of 3D Gaussian Splatting read it: .ply, .spz, .sog, .glb.
 
     abcd export outputs/garden/abcd/TIME --out garden.ply
 
     abcd export outputs/garden/abcd/TIME --out parts --by-block
 
-    Reads the blocks at rest, one at a time, so that no scene is too large; also of a run that was stopped or
-    killed. Gaussians that no rasterizer draws, being too transparent, are left out.
+    The suffix of --out is the format. .ply is read everywhere and loses nothing; .spz, .sog and
+    .compressed.ply are for the web, and 4 to 15 times smaller; .glb is glTF with KHR_gaussian_splatting.
+
+    Reads the blocks at rest; .ply and .glb are written block by block, so that no scene is too large.
+    Also of a run that was stopped or killed. Gaussians too transparent for any rasterizer are left out.
 
     Args:
         run: A run's folder, outputs/SCENE/METHOD/TIME.
-        out: A new file; with --by-block a new folder, of which each file is a block.
+        out: A new file that ends in .ply, .compressed.ply, .spz, .sog or .glb. With --by-block a new folder,
+            of which each file is a block: .ply, or as the folder's own name ends.
         by_block: One file for each block.
         box: Only Gaussians with their means in this box, in the coordinates of `frame`.
         frame: "data" is that of the photos' poses, as COLMAP or transforms.json have them, with its scale;
@@ -56,6 +62,7 @@ def export(
         UserError: there is no run, it has nothing to show yet, or `out` exists or cannot be written.
     """
     _check(out, box)
+    suffix = suffix_of(out, ".ply" if by_block else None)
     to = _to_data(run) if frame == "data" else None
     try:
         with _open(run / STATE / STORE) as store:
@@ -63,12 +70,14 @@ def export(
             counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
             if not sum(counts.values()):
                 raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
-            written = _write_parts(scene, counts, out) if by_block else _write(scene, counts, out)
+            _tell_ram(suffix, max(counts.values()) if by_block else sum(counts.values()))
+            write = _write_parts if by_block else _write
+            written = write(scene, counts, out, suffix)
     except StoreError as error:
         raise UserError(f"{error} If the run is training, wait until it has ended.") from None
     except OSError as error:
         raise UserError(f"{out} cannot be written: {error.strerror}.") from None
-    _report(written, counts, scene)
+    _report(written, counts, scene, suffix)
     return 0
 
 
@@ -102,25 +111,37 @@ def _open(folder: Path) -> ParameterStore:
     return ParameterStore.open(folder, read_only=True)
 
 
-def _write(scene: Shown, counts: dict[int, int], out: Path) -> list[Path]:
-    with _file(scene, out, sum(counts.values())) as append:
+def _tell_ram(suffix: str, count: int) -> None:
+    needed = ram_needed(suffix, count)
+    if needed is not None:
+        print(
+            f"{suffix} is packed at once, in about {needed / 2**20:,.0f} MiB of RAM; .ply and .glb are not."
+        )
+
+
+def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
+    with scene_file(out, suffix, sum(counts.values()), scene.sh_degree, _up(scene)) as append:
         for block in _steps([block for block, count in counts.items() if count], "writing"):
             append(scene.gaussians(block))
+        rounding(suffix, scene.largest)
     return [out]
 
 
-def _write_parts(scene: Shown, counts: dict[int, int], out: Path) -> list[Path]:
+def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
     out.mkdir()
     written = []
-    for block in _steps([block for block, count in counts.items() if count], "writing"):
-        written.append(out / f"block-{block:04d}.ply")
-        with _file(scene, written[-1], counts[block]) as append:
-            append(scene.gaussians(block))
+    try:
+        for block in _steps([block for block, count in counts.items() if count], "writing"):
+            written += _write(scene, {block: counts[block]}, out / f"block-{block:04d}{suffix}", suffix)
+    except UserError:
+        shutil.rmtree(out)
+        raise
     return written
 
 
-def _file(scene: Shown, path: Path, count: int) -> AbstractContextManager[Callable[[Gaussians], None]]:
-    return ply_file(path, count, scene.sh_degree, f"abcd_ns {__version__}")
+def _up(scene: Shown) -> Float[Tensor, "3 3"]:
+    """Turns what is written so that y is up; in the run's own frame z is."""
+    return Z_TO_Y if scene.to is None else Z_TO_Y @ scene.to.rotation.T
 
 
 def _steps(blocks: Iterable[int], what: str) -> Iterator[int]:
@@ -128,13 +149,11 @@ def _steps(blocks: Iterable[int], what: str) -> Iterator[int]:
     yield from track(blocks, what, console=Console(stderr=True), transient=True, disable=len(blocks) < 2)
 
 
-def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown) -> None:
-    size = sum(path.stat().st_size for path in written) / 2**20
+def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffix: str) -> None:
+    size, count = sum(path.stat().st_size for path in written), sum(counts.values())
     where = written[0] if len(written) == 1 else f"{written[0].parent} ({len(written)} files)"
-    print(f"{where}: {sum(counts.values()):,} Gaussians, {size:.1f} MiB")
-    rounding = scene.largest * torch.finfo(torch.float32).eps
-    if rounding > LOST_DIGITS * scene.size:
-        print(
-            f"The data's origin is far away: float32, which .ply has, rounds positions to {rounding:.1g}. "
-            "--frame nerfstudio keeps all digits."
-        )
+    print(f"{where}: {count:,} Gaussians, {size / 2**20:.1f} MiB, {size / count:.0f} bytes each")
+    off = rounding(suffix, scene.largest)
+    if off > LOST_DIGITS * scene.size:
+        remedy = "; .sog and .ply are finer." if suffix == ".spz" else FAR_AWAY
+        print(f"{suffix} rounds positions to {off:.1g}, {off / scene.size:.1g} of the scene's size{remedy}")

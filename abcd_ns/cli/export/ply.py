@@ -34,31 +34,19 @@ def rows(gaussians: Gaussians) -> np.ndarray:
         gaussians.scales,
         gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True),
     )
-    return np.concatenate([value.float().cpu().numpy() for value in values], axis=1)
+    return np.concatenate([value.float().cpu().numpy() for value in values], axis=1).astype("<f4", copy=False)
+
+
+def header(count: int, sh_degree: int, comment: str) -> bytes:
+    """What stands before the rows of so many Gaussians."""
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in columns(sh_degree)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 
 
 @contextmanager
 def ply_file(path: Path, count: int, sh_degree: int, comment: str) -> Iterator[Callable[[Gaussians], None]]:
-    """Yields what takes the next Gaussians; the file appears under its name once all are in it.
-
-    Args:
-        count: how many there will be; the header says so, and comes first.
-    """
-    header = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {count}"]
-    header += [f"property float {name}" for name in columns(sh_degree)]
-    partial, written = path.with_name(path.name + ".part"), 0
-    try:
-        with partial.open("wb") as file:
-
-            def append(gaussians: Gaussians) -> None:
-                nonlocal written
-                written += len(gaussians)
-                file.write(np.ascontiguousarray(rows(gaussians), dtype="<f4").tobytes())
-
-            file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace"))
-            yield append
-        if written != count:
-            raise RuntimeError(f"{path}: {written} Gaussians, where {count} were announced")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Yields what takes the next Gaussians, `count` in all, and writes them to `path`."""
+    with path.open("wb") as file:
+        file.write(header(count, sh_degree, comment))
+        yield lambda gaussians: file.write(np.ascontiguousarray(rows(gaussians)).tobytes())

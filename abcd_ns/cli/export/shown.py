@@ -58,12 +58,12 @@ class Shown:
         """Those Gaussians."""
         found = Gaussians(**self._load(block, PARAM_NAMES))
         found = found[self._kept(self._placed(found.means), found.opacities)]
-        if self.to is None or not len(found):
+        if not len(found):
             return found
-        exact = self.to.points(found.means)
+        exact = self._placed(found.means)
         self.largest = max(self.largest, float(exact.abs().max()))
         self.size = max(self.size, float((exact.amax(0) - exact.amin(0)).max()))
-        return self.to.gaussians(found)
+        return found if self.to is None else self.to.gaussians(found)
 
     def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
         """These parameters, the means among them, of the block and of those that wait for its next visit."""

@@ -15,6 +15,10 @@ class Block:
     """From 1, as the progress line counts."""
     gaussians: int | None
     """None where there is no checkpoint."""
+    shed: int | None
+    """Gaussians taken out that filled too little of their views; None where it is not known."""
+    filled: float | None
+    """Pixels that a Gaussian fills in all its views, the median; None where nobody was weighed."""
     views: int | None
     """That it is trained on; None where it is not known."""
     visits: int
@@ -40,9 +44,12 @@ def describe_blocks(run: RunFolder) -> list[Block]:
 def _describe(run: RunFolder, block: int, gaussians: int | None) -> Block:
     visits = run.story.of_block(block)
     known = run.state.views if run.state is not None else {}
+    health = run.state.health if run.state is not None else {}
     return Block(
         number=block + 1,
         gaussians=gaussians,
+        shed=None if block not in health else health[block].shed,
+        filled=run.filled.get(block),
         views=known.get(block),
         visits=sum(visit.done for visit in visits),
         seconds=sum(visit.seconds for visit in visits),

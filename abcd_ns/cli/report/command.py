@@ -1,5 +1,6 @@
 """`abcd report`: one training run as one HTML page that needs nothing else."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -16,22 +17,28 @@ from abcd_ns.lab.runs.checks import check_ranges
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 
 PAGE_FILE = "report.html"
+NO_PHOTOS = "Held-out views and their photos are shown if their folder is named: --data {}"
 
 
 def report(
     run: Annotated[Path, tyro.conf.Positional],
     /,
     *,
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None,
     pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 3,
 ) -> int:
     """Write a page about a training run: quality, visits, memory, held-out views, blocks, settings.
 
-    The page is one file that needs no network and no other file. Held-out views are drawn anew from the
-    newest checkpoint; where the photos are gone, the page does without them.
+    abcd report outputs/garden/abcd/TIME --data garden
+
+    The page is one file that needs no network and no other file. With --data, held-out views are drawn anew
+    from the newest checkpoint and shown beside their photos.
 
     Args:
         run: A run's folder, outputs/SCENE/METHOD/TIME, as `ns-train abcd` leaves it.
+        data: The run's photos, as given to `ns-train`. Where the run says they are is not looked at, since
+            a run from elsewhere could name any folder, and the page would show what is in it.
         out: The page. Default: report.html in the run's folder.
         pictures: Held-out views to show, from the best to the worst.
 
@@ -43,7 +50,7 @@ def report(
     out = folder / PAGE_FILE if out is None else out
     _check_page(out)
     console, found = Console(), open_run(folder)
-    pipeline, notes = _load(found)
+    pipeline, notes = _load(found, data)
     held_out = None
     if pipeline is not None:
         held_out, more = _look(pipeline, pictures, console)
@@ -73,7 +80,7 @@ def _check_page(out: Path) -> None:
                 raise UserError(f"--out {out} is no page of this command; name another file.")
 
 
-def _load(run: RunFolder) -> tuple[AbcdPipeline | None, list[str]]:
+def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[str]]:
     """The trained model, or None and why there is none."""
     notes, version = [], run.settings.versions.abcd_ns
     if version != __version__:
@@ -85,8 +92,10 @@ def _load(run: RunFolder) -> tuple[AbcdPipeline | None, list[str]]:
             f"Pictures and blocks are those of the checkpoint at step {run.checkpoint.step:,}; the log "
             f"goes on to step {run.story.step:,}."
         )
+    if data is None:
+        return None, [*notes, NO_PHOTOS.format(shlex.quote(run.settings.data_path))]
     try:
-        return load_pipeline(run, run.checkpoint), notes
+        return load_pipeline(run, run.checkpoint, data), notes
     except UserError as error:
         return None, [*notes, f"Held-out views could not be drawn. {error}"]
 

@@ -170,6 +170,8 @@ def _row(block: Block) -> dict[str, Any]:
     return {
         "number": block.number,
         "gaussians": NOTHING if block.gaussians is None else f"{block.gaussians:,}",
+        "shed": NOTHING if block.shed is None else f"{block.shed:,}",
+        "filled": NOTHING if block.filled is None else f"{block.filled:.1f} px",
         "views": NOTHING if block.views is None else f"{block.views:,}",
         "visits": f"{block.visits:,}",
         "time": f"{block.seconds:.1f} s" if block.seconds else NOTHING,

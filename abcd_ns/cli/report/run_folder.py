@@ -1,7 +1,9 @@
 """A run's folder, read without trusting it: JSON, tensors, and no Python objects."""
 
 import copy
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -14,6 +16,7 @@ from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.parameter_store import StoreError
+from abcd_ns.engine.train.density.shedding import WEIGHED
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_record
@@ -24,7 +27,7 @@ from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings
+from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Plain, Settings
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 CHECKPOINTS = "nerfstudio_models"
@@ -60,6 +63,8 @@ class RunFolder:
     """None where the run ended before its first."""
     state: RunState | None
     """Where the planner stood at the checkpoint, or else when the run was last heard of."""
+    filled: Mapping[int, float] = field(default_factory=dict)
+    """By block, the pixels that a Gaussian fills in all its views, the median, as known then."""
 
 
 def find_run(path: Path) -> Path:
@@ -83,14 +88,19 @@ def open_run(path: Path) -> RunFolder:
     settings = read_record(path / "abcd" / SETTINGS_FILE, Settings, SCHEMA)
     story = read_story(path / "abcd" / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
-    return RunFolder(path, settings, story, checkpoint, _read_state(path / "abcd" / STORE, checkpoint))
+    return RunFolder(path, settings, story, checkpoint, *_read_store(path / "abcd" / STORE, checkpoint))
 
 
-def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
+def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPipeline:
     """The trained model with its data, for drawing.
 
+    Args:
+        data: the folder of the photos, or its transforms.json. What the run names is not looked at: a run
+            from elsewhere could name anything.
+
     Raises:
-        UserError: the data is gone, or the run's options or checkpoint do not fit this version.
+        UserError: the data is gone, an option leads out of it, or the run's options or checkpoint do not fit
+            this version.
     """
     versions, config = run.settings.versions, _registered(run.settings.method, run.settings.reader)
     wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
@@ -98,7 +108,8 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     prefix = "pipeline."
     options = {n: v for n, v in run.settings.options.items() if n.startswith(prefix)}
     set_options(config.pipeline, {n.removeprefix(prefix): v for n, v in options.items()}, where)
-    config.pipeline.datamanager.data = Path(run.settings.data_path)
+    _check_paths(options, data, where)
+    config.pipeline.datamanager.data = data
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     pipeline = config.pipeline.setup(device=device, test_mode="test")
     pipeline.eval()
@@ -107,6 +118,16 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint) -> AbcdPipeline:
     except (KeyError, RuntimeError) as error:
         raise UserError(f"{checkpoint.path} does not fit the options in {where}: {error}.") from None
     return pipeline
+
+
+def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
+    """Photos, masks and points are those of `data`, whatever a run's options say."""
+    folder = (data if data.is_dir() else data.parent).resolve()
+    for name, value in options.items():
+        if not name.startswith("pipeline.datamanager.") or not isinstance(value, str):
+            continue
+        if not name.endswith(".data") and not (folder / value).resolve().is_relative_to(folder):
+            raise UserError(f"{where}: {name} is {value}, outside of {folder}; nothing there is read.")
 
 
 def default_config(method: str, reader: str = OUR_READER) -> AbcdTrainerConfig | None:
@@ -153,13 +174,26 @@ def _newest(folder: Path) -> Checkpoint | None:
         raise UserError(f"{path} cannot be read ({reason}); remove it to use an earlier one.") from None
 
 
-def _read_state(folder: Path, checkpoint: Checkpoint | None) -> RunState | None:
+def _read_store(folder: Path, checkpoint: Checkpoint | None) -> tuple[RunState | None, dict[int, float]]:
     if not folder.is_dir():
-        return None
+        return None, {}
     try:
         store = ParameterStore.open(folder, read_only=True)
         if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
+        state = RunState.from_json(store.state) if store.state else None
+        views = {} if state is None else {block: n for block, n in state.views.items() if n}
+        return state, {
+            block: px for block, n in views.items() if (px := _filled(store, block, n)) is not None
+        }
     except StoreError as error:
         raise UserError(str(error)) from None
-    return RunState.from_json(store.state) if store.state else None
+
+
+def _filled(store: ParameterStore, block: int, views: int) -> float | None:
+    """Pixels; None where nobody was weighed, as by methods that keep everything."""
+    with suppress(KeyError):
+        weight, looks = store.load_names(block, [f"growth.{name}" for name in WEIGHED]).values()
+        if bool((looks > 0).any()):
+            return float((weight * views / looks)[looks > 0].median())
+    return None

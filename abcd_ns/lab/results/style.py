@@ -42,6 +42,7 @@ STYLE = {
     "axes.linewidth": 0.7,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "text.parse_math": False,  # names are anyone's: two $ in one are no formula
     "svg.fonttype": "none",  # text stays text: searchable, and set in the paper's font
     "svg.hashsalt": "abcd",  # the same chart gives the same bytes
 }

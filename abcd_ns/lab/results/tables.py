@@ -1,5 +1,6 @@
 """Results as tables: what is measured, in which words and with how many digits."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +8,7 @@ from statistics import fmean, stdev
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
@@ -175,9 +177,14 @@ def write_table(results: Results, path: Path) -> None:
 
 def markdown(table: Sequence[Sequence[str]], align: str = "---:") -> str:
     """A table, its first row the titles; `align` is that of all columns but the first."""
-    cells = [[text.replace("|", "\\|").replace("\n", " ") for text in row] for row in table]
+    cells = [[_in_cell(text) for text in row] for row in table]
     titles, *body = ("| " + " | ".join(row) + " |" for row in cells)
     return "\n".join([titles, "| --- |" + f" {align} |" * (len(cells[0]) - 1), *body])
+
+
+def _in_cell(text: str) -> str:
+    """Bars end a cell, also after a backslash that is escaped itself, and new lines a row."""
+    return re.sub(r"(\\*)\|", r"\1\1\\|", " ".join(text.splitlines()))
 
 
 def print_table(results: Results, console: Console) -> None:
@@ -190,9 +197,9 @@ def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: 
     titles, *body = table
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for i, title in enumerate(titles):
-        shown.add_column(title, justify="right" if i else "left", no_wrap=True)
+        shown.add_column(escape(title), justify="right" if i else "left", no_wrap=True)
     for row in body:
-        shown.add_row(*row)
+        shown.add_row(*map(escape, row))
     width = console.width
     # Wider than a narrow terminal rather than with numbers cut off.
     needed = Measurement.get(console, console.options.update(width=1000), shown).maximum

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import hashlib
+import json
 import re
 import shlex
 from html.parser import HTMLParser
@@ -18,9 +19,25 @@ from abcd_ns.cli.report.held_out import HeldOut, data_uri, pick
 from abcd_ns.cli.report.options import changed_options, training_command
 from abcd_ns.cli.report.page import render_page, sparkline
 from abcd_ns.cli.report.plan import make_plan, push_apart
+from abcd_ns.cli.report.run_folder import open_run
 from abcd_ns.cli.report.svg import DARK
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.lab.runs.evaluate import Drawn, HeldOutView
-from tests.cli.report.runs import made_up_held_out, made_up_run, made_up_score, made_up_settings
+from abcd_ns.nerfstudio.run.run_log import LOG_FILE
+from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
+from tests.cli.report.runs import (
+    log_lines,
+    made_up_held_out,
+    made_up_run,
+    made_up_score,
+    made_up_settings,
+    write_log,
+)
+from tests.reference.scenes import random_gaussians
 
 HOSTILE = "</title></style><script>alert(1)</script>\"'><img src=http://evil/x onerror=alert(2)>{{ 7*7 }}"
 
@@ -210,6 +227,32 @@ def test_an_unknown_method_is_told_without_defaults():
     settings = made_up_settings("my-own")
     assert changed_options(settings) == []
     assert training_command(settings) == "ns-train my-own --data made-up"
+
+
+def test_blocks_say_what_their_gaussians_fill_and_how_many_were_shed(tmp_path):
+    state = RunState(health={0: BlockHealth(visits=1, shed=1234), 1: BlockHealth()}, views={0: 4})
+    run = dataclasses.replace(made_up_run(tmp_path), state=state, filled={0: 12.34})
+    cells = Page(render_page(run, None, None, [])).texts["td"][: 3 * 10]
+    first, second, third = (cells[row + 1 : row + 3] for row in range(0, 30, 10))
+    assert (first, second, third) == (["12.3 px", "1,234"], ["-", "0"], ["-", "-"])
+
+
+def test_what_gaussians_fill_is_the_weight_that_was_added_up_over_the_views(tmp_path):
+    """Three pixels in two looks, and four views: six pixels. Who was never looked at does not count."""
+    scene = random_gaussians(6)
+    tree = build_kd(scene.means, 2)
+    rest = blocks_at_rest(tree, scene)
+    tensors, meta = rest[0]
+    count = len(tensors["means"])
+    looks = torch.full((count,), 2.0).index_fill(0, torch.tensor([0]), 0.0)
+    rest[0] = ({**tensors, "growth.weight": torch.full((count,), 3.0), "growth.looks": looks}, meta)
+    folder = tmp_path / "run"
+    (folder / "abcd").mkdir(parents=True)
+    (folder / "abcd" / SETTINGS_FILE).write_text(json.dumps(dataclasses.asdict(made_up_settings())))
+    write_log(folder / "abcd" / LOG_FILE, log_lines())
+    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
+        store.commit(rest, state=RunState(views={0: 4, 1: 4}).to_json())
+    assert open_run(folder).filled == {0: 6.0}
 
 
 def test_states_of_blocks_say_why_one_was_not_trained(tmp_path):

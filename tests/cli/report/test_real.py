@@ -30,6 +30,10 @@ def trained(tmp_path_factory) -> Path:
     return Path(trainer.base_dir)
 
 
+def photos_of(trained: Path) -> Path:
+    return trained.parents[3] / "wall"
+
+
 @pytest.fixture
 def copied(trained, tmp_path) -> Path:
     """The run again, to be damaged."""
@@ -48,7 +52,7 @@ class Canary:
 
 def test_a_run_becomes_one_page(trained, tmp_path, capsys):
     out = tmp_path / "page.html"
-    assert report(trained, out=out, pictures=2) == 0
+    assert report(trained, data=photos_of(trained), out=out, pictures=2) == 0
     page = out.read_text()
     assert page.count('type="range"') == 2
     assert len(re.findall(r'src="data:image/png', page)) == 6
@@ -61,7 +65,7 @@ def test_a_run_becomes_one_page(trained, tmp_path, capsys):
 
 def test_the_model_that_is_drawn_is_the_one_that_was_trained(trained):
     opened = open_run(trained)
-    pipeline = load_pipeline(opened, opened.checkpoint)
+    pipeline = load_pipeline(opened, opened.checkpoint, photos_of(trained))
     saved = torch.load(opened.checkpoint.path, weights_only=True)["pipeline"]
     assert torch.equal(pipeline.model.merged().means, saved["_model.gauss_params.means"])
     assert pipeline.config.blocks == 3
@@ -73,11 +77,12 @@ def test_the_model_that_is_drawn_is_the_one_that_was_trained(trained):
     assert opened.checkpoint.step == opened.story.step == 36
 
 
-def test_the_page_lies_in_the_runs_folder_unless_told_otherwise(copied):
-    assert cli.main(["report", str(copied / "config.yml"), "--pictures", "0"]) == 0
+def test_the_page_lies_in_the_runs_folder_unless_told_otherwise(copied, trained):
+    data = ["--data", str(photos_of(trained))]
+    assert cli.main(["report", str(copied / "config.yml"), *data, "--pictures", "0"]) == 0
     first = (copied / "report.html").read_text()
     assert "<input" not in first
-    assert cli.main(["report", str(copied), "--pictures", "1"]) == 0
+    assert cli.main(["report", str(copied), *data, "--pictures", "1"]) == 0
     assert "<input" in (copied / "report.html").read_text()
 
 
@@ -97,13 +102,30 @@ def test_no_object_is_made_of_what_a_folder_says(copied, tmp_path):
 
 
 def test_where_the_photos_are_gone_the_page_says_so_and_has_the_rest(copied, capsys):
-    settings = json.loads((copied / "abcd" / SETTINGS_FILE).read_text())
-    (copied / "abcd" / SETTINGS_FILE).write_text(json.dumps({**settings, "data_path": "/absent/wall"}))
-    assert report(copied) == 0
+    assert report(copied, data=Path("/absent/wall")) == 0
     page = (copied / "report.html").read_text()
     assert "Held-out views could not be drawn" in page
     assert "Chart: From above" in page
     assert "/absent/wall" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_photos_are_those_of_a_folder_that_the_user_names(trained, copied, tmp_path, capsys):
+    """Not of one that the run names: it may come from elsewhere, and the page may be handed on."""
+    path = copied / "abcd" / SETTINGS_FILE
+    settings, photos = json.loads(path.read_text()), photos_of(trained)
+    assert settings["data_path"] == str(photos)
+    assert report(copied) == 0
+    page = (copied / "report.html").read_text()
+    assert "<img" not in page
+    assert f"--data {photos}" in capsys.readouterr().out.replace("\n", " ")
+    # The run cannot lead out of the folder that is named, either.
+    secret = shutil.copytree(photos, tmp_path / "secret")
+    for value in (str(secret), "../secret"):
+        options = {**settings["options"], "pipeline.datamanager.dataparser.images_path": value}
+        path.write_text(json.dumps({**settings, "data_path": str(secret), "options": options}))
+        opened = open_run(copied)
+        with pytest.raises(UserError, match=r"images_path is .*secret, outside of .*nothing there is read"):
+            load_pipeline(opened, opened.checkpoint, photos)
 
 
 def test_a_run_that_is_still_going_on_has_a_page(copied):
@@ -154,7 +176,7 @@ def test_options_that_this_version_has_not_are_named(copied):
         path.write_text(json.dumps({**settings, "options": {**settings["options"], name: value}}))
         opened = open_run(copied)
         with pytest.raises(UserError, match=message):
-            load_pipeline(opened, opened.checkpoint)
+            load_pipeline(opened, opened.checkpoint, Path("wall"))
 
 
 def test_a_folder_above_the_run_gets_a_hint(trained):
@@ -184,8 +206,9 @@ def test_files_of_something_else_are_left_alone(trained, tmp_path):
     ids=lambda m: m.config.method_name,
 )
 def test_every_way_to_train_has_a_page(tmp_path, method):
-    trainer = run(configure(write_scene(tmp_path / "wall"), tmp_path / "out", method, steps=8))
-    assert report(Path(trainer.base_dir), pictures=1) == 0
+    photos = write_scene(tmp_path / "wall")
+    trainer = run(configure(photos, tmp_path / "out", method, steps=8))
+    assert report(Path(trainer.base_dir), data=photos, pictures=1) == 0
     page = (Path(trainer.base_dir) / "report.html").read_text()
     assert ("ordering gap" in page) == (method is not methods.abcd_monolithic)
     assert ("trained in every step" in page) == (method is methods.abcd_exact)

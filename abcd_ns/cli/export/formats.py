@@ -1,0 +1,95 @@
+"""The formats of an exported scene, chosen by the file's suffix."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns import __version__
+from abcd_ns.cli.export.glb import glb_file
+from abcd_ns.cli.export.packed import BYTES_AT_ONCE, check_installed, packed_file
+from abcd_ns.cli.export.ply import ply_file
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
+
+PACKED = (".compressed.ply", ".spz", ".sog")
+SUFFIXES = (*PACKED, ".ply", ".glb")
+"""The longer of two that fit comes first."""
+GENERATOR = f"abcd_ns {__version__}"
+SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
+"""What .spz rounds positions to, and how far from the origin they may be: 24 bits, 12 of them below one."""
+
+
+def suffix_of(path: Path, missing: str | None = None) -> str:
+    """Which of SUFFIXES the path has; what begins with a dot and has no letters before it has none.
+
+    Args:
+        missing: what a path without any suffix has.
+
+    Raises:
+        UserError: it has another, or the package that writes it is not there.
+    """
+    found = next((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), missing)
+    if found is None:
+        raise UserError(f"--out {path} must end in one of {', '.join(sorted(SUFFIXES))}.")
+    if found in PACKED:
+        check_installed()
+    return found
+
+
+def ram_needed(suffix: str, count: int) -> int | None:
+    """Bytes to write so many Gaussians; None where they are written part by part."""
+    return count * BYTES_AT_ONCE if suffix in PACKED else None
+
+
+def rounding(suffix: str, largest: float) -> float:
+    """By how much positions may be off whose largest coordinate is this.
+
+    Raises:
+        UserError: the format cannot hold it.
+    """
+    if suffix != ".spz":
+        return largest * torch.finfo(torch.float32).eps
+    if largest >= SPZ_REACH:
+        raise UserError(
+            f".spz reaches {SPZ_REACH:.0f} units from the origin, and the scene {largest:,.0f}; "
+            "use --frame nerfstudio, or another format."
+        )
+    return SPZ_STEP / 2
+
+
+@contextmanager
+def scene_file(
+    path: Path, suffix: str, count: int, sh_degree: int, up: Float[Tensor, "3 3"]
+) -> Iterator[Callable[[Gaussians], None]]:
+    """Yields what takes the next Gaussians; the file appears under its name once all are in it.
+
+    Args:
+        suffix: of SUFFIXES.
+        count: how many there will be; most formats say so at their beginning.
+        up: turns the Gaussians' frame so that y is up.
+    """
+    partial, written = path.with_name(path.name + ".part"), 0
+    if suffix == ".ply":
+        made = ply_file(partial, count, sh_degree, GENERATOR)
+    elif suffix == ".glb":
+        made = glb_file(partial, count, sh_degree, GENERATOR, up)
+    else:
+        made = packed_file(partial, count, sh_degree, suffix[1:], GENERATOR)
+    try:
+        with made as append:
+
+            def counted(gaussians: Gaussians) -> None:
+                nonlocal written
+                written += len(gaussians)
+                append(gaussians)
+
+            yield counted
+            if written != count:
+                raise RuntimeError(f"{path}: {written} Gaussians, where {count} were announced")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,158 @@
+"""glTF in one file (.glb) with KHR_gaussian_splatting, written part by part as .ply is.
+
+The extension is Khronos', https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos: points with
+linear scales, opacities from 0 to 1, quaternions (x, y, z, w), and a vector of three colours for each
+spherical harmonic. A viewer that does not know it shows points in their colours (COLOR_0).
+"""
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import accumulate
+from math import isqrt
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.frames import quaternion
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
+
+EXTENSION = "KHR_gaussian_splatting"
+Z_TO_Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+"""From nerfstudio's frame, in which z is up, to glTF's, in which y is."""
+_FLOAT, _BYTE = 5126, 5121
+_LARGEST = 2**32
+"""Bytes: the file tells its length in 32 bits."""
+_SPARE = 256
+"""Bytes kept free in the JSON for the corners of the box, which are known last."""
+
+
+class Attribute(NamedTuple):
+    """What each Gaussian has."""
+
+    name: str
+    kind: str
+    width: int
+    component: int = _FLOAT
+
+    @property
+    def stride(self) -> int:
+        """Bytes a Gaussian."""
+        return self.width * (4 if self.component == _FLOAT else 1)
+
+
+def attributes(sh_degree: int) -> list[Attribute]:
+    """In the order of the file."""
+    return [
+        Attribute("POSITION", "VEC3", 3),
+        Attribute("COLOR_0", "VEC4", 4, _BYTE),
+        Attribute(f"{EXTENSION}:ROTATION", "VEC4", 4),
+        Attribute(f"{EXTENSION}:SCALE", "VEC3", 3),
+        Attribute(f"{EXTENSION}:OPACITY", "SCALAR", 1),
+        *(
+            Attribute(f"{EXTENSION}:SH_DEGREE_{isqrt(k)}_COEF_{k - isqrt(k) ** 2}", "VEC3", 3)
+            for k in range((sh_degree + 1) ** 2)
+        ),
+    ]
+
+
+def values(gaussians: Gaussians) -> list[np.ndarray]:
+    """For `attributes`, each [n, width]."""
+    opacities = gaussians.opacities.sigmoid()
+    quats = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
+    found = [
+        gaussians.means,
+        quats[:, [1, 2, 3, 0]],
+        gaussians.scales.exp(),
+        opacities,
+        gaussians.features_dc,
+        *gaussians.features_rest.unbind(1),
+    ]
+    arrays = [value.float().cpu().numpy().astype("<f4") for value in found]
+    color = torch.cat((_linear(gaussians.features_dc * SH_C0 + 0.5), opacities), dim=1)
+    return [arrays[0], (color * 255).round().to(torch.uint8).cpu().numpy(), *arrays[1:]]
+
+
+def _linear(color: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Of sRGB: COLOR_0 is linear."""
+    color = color.clamp(0, 1)
+    return torch.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+
+
+@contextmanager
+def glb_file(
+    path: Path, count: int, sh_degree: int, comment: str, up: Float[Tensor, "3 3"]
+) -> Iterator[Callable[[Gaussians], None]]:
+    """Yields what takes the next Gaussians, `count` in all, and writes them to `path`.
+
+    Args:
+        up: turns the frame that the Gaussians are in, so that y is up. A node of the file says it: the
+            values stay those of that frame.
+
+    Raises:
+        UserError: they are too many for one file.
+    """
+    parts = attributes(sh_degree)
+    starts = list(accumulate((part.stride * count for part in parts), initial=0))
+    document = _document(parts, starts, count, comment, up)
+    words = 4 * -(-(len(json.dumps(document)) + _SPARE) // 4)
+    head, total = 12 + 8 + words + 8, 12 + 8 + words + 8 + starts[-1]
+    if total >= _LARGEST:
+        raise UserError(
+            f"{count:,} Gaussians are {total / 2**30:.1f} GiB and a .glb holds 4; use --by-block."
+        )
+    done, low, high = 0, np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+    with path.open("wb") as file:
+        file.truncate(total)
+
+        def append(gaussians: Gaussians) -> None:
+            nonlocal done, low, high
+            found = values(gaussians)
+            for part, start, value in zip(parts, starts, found, strict=False):
+                file.seek(head + start + done * part.stride)
+                file.write(np.ascontiguousarray(value).tobytes())
+            done += len(gaussians)
+            low, high = np.minimum(low, found[0].min(0)), np.maximum(high, found[0].max(0))
+
+        yield append
+        document["accessors"][0] |= {"min": low.tolist(), "max": high.tolist()}
+        file.seek(0)
+        file.write(struct.pack("<4sIII4s", b"glTF", 2, total, words, b"JSON"))
+        file.write(json.dumps(document).encode().ljust(words))
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+
+
+def _document(
+    parts: list[Attribute], starts: list[int], count: int, comment: str, up: Float[Tensor, "3 3"]
+) -> dict[str, Any]:
+    w, x, y, z = quaternion(up).tolist()
+    primitive = {
+        "mode": 0,
+        "attributes": {part.name: number for number, part in enumerate(parts)},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": comment},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": part.stride * count, "target": 34962}
+            for part, start in zip(parts, starts, strict=False)
+        ],
+        "accessors": [
+            {"bufferView": number, "componentType": part.component, "count": count, "type": part.kind}
+            | ({"normalized": True} if part.component == _BYTE else {})
+            for number, part in enumerate(parts)
+        ],
+    }

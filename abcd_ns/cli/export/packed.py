@@ -1,0 +1,64 @@
+"""Smaller files, by the package gaussforge, all at once: .spz, .sog and .compressed.ply."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from abcd_ns.cli.export.ply import columns, header, rows
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
+
+BYTES_AT_ONCE = 1000
+"""RAM that a Gaussian of degree 3 needs while it is packed: its row, and up to 755 bytes (.spz), measured."""
+
+
+def check_installed() -> None:
+    """Raises UserError where gaussforge is not there."""
+    try:
+        import gaussforge  # noqa: F401
+    except ImportError as error:
+        raise UserError(
+            f"gaussforge, which writes this format, is not there ({error}): pip install 'abcd-ns[export]'."
+        ) from None
+
+
+@contextmanager
+def packed_file(
+    path: Path, count: int, sh_degree: int, kind: str, comment: str
+) -> Iterator[Callable[[Gaussians], None]]:
+    """Yields what takes the next Gaussians, `count` in all, and writes them to `path` when all are there.
+
+    Args:
+        kind: "spz", "sog" or "compressed.ply".
+
+    Raises:
+        UserError: the package cannot write them.
+    """
+    import gaussforge
+
+    table, done = np.empty((count, len(columns(sh_degree))), dtype="<f4"), 0
+
+    def append(gaussians: Gaussians) -> None:
+        nonlocal done
+        table[done : done + len(gaussians)] = rows(gaussians)
+        done += len(gaussians)
+
+    yield append
+    if kind == "compressed.ply":
+        _transpose(table, sh_degree)
+    whole = header(count, sh_degree, comment) + table.tobytes()
+    del table
+    found = gaussforge.GaussForge().convert(whole, "ply", kind)
+    if "error" in found:
+        raise UserError(f"{path} cannot be written: gaussforge says {found['error']}.")
+    path.write_bytes(found["data"])
+
+
+def _transpose(table: np.ndarray, sh_degree: int) -> None:
+    """Undo in advance what gaussforge 0.6 does to a .compressed.ply: it writes red, green, blue of a harmonic
+    together, where readers expect all of red, then of green and of blue, as in .ply."""
+    first, rest = columns(sh_degree).index("f_dc_2") + 1, 3 * ((sh_degree + 1) ** 2 - 1)
+    harmonics = table[:, first : first + rest]
+    harmonics[:] = harmonics.reshape(len(table), -1, 3).transpose(0, 2, 1).reshape(harmonics.shape)
