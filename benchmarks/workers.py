@@ -25,7 +25,6 @@ import tyro
 
 from abcd_ns import methods
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.ray_workers import RayWorkers, Shared
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded, WorkersSeen
 from abcd_ns.lab.runs.evaluate import mean_psnr
 
@@ -117,7 +116,7 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     trainer.setup()
     row, coordinator = Row(workers), trainer.pipeline.coordinator
     coordinator.announce.subscribe(Watch(row, coordinator, kills, args.seed))
-    waiting = _count_waiting(row)
+    waiting = _count_waiting(row) if workers > 1 else [0.0]
     began = time.perf_counter()
     trainer.train()
     ended = time.perf_counter()
@@ -130,6 +129,8 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
 
 def _count_waiting(row: Row) -> list[float]:
     """From now on count what the driver waits, seconds, and the bytes that it puts into the store."""
+    from abcd_ns.cluster.ray_workers import RayWorkers, Shared  # by now Ray's environment is set
+
     waiting, wait, of = [0.0], RayWorkers.wait, Shared.of
 
     def timed(self: RayWorkers, seconds: float):
@@ -139,7 +140,7 @@ def _count_waiting(row: Row) -> list[float]:
         finally:
             waiting[0] += (time.perf_counter() - began) * bool(row.began)
 
-    def counted(value) -> Shared:
+    def counted(value) -> object:
         row.lent += value.nbytes
         return of(value)
 

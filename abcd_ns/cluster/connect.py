@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import secrets
+import sys
 from contextlib import suppress
 from typing import Any
 
@@ -10,6 +11,8 @@ from abcd_ns.cluster.lease import WorkersError
 
 MISSING = "Workers need Ray, which is not installed: pip install 'abcd-ns[cluster]'."
 LOOPBACK = "127.0.0.1"
+ON_LOOPBACK = ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+"""Without it Ray takes an interface that others can reach, whatever address it is given."""
 STARTS = 3
 """Attempts to start Ray, which gives its own processes half a minute: little on a machine that is busy."""
 
@@ -61,12 +64,20 @@ def keep_to_ourselves(starts: bool) -> None:
 
     Args:
         starts: whether a cluster is started here.
+
+    Raises:
+        WorkersError: it was imported before.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault(
         "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0"
     )  # no GPU asked for: leave the others alone
+    if starts and "ray" in sys.modules and os.environ.get(ON_LOOPBACK[0]) != ON_LOOPBACK[1]:
+        raise WorkersError(
+            "Ray was imported before workers were asked for, and would listen to strangers: set "
+            f"{'='.join(ON_LOOPBACK)} and RAY_AUTH_MODE=token in the environment."
+        )
     if starts:
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # else it takes an interface others can reach
+        os.environ.update([ON_LOOPBACK])

@@ -160,6 +160,12 @@ def test_a_stranger_without_the_token_is_refused():
     assert "WorkersError: No Ray cluster answers" in found.stderr
 
 
+def test_ray_that_was_imported_before_is_not_trusted_to_keep_to_this_machine(monkeypatch):
+    monkeypatch.delenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
+    with pytest.raises(WorkersError, match="would listen to strangers: set RAY_ENABLE"):
+        keep_to_ourselves(starts=True)
+
+
 def test_where_ray_is_not_installed_one_line_says_so(monkeypatch):
     monkeypatch.setattr(connecting.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(WorkersError, match=r"pip install 'abcd-ns\[cluster\]'"):
