@@ -25,7 +25,7 @@ import tyro
 
 from abcd_ns import methods
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.engine.events import Event, StepTaken, VisitEnded, WorkersSeen
+from abcd_ns.engine.events import Event, StepTaken, VisitBegan, VisitEnded, WorkersSeen
 from abcd_ns.lab.runs.evaluate import mean_psnr
 
 
@@ -54,7 +54,7 @@ class Row:
     workers: int
     kills: int = 0
     began: float = 0.0
-    """When the first block was lent."""
+    """When the first visit to a block began."""
     seconds: float = 0.0
     """From then to the end."""
     visits: int = 0
@@ -79,10 +79,9 @@ class Watch:
         row, trainer = self._row, self._trainer
         if isinstance(event, VisitEnded) and event.block is not None:
             row.visits += 1
+        if isinstance(event, VisitBegan) and event.block is not None:
+            row.began = row.began or time.perf_counter()
         if isinstance(event, WorkersSeen):
-            row.began = row.began or (
-                time.perf_counter() if any(w.block is not None for w in event.workers) else 0.0
-            )
             row.deaths = [worker.deaths for worker in event.workers]
         if isinstance(event, (WorkersSeen, StepTaken)) and self._moments and isinstance(trainer, Dispatcher):
             pids = trainer.workers.pids if trainer.trains_elsewhere else []
