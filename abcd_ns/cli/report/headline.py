@@ -35,8 +35,18 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
             _clock(story.seconds),
             more=f"{share:.0%} for layers" if story.layer_seconds else "",
         ),
+        *_workers(story),
         *_memory(run),
     ]
+
+
+def _workers(story: Story) -> list[Fact]:
+    if not story.workers:
+        return []
+    deaths = sum(worker.deaths for worker in story.workers)
+    waited = sum(worker.waited for worker in story.workers) / len(story.workers)
+    lost = f", {deaths} lost" if deaths else ""
+    return [Fact("workers", f"{len(story.workers)}", more=f"waited {waited:.0%} of the time{lost}")]
 
 
 def _quality(story: Story, held_out: HeldOut | None) -> list[Fact]:

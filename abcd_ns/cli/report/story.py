@@ -20,6 +20,7 @@ from abcd_ns.nerfstudio.run.log_lines import (
     TrainingLine,
     VisitEndLine,
     VisitLine,
+    WorkerLine,
 )
 
 L = TypeVar("L", bound=Line)
@@ -60,6 +61,8 @@ class Story:
     visits: tuple[Visit, ...]
     sweeps: tuple[SweepEndLine, ...]
     held_out: tuple[HeldOutLine, ...]
+    workers: tuple[WorkerLine, ...]
+    """At the end; none where one process trained."""
     """Those with a PSNR."""
     end: EndLine | None
     """None where the run is still going on, or was killed."""
@@ -125,6 +128,7 @@ def read_story(path: Path) -> Story:
         samples=_of(lines, SampleLine),
         visits=_join_visits(lines),
         sweeps=_of(lines, SweepEndLine),
+        workers=_of(lines, WorkerLine),
         held_out=tuple(line for line in _of(lines, HeldOutLine) if line.psnr is not None),
         end=ends[-1] if ends else None,
         moments=tuple((line.step, line.seconds) for line in lines),

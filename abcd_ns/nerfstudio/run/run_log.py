@@ -205,7 +205,7 @@ def past_of(coordinator: Trainer, log: Path) -> list[str]:
             line = json.loads(text)
             # A visit that began after the checkpoint begins once more, at the same step.
             again = line["kind"] == "visit" and line["visit"] >= state.visit
-            if line["step"] <= state.step and line["kind"] != "end" and not again:
+            if line["step"] <= state.step and line["kind"] not in ("end", "worker") and not again:
                 # The clock goes on from the commit, and what was said of it came after.
                 line["seconds"] = min(line["seconds"], round(coordinator.stopwatch.seconds, 3))
                 kept.append(json.dumps(line))

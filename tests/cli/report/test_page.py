@@ -15,11 +15,13 @@ import torch
 from abcd_ns.cli.report import held_out as held_out_module
 from abcd_ns.cli.report.blocks import describe_blocks
 from abcd_ns.cli.report.charts import smoothed
+from abcd_ns.cli.report.headline import headline
 from abcd_ns.cli.report.held_out import HeldOut, data_uri, pick
 from abcd_ns.cli.report.options import changed_options, training_command
 from abcd_ns.cli.report.page import render_page, sparkline
 from abcd_ns.cli.report.plan import make_plan, push_apart
 from abcd_ns.cli.report.run_folder import open_run
+from abcd_ns.cli.report.story import read_story
 from abcd_ns.cli.report.svg import DARK
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -30,6 +32,7 @@ from abcd_ns.lab.runs.evaluate import Drawn, HeldOutView
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from tests.cli.report.runs import (
+    line,
     log_lines,
     made_up_held_out,
     made_up_run,
@@ -88,6 +91,16 @@ def test_the_headline_says_what_was_measured(tmp_path):
         assert value in said
     assert "not ended: still running, or broken off" in text
     assert "2026-01-02 03:04 UTC" in text
+
+
+def test_the_headline_counts_workers_where_there_were_any(tmp_path):
+    run = made_up_run(tmp_path)
+    ends = [{"worker": 0, "deaths": 1, "waited": 0.25}, {"worker": 1, "deaths": 0, "waited": 0.05}]
+    lines = [*log_lines(), *(line("worker", 40, 16.0, visits=2, **end) for end in ends)]
+    story = read_story(write_log(tmp_path / "workers.jsonl", lines))
+    facts = {fact.name: fact for fact in headline(dataclasses.replace(run, story=story), None)}
+    assert (facts["workers"].value, facts["workers"].more) == ("2", "waited 15% of the time, 1 lost")
+    assert "workers" not in {fact.name for fact in headline(run, None)}
 
 
 def test_without_pictures_the_last_evaluation_of_the_log_stands_in(tmp_path):
