@@ -114,6 +114,7 @@ def test_a_worker_that_is_killed_takes_nothing_along(steady, lent, photos):
     assert equal(whole_scene(lent), steady[0])
 
 
+@pytest.mark.slow
 def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos, monkeypatch):
     """As behind a cut cable: it lives, and whatever it may still say counts no more."""
     monkeypatch.setattr(ray_workers, "SILENCE", 3.0)

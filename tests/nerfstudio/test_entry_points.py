@@ -10,7 +10,7 @@ import pytest
 
 from tests.test_house_rules import PACKAGE_FILES, PYPROJECT, ROOT
 
-NEEDED = ("viser", "msgspec", "cv2", "fcntl", "safetensors", "pytorch_msssim")
+NEEDED = ("viser", "cv2", "fcntl", "safetensors", "pytorch_msssim")
 NOT_NEEDED = ("embreex", "trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray")
 SCRIPT = """
 import json, sys

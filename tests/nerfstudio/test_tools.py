@@ -304,7 +304,7 @@ def test_a_scene_that_nerfstudios_colmap_reader_reads_trains_as_ours_does(data, 
     assert isinstance(config.pipeline.datamanager.dataparser, ColmapDataParserConfig)
     assert "psnr" in evaluated(theirs.base_dir, tmp_path)
     found = open_run(theirs.base_dir)
-    assert isinstance(load_pipeline(found, found.checkpoint).model, AbcdModel)
+    assert isinstance(load_pipeline(found, found.checkpoint, data).model, AbcdModel)
     again = shlex.split(training_command(found.settings).replace("\\\n", ""))
     assert again[again.index("colmap") :] == ["colmap", "--colmap-path", "sparse/0"]
 

@@ -74,7 +74,7 @@ def test_a_step_is_the_one_that_a_single_process_takes(make, photos):
     loss = shared.loss(batch, rendered.pictures, [photos(s.view.index, s.crop) for s in batch.samples])
     loss.backward()
     order = shared.visit.steps._order_of(shared.state.active, 1)
-    helped = [shared.steps._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
+    helped = [shared.visit.steps._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
     alone.next_batch()
     every = type(batch)(0, (*batch.samples, *helped))
     drawn = alone.render(every)
@@ -98,7 +98,7 @@ def test_what_density_control_counts_is_that_of_all_views(make, photos):
     own = shared.density.count(shared.params["means"], rendered.infos)
     found = {name: own[name] + part.counts[name] for name in own}
     alone.next_batch()
-    helped = [shared.steps._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
+    helped = [shared.visit.steps._sample(view, 2 + k, 0) for k, view in enumerate(order[:2])]
     every = type(batch)(0, (*batch.samples, *helped))
     drawn = alone.render(every)
     alone.loss(every, drawn.pictures, [photos(s.view.index, s.crop) for s in every.samples]).backward()
@@ -130,7 +130,7 @@ def test_a_step_of_the_warm_up_is_the_one_that_a_single_process_takes(make, phot
         drawn.append([s.view.index for s in batch.samples])
     (own,), both = drawn
     assert shared.state.active.crew == 2
-    assert both == [own, *shared.steps._views_of_step(shared.state.active, (), 3, member=1)]
+    assert both == [own, *shared.visit.steps._views_of_step(shared.state.active, (), 3, member=1)]
     assert len(set(both)) == 2
     for name in PARAM_NAMES:
         found, expected = shared.params[name].grad, alone.params[name].grad
