@@ -65,8 +65,12 @@ class Trainer(ABC):
         return False
 
     def await_step(self) -> None:
-        """Return when one more step of the run has been taken, or the run is finished."""
-        raise NotImplementedError
+        """Return when one more step of the run has been taken, or the run is finished.
+
+        Raises:
+            RuntimeError: steps are not taken elsewhere.
+        """
+        raise RuntimeError("steps are taken here: call next_batch")
 
     def dismiss(self) -> None:  # noqa: B027 - most have nobody
         """End whoever trains elsewhere."""
