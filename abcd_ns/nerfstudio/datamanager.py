@@ -17,6 +17,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
@@ -139,6 +141,14 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def photo(self, row: int, crop: Crop) -> torch.Tensor:
         """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""
         return self._pixels("photo", row, self.train_dataset.photos.image, crop).float() / 255
+
+    def target(self, sample: Sample) -> Target:
+        """What a sample is trained on where no model is asked: helpers and workers have none."""
+        shot = sample.view.index, sample.crop
+        photo = self.photo(*shot)
+        if photo.shape[-1] == 4:  # as splatfacto's model composites
+            photo = photo[..., 3:] * photo[..., :3] + (1 - photo[..., 3:]) * sample.background
+        return photo, self.mask(*shot)
 
     def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
         """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""

@@ -29,8 +29,7 @@ from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.splitting import cut_at_rest
-from abcd_ns.engine.train.step.batch import Rendered, Sample
-from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
@@ -220,7 +219,7 @@ class AbcdPipeline(VanillaPipeline):
         if run.config.recipe.overlap > 0:
             return independent_trainer(run)
         source = LayerSource(run, self._room_for_layers())
-        coordinator = Coordinator(run, source=source, target=self._target)
+        coordinator = Coordinator(run, source=source, target=self.datamanager.target)
         if self._lends and run.scene.tree.num_blocks > 1:
             return dispatcher_for(coordinator, asked.config, self._budget)
         return coordinator
@@ -249,12 +248,6 @@ class AbcdPipeline(VanillaPipeline):
         """As asked for; where RAM is short, one, since each reads blocks for itself."""
         asked = self.config.training.processes
         return asked or int(self.config.ram_budget_gb > 0)
-
-    def _target(self, sample: Sample) -> Target:
-        """What a helper trains on; the training process gets the same by way of `next_train`."""
-        shot = sample.view.index, sample.crop
-        photo = self.model.photo_on(self.datamanager.photo(*shot), sample.background)
-        return photo, self.datamanager.mask(*shot)
 
     def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
         """The limits that were fitted to the device: as the run began, unless it goes on with a budget of

@@ -7,7 +7,6 @@ from functools import partial
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
 
 from abcd_ns.cluster.connect import check_installed, connect
 from abcd_ns.cluster.dispatcher import Dispatcher
@@ -18,8 +17,6 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.memory import PHOTO_SHARE
 from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.engine.train.step.batch import Sample
-from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.errors import UserError
 
 BLOCKS_EACH = 2
@@ -103,16 +100,4 @@ def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int)
         )
     data.device_photo_bytes = device_photo_bytes
 
-    def target(sample: Sample) -> Target:
-        shot = sample.view.index, sample.crop
-        return _on_background(data.photo(*shot), sample.background), data.mask(*shot)
-
-    return VisitWorker(setup, make_rasterizer(config.pipeline.model.rasterizer, device), target, device)
-
-
-def _on_background(photo: Tensor, background: Tensor) -> Tensor:
-    """What a picture on this background should be, [h, w, 3]."""
-    if photo.shape[-1] == 3:
-        return photo
-    alpha = photo[..., 3:]
-    return alpha * photo[..., :3] + (1 - alpha) * background.to(photo)
+    return VisitWorker(setup, make_rasterizer(config.pipeline.model.rasterizer, device), data.target, device)
