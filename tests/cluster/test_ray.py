@@ -114,16 +114,15 @@ def test_a_worker_that_is_killed_takes_nothing_along(steady, lent, photos):
     assert equal(whole_scene(lent), steady[0])
 
 
-@pytest.mark.slow
 def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos, monkeypatch):
     """As behind a cut cable: it lives, and whatever it may still say counts no more."""
-    monkeypatch.setattr(ray_workers, "SILENCE", 3.0)
+    monkeypatch.setattr(ray_workers, "SILENCE", 8.0)  # a busy machine may take seconds to answer
     lost = []
     lent.announce.subscribe(lambda e: lost.append(e.why) if isinstance(e, WorkerLost) else None)
     lent_first(lent)
     os.kill(lent.workers.pids[0], signal.SIGSTOP)
     train(lent, photos)
-    assert lost == ["silent for 3 s"]
+    assert lost == ["silent for 8 s"]
     assert equal(whole_scene(lent), steady[0])
 
 
