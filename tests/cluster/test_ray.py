@@ -98,6 +98,7 @@ def deaths(workers: RayWorkers) -> int:
 def test_two_processes_make_of_a_run_what_one_makes_of_it(steady, lent, photos):
     seen = []
     lent.announce.subscribe(lambda e: seen.append(e.workers) if isinstance(e, WorkersSeen) else None)
+    lent_first(lent)
     train(lent, photos)
     assert equal(whole_scene(lent), steady[0])
     assert any(all(worker.block is not None for worker in workers) for workers in seen)
@@ -127,10 +128,11 @@ def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos, monkeypatc
 
 
 def lent_first(run: Dispatcher) -> None:
-    """Have both workers at it."""
-    while len(run.state.in_flight) < 2:
+    """Have both workers at it, however long they took to begin."""
+    while run.workers.idle < 2:
         run.workers.wait(0.1)
-        run._lend()
+    run._lend()
+    assert len(run.state.in_flight) == 2
 
 
 @pytest.mark.usefixtures("workers")
