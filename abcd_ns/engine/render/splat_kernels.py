@@ -4,6 +4,8 @@ Every function is elementwise along its last dimension, so that a compiler fuses
 quantities, columns are Gaussians (or bands). See `kernels.Kernel`.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -54,19 +56,22 @@ def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> tuple
     Colours are max(0, SH(direction) + 0.5), linear, not clamped from above. Covariances come as dot products
     of projected axes: never indefinite, and cheaper. Columns with radius 0 are finite and without meaning.
     """
-    return (torch.stack(_graded_rows(parameters, camera, bounds=True)),)
+    return (torch.stack(_graded_rows(parameters.unbind(0), camera, bounds=True)),)
 
 
 def splat_backward(
     parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"], grad: Float[Tensor, "g n"]
 ) -> tuple[Float[Tensor, "p n"]]:
-    """Gradient of `parameters` from that of the GRADED rows; everything else is computed again."""
-    _, pull = torch.func.vjp(lambda rows: torch.stack(_graded_rows(rows, camera, bounds=False)), parameters)
-    return pull(grad)
+    """Gradient of `parameters` from that of the GRADED rows; everything else is computed again.
+
+    Row by row: the gradient of a slice of a matrix is as large as the matrix, and there are a hundred slices.
+    """
+    _, pull = torch.func.vjp(lambda *rows: _graded_rows(rows, camera, bounds=False), *parameters.unbind(0))
+    return (torch.stack(pull(list(grad.unbind(0)))),)
 
 
-def _graded_rows(parameters: Tensor, camera: Tensor, bounds: bool) -> list[Tensor]:
-    x, y, z, *scales, qw, qx, qy, qz, logit = parameters[:11].unbind(0)
+def _graded_rows(parameters: Sequence[Tensor], camera: Tensor, bounds: bool) -> list[Tensor]:
+    x, y, z, *scales, qw, qx, qy, qz, logit = parameters[:11]
     number = camera.unbind(0)
     rotation, (tx, ty, tz) = number[:9], number[9:12]
     fx, fy, cx, cy, width, height, antialiased = number[12:19]
@@ -121,7 +126,7 @@ def _camera_axes(
     ]
 
 
-def _colors(harmonics: Tensor, direction: list[Tensor], in_use: tuple[Tensor, ...]) -> list[Tensor]:
+def _colors(harmonics: Sequence[Tensor], direction: list[Tensor], in_use: tuple[Tensor, ...]) -> list[Tensor]:
     bases = sh_basis_rows(*direction)
     # Multiplied, not left out: coefficients of degrees not in use get a gradient of zeros, as gsplat gives
     # them; Adam counts such steps.

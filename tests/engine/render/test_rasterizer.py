@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
+from abcd_ns.engine.render.cpu import binning
 from abcd_ns.engine.render.cpu.binning import bin_splats
 from abcd_ns.engine.render.projection import project
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -44,6 +45,22 @@ def by_pixel(window: ZWindow) -> torch.Tensor:
     """(near, far) of each pixel, [2, h, w]."""
     planes = torch.stack((window.near, window.far))[:, None]
     return window.grid.to_image(planes.expand(-1, window.grid.pixels_per_tile, -1))
+
+
+@pytest.mark.parametrize("together", [1, 7, 53])
+def test_how_many_tiles_are_drawn_together_changes_nothing_but_rounding(together, monkeypatch):
+    """Early stops, narrowing and dropped tiles included: some Gaussians are all but opaque."""
+    gaussians = random_gaussians(60)
+    image, grads = gradients(lambda g: EAGER(g, VIEW, sh_degree=1), gaussians)
+    weights = EAGER.depth_window(gaussians, VIEW, crop=VIEW.full, visible=0.9)
+    monkeypatch.setattr(binning, "TILES_AT_ONCE", together)
+    lists = bin_splats(project(gaussians, VIEW), TileGrid(VIEW.full, 4), 8)
+    assert len(lists.groups) == math.ceil(lists.tiles.numel() / together) > 1
+    found, found_grads = gradients(lambda g: EAGER(g, VIEW, sh_degree=1), gaussians)
+    torch.testing.assert_close(found, image, rtol=1e-12, atol=1e-13)
+    assert all(relative_error(found_grads[name], grads[name]) < 1e-11 for name in PARAM_NAMES)
+    found = EAGER.depth_window(gaussians, VIEW, crop=VIEW.full, visible=0.9)
+    torch.testing.assert_close(torch.stack((found.near, found.far)), torch.stack((weights.near, weights.far)))
 
 
 @pytest.mark.parametrize(

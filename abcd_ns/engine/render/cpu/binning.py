@@ -22,22 +22,28 @@ from abcd_ns.engine.render.z_window import ZWindow
 
 SHRINK = 0.875
 """A level is narrowed once fewer than this share of its tiles still have Gaussians to draw."""
+TILES_AT_ONCE = 2400
+"""Tiles side by side in a level, at most: what the kernels hold of more would not fit into a core's cache."""
 
 
 @dataclass(frozen=True)
 class Level:
     """The n-th chunk of every tile that has so many: `width` tiles side by side, `chunk` Gaussians deep.
 
-    Its slots are `start` + lane * width + column; column j belongs to `TileLists.tiles[j]`.
+    Its slots are `start` + lane * width + column; column j belongs to `TileLists.tiles[first + j]`.
     """
 
     start: int
     width: int
+    first: int
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """For each tile its Gaussians, front to back, cut into chunks and laid out level by level."""
+    """For each tile its Gaussians, front to back, cut into chunks and laid out level by level.
+
+    Tiles with lists of like length are one group, drawn to its end before the next one is begun.
+    """
 
     sheet: TileSheet
     chunk: int
@@ -47,7 +53,8 @@ class TileLists:
     """The rank that stands in each slot; m, one past the last, in slots that no Gaussian fills."""
     tiles: Int[Tensor, "a"]
     """The tiles that have any Gaussians, longest list first."""
-    levels: tuple[Level, ...]
+    groups: tuple[tuple[Level, ...], ...]
+    """The levels of each group of tiles; a group's first level is as wide as the group."""
     slots: Int[Tensor, "q"]
     """Where each (Gaussian, tile) pair stands; the pairs of one Gaussian are neighbours, by rank."""
     bags: Int[Tensor, "m"]
@@ -114,19 +121,34 @@ def _only(pairs: _Pairs, keep: Bool[Tensor, "q"]) -> _Pairs:
     return _Pairs(rank, tile, kept_before.index_select(0, pairs.bags))
 
 
-def _levels(n_chunks: list[int], chunk: int) -> tuple[Level, ...]:
-    """Levels for tiles whose numbers of chunks are given, largest first."""
+def _levels(n_chunks: list[int], chunk: int, start: int, first: int) -> tuple[Level, ...]:
+    """Levels for tiles whose numbers of chunks are given, largest first.
+
+    Args:
+        start: slot of the first level.
+        first: of the tiles, see Level.
+    """
     levels: list[Level] = []
-    start, remaining = 0, len(n_chunks)
-    width = remaining
-    for depth in range(n_chunks[0] if n_chunks else 0):
+    width = remaining = len(n_chunks)
+    for depth in range(n_chunks[0]):
         while n_chunks[remaining - 1] <= depth:
             remaining -= 1
         if remaining < SHRINK * width:
             width = remaining
-        levels.append(Level(start, width))
+        levels.append(Level(start, width, first))
         start += chunk * width
     return tuple(levels)
+
+
+def _groups(n_chunks: list[int], chunk: int) -> tuple[int, tuple[tuple[Level, ...], ...]]:
+    """(tiles of a group, the last one's excepted; the levels of each group)."""
+    size = math.ceil(len(n_chunks) / max(math.ceil(len(n_chunks) / TILES_AT_ONCE), 1))
+    groups: list[tuple[Level, ...]] = []
+    start = 0
+    for first in range(0, len(n_chunks), max(size, 1)):
+        groups.append(_levels(n_chunks[first : first + size], chunk, start, first))
+        start = groups[-1][-1].start + chunk * groups[-1][-1].width
+    return size, tuple(groups)
 
 
 def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], sheet: TileSheet, chunk: int) -> TileLists:
@@ -136,25 +158,26 @@ def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], sheet: TileSheet, chunk: int
     counts = torch.bincount(pairs.tile, minlength=n_tiles)
     n_chunks, tiles = ((counts + chunk - 1) // chunk).sort(descending=True, stable=True)
     used = int((n_chunks > 0).sum())
-    levels = _levels(n_chunks[:used].tolist(), chunk)
+    size, groups = _groups(n_chunks[:used].tolist(), chunk)
+    levels = [level for group in groups for level in group]
     column = torch.empty_like(tiles)
     column[tiles] = torch.arange(n_tiles, device=device)
 
     place = torch.arange(n_pairs, device=device) - _exclusive_cumsum(counts).index_select(0, sorted_tile)
     starts = torch.tensor([level.start for level in levels], dtype=torch.long, device=device)
     widths = torch.tensor([level.width for level in levels], dtype=torch.long, device=device)
-    depth, lane = torch.div(place, chunk, rounding_mode="floor"), place % chunk
-    slot = (
-        starts.index_select(0, depth)
-        + lane * widths.index_select(0, depth)
-        + column.index_select(0, sorted_tile)
-    )
+    before = torch.tensor([0, *map(len, groups)], dtype=torch.long, device=device).cumsum(0)
+    column = column.index_select(0, sorted_tile)
+    group = torch.div(column, max(size, 1), rounding_mode="floor")
+    level = before.index_select(0, group) + torch.div(place, chunk, rounding_mode="floor")
+    across = (place % chunk) * widths.index_select(0, level)
+    slot = starts.index_select(0, level) + across + column - group * size
 
     n_slots = levels[-1].start + chunk * levels[-1].width if levels else 0
     ranks = torch.full((n_slots,), len(rows), dtype=torch.long, device=device)
     ranks.index_copy_(0, slot, pairs.rank.index_select(0, order))
     slots = torch.empty_like(slot).index_copy_(0, order, slot)
-    return TileLists(sheet, chunk, rows, ranks, tiles[:used], levels, slots, pairs.bags)
+    return TileLists(sheet, chunk, rows, ranks, tiles[:used], groups, slots, pairs.bags)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Alpha compositing of projected Gaussians as one differentiable function of bounded memory."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from abcd_ns.engine.render.cpu.binning import TileLists
+from abcd_ns.engine.render.cpu.binning import Level, TileLists
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels
 from abcd_ns.engine.render.cpu.torch_kernels import (
     ALL_GRADIENTS,
@@ -36,14 +36,14 @@ class Job:
     """Gets an attribute `absgrad` in the backward pass: means2d [v, n, 2] of the first v n splats."""
 
 
-@dataclass
-class _Trace:
-    """What the forward pass leaves for the backward pass."""
+class _Drawn(NamedTuple):
+    """A level of a group of tiles, as it was drawn."""
 
-    columns: list[Tensor | None] = field(default_factory=list)
-    """Per level, which of its columns were drawn; None means all."""
-    states: list[Tensor] = field(default_factory=list)
-    """Per level, the state before it."""
+    level: Level
+    columns: Tensor | None
+    """Which of its columns; None means all."""
+    state: Tensor
+    """Before it."""
 
 
 def _initial_state(lists: TileLists, dtype: torch.dtype) -> Float[Tensor, "5 p a"]:
@@ -61,40 +61,49 @@ def _live_columns(state: Float[Tensor, "s p a"]) -> Int[Tensor, "b"] | None:
     return live if live.numel() < COMPACT * state.shape[2] else None
 
 
-def _level_ranks(lists: TileLists, index: int, columns: Tensor | None) -> Int[Tensor, "k a"]:
-    level = lists.levels[index]
+def _level_ranks(lists: TileLists, level: Level, columns: Tensor | None) -> Int[Tensor, "k a"]:
     ranks = lists.ranks[level.start : level.start + lists.chunk * level.width].view(lists.chunk, level.width)
     return ranks if columns is None else ranks.index_select(1, columns)
 
 
-def _take(planes: Tensor, width: int, columns: Tensor | None) -> Tensor:
+def _take(planes: Tensor, level: Level, columns: Tensor | None) -> Tensor:
     """The columns of a level from planes [..., a] that hold all tiles' columns."""
-    return planes[..., :width].contiguous() if columns is None else planes.index_select(-1, columns)
+    planes = planes[..., level.first : level.first + level.width]
+    return planes.contiguous() if columns is None else planes.index_select(-1, columns)
 
 
-DrawChunk = Callable[[int, Tensor | None, Float[Tensor, "s p a"]], Float[Tensor, "s p a"]]
+DrawChunk = Callable[[Level, Tensor | None, Float[Tensor, "s p a"]], Float[Tensor, "s p a"]]
 """(level, columns, state) -> the state after that level's chunk; no columns are all of the level's."""
 
 
 def _walk(lists: TileLists, state: Float[Tensor, "s p a"], draw: DrawChunk) -> Float[Tensor, "s p a"]:
-    """All levels front to back, for as long as a tile has unfinished pixels. Returns the last states."""
-    columns, final = None, state.clone()
-    for index, level in enumerate(lists.levels):
-        if columns is not None and level.width < lists.levels[index - 1].width:
+    """All groups, one after the other. Returns the last states."""
+    states = [_walk_group(levels, _take(state, levels[0], None), draw) for levels in lists.groups]
+    return torch.cat(states, dim=2) if states else state
+
+
+def _walk_group(
+    levels: Sequence[Level], state: Float[Tensor, "s p a"], draw: DrawChunk
+) -> Float[Tensor, "s p a"]:
+    """A group's levels front to back, for as long as a tile has unfinished pixels."""
+    columns, final, width = None, state.clone(), state.shape[2]
+    for level in levels:
+        if columns is not None and level.width < width:
             keep = int((columns < level.width).sum())
             final.index_copy_(2, columns[keep:], state[..., keep:])
             columns, state = columns[:keep], state[..., :keep].contiguous()
         elif level.width < state.shape[2]:
             final[..., level.width : state.shape[2]] = state[..., level.width :]
             state = state[..., : level.width].contiguous()
+        width = level.width
         live = _live_columns(state)
         if live is not None:
-            held = torch.arange(level.width, device=state.device) if columns is None else columns
+            held = torch.arange(width, device=state.device) if columns is None else columns
             final.index_copy_(2, held, state)
             columns, state = held[live], state.index_select(2, live)
         if state.shape[2] == 0:
             break
-        state = draw(index, columns, state)
+        state = draw(level, columns, state)
     if columns is None:
         final[..., : state.shape[2]] = state
     else:
@@ -104,16 +113,15 @@ def _walk(lists: TileLists, state: Float[Tensor, "s p a"], draw: DrawChunk) -> F
 
 def _composite(
     job: Job, table: Tensor, origins: Float[Tensor, "2 a"], keep_states: bool
-) -> tuple[Float[Tensor, "5 p a"], _Trace]:
-    """Draw all levels. Returns the final state of every tile and the trace."""
-    lists, trace = job.lists, _Trace()
+) -> tuple[Float[Tensor, "5 p a"], list[_Drawn]]:
+    """Draw all levels. Returns the final state of every tile and, if kept, what was drawn."""
+    lists, trace = job.lists, list[_Drawn]()
 
-    def draw(index: int, columns: Tensor | None, state: Tensor) -> Tensor:
+    def draw(level: Level, columns: Tensor | None, state: Tensor) -> Tensor:
         if keep_states:
-            trace.columns.append(columns)
-            trace.states.append(state)
-        params = gather_params(table, _level_ranks(lists, index, columns))
-        return job.kernels.forward(params, _take(origins, lists.levels[index].width, columns), state)
+            trace.append(_Drawn(level, columns, state))
+        params = gather_params(table, _level_ranks(lists, level, columns))
+        return job.kernels.forward(params, _take(origins, level, columns), state)
 
     return _walk(lists, _initial_state(lists, table.dtype), draw), trace
 
@@ -134,8 +142,8 @@ class Composite(torch.autograd.Function):
         planes = final.new_zeros((STATE_PLANES, sheet.pixels_per_tile, sheet.tiles))
         planes[0] = 1.0
         planes.index_copy_(2, lists.tiles, torch.cat((final[:1].abs(), final[1:])))
-        ctx.job, ctx.columns = job, trace.columns
-        ctx.save_for_backward(table, origins, final, *trace.states)
+        ctx.job, ctx.drawn = job, [(drawn.level, drawn.columns) for drawn in trace]
+        ctx.save_for_backward(table, origins, final, *(drawn.state for drawn in trace))
         return planes
 
     @staticmethod
@@ -146,7 +154,8 @@ class Composite(torch.autograd.Function):
         tiled = grad.index_select(2, lists.tiles)
         total = (final[1:] * tiled[1:]).sum(dim=0) + final[0].abs() * tiled[0]
         upstream = torch.cat((tiled[1:], total[None]))
-        per_slot = _slot_gradients(job, table, origins, upstream, ctx.columns, states)
+        trace = [_Drawn(*drawn, state) for drawn, state in zip(ctx.drawn, states, strict=True)]
+        per_slot = _slot_gradients(job, table, origins, upstream, trace)
         sums = sum_bags(per_slot, lists.slots, lists.bags)
         if job.absgrad_target is not None:
             target = job.absgrad_target
@@ -155,27 +164,27 @@ class Composite(torch.autograd.Function):
         return _to_parameters(table[:, :-1], sums), None
 
 
-def _slot_gradients(job: Job, table, origins, upstream, all_columns, states) -> Float[Tensor, "s g"]:
+def _slot_gradients(
+    job: Job, table: Tensor, origins: Tensor, upstream: Tensor, trace: list[_Drawn]
+) -> Float[Tensor, "s g"]:
     """The backward kernel's sums for every slot; 0 for slots that early stopping left out."""
     lists = job.lists
     kept = GRADIENTS if job.absgrad_target is None else ALL_GRADIENTS
     per_slot = table.new_zeros((lists.ranks.numel(), kept))
-    for index, (columns, state) in enumerate(zip(all_columns, states, strict=True)):
-        level = lists.levels[index]
-        params = gather_params(table, _level_ranks(lists, index, columns))
-        level_origins, level_upstream = (_take(x, level.width, columns) for x in (origins, upstream))
+    for level, columns, state in trace:
+        params = gather_params(table, _level_ranks(lists, level, columns))
+        level_origins, level_upstream = (_take(x, level, columns) for x in (origins, upstream))
         sums = job.kernels.backward(params, level_origins, state, level_upstream)
-        _put(per_slot, lists, index, columns, sums[:kept].reshape(kept, -1).T)
+        _put(per_slot, level, columns, sums[:kept].reshape(kept, -1).T)
     return per_slot
 
 
-def _put(per_slot: Tensor, lists: TileLists, index: int, columns: Tensor | None, by_slot: Tensor) -> None:
+def _put(per_slot: Tensor, level: Level, columns: Tensor | None, by_slot: Tensor) -> None:
     """Write what a level's chunk gave for some columns to their slots."""
-    level = lists.levels[index]
     if columns is None:
         per_slot[level.start : level.start + by_slot.shape[0]] = by_slot
     else:
-        lanes = torch.arange(lists.chunk, device=columns.device) * level.width
+        lanes = torch.arange(by_slot.shape[0] // columns.numel(), device=columns.device) * level.width
         per_slot.index_copy_(0, (level.start + lanes[:, None] + columns).view(-1), by_slot)
 
 
@@ -185,11 +194,10 @@ def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
     table, origins = _table(drawn[: OPACITY + 1], job)
     per_slot = table.new_zeros(lists.ranks.numel())
 
-    def weigh(index: int, columns: Tensor | None, state: Tensor) -> Tensor:
-        params = gather_params(table, _level_ranks(lists, index, columns))
-        level_origins = _take(origins, lists.levels[index].width, columns)
-        state, weights = job.kernels.weigh(params, level_origins, state)
-        _put(per_slot, lists, index, columns, weights.reshape(-1))
+    def weigh(level: Level, columns: Tensor | None, state: Tensor) -> Tensor:
+        params = gather_params(table, _level_ranks(lists, level, columns))
+        state, weights = job.kernels.weigh(params, _take(origins, level, columns), state)
+        _put(per_slot, level, columns, weights.reshape(-1))
         return state
 
     _walk(lists, _initial_state(lists, table.dtype)[:1], weigh)
