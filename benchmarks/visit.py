@@ -21,6 +21,8 @@ from typing import Any, Protocol
 
 import torch
 import tyro
+from jaxtyping import Float
+from torch import Tensor
 from torch.profiler import ProfilerActivity
 
 from abcd_ns.data.dataset import AbcdDataset
@@ -38,6 +40,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
@@ -159,7 +162,7 @@ def begin(
         *nothing_live(3, device),
         device=device,
     )
-    return Coordinator(run, target=lambda sample: (capture.photo(sample.view.index, sample.crop), None))
+    return Coordinator(run, target=lambda sample: (_shown(sample, capture.photo), None))
 
 
 def run(
@@ -202,13 +205,17 @@ def run(
     return clock
 
 
+def _shown(sample: Sample, photo: PhotoReader) -> Float[Tensor, "h w 3"]:
+    return sample.reduced(photo(sample.view.index, sample.source))
+
+
 def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> None:
     """training_loop.train_step with a clock."""
     with clock.stage("plan and attach"):
         batch = coordinator.next_batch()
     crew = coordinator.state.active.crew
     with clock.stage("photos"):
-        photos = [photo(sample.view.index, sample.crop).to(coordinator.device) for sample in batch.samples]
+        photos = [_shown(sample, photo).to(coordinator.device) for sample in batch.samples]
     with clock.stage("render"):
         rendered = coordinator.render(batch)
     with clock.stage("loss"):

@@ -105,6 +105,10 @@ class Crop:
     def pixels(self) -> int:
         return self.width * self.height
 
+    def enlarged(self, by: int) -> "Crop":
+        """The same part of an image that is `by` times as wide and as high."""
+        return Crop(self.x * by, self.y * by, self.width * by, self.height * by)
+
     def within(self, outer: "Crop") -> "Crop":
         """The same pixels, counted from the upper left corner of `outer`."""
         return Crop(self.x - outer.x, self.y - outer.y, self.width, self.height)
@@ -124,6 +128,8 @@ class View:
     """Which camera of the training set this is; names its layers and its photo."""
     near: float = NEAR_PLANE
     """Gaussians whose mean has a smaller camera z are not drawn; world units."""
+    reduction: int = 1
+    """A pixel is a square of so many pixels of the photo, wide and high."""
 
     @property
     def full(self) -> Crop:
@@ -134,6 +140,14 @@ class View:
     def center(self) -> Float[Tensor, "3"]:
         """The camera's centre in world space: -R^T t."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def reduced(self, by: int) -> "View":
+        """The same camera with pixels `by` times as wide; a last column or row that is not whole goes."""
+        if by == 1:
+            return self
+        size = {"width": self.width // by, "height": self.height // by}
+        scale = self.K.new_tensor([[1 / by], [1 / by], [1.0]])
+        return replace(self, K=self.K * scale, reduction=self.reduction * by, **size)
 
     def to(self, *args, **kwargs) -> "View":
         """As Tensor.to, for both matrices."""

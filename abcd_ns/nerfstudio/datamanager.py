@@ -144,11 +144,15 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def target(self, sample: Sample) -> Target:
         """What a sample is trained on where no model is asked: helpers and workers have none."""
-        shot = sample.view.index, sample.crop
-        photo = self.photo(*shot)
+        photo, mask = self.shown(sample)
         if photo.shape[-1] == 4:  # as splatfacto's model composites
             photo = photo[..., 3:] * photo[..., :3] + (1 - photo[..., 3:]) * sample.background
-        return photo, self.mask(*shot)
+        return photo, mask
+
+    def shown(self, sample: Sample) -> Target:
+        """What a sample's crop shows of the photo and of the mask, in the crop's pixels."""
+        shot = sample.view.index, sample.source
+        return sample.reduced(self.photo(*shot)), sample.reduced_mask(self.mask(*shot))
 
     def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
         """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""
@@ -178,10 +182,8 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         rows = [sample.view.index for sample in samples.samples]
         camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
-        crops = [sample.crop for sample in samples.samples]
-        photos = [self.photo(row, crop) for row, crop in zip(rows, crops, strict=True)]
+        photos, masks = map(list, zip(*map(self.shown, samples.samples), strict=True))
         batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
-        masks = [self.mask(row, crop) for row, crop in zip(rows, crops, strict=True)]
         if any(mask is not None for mask in masks):
             batch["mask"] = masks
         return camera, batch

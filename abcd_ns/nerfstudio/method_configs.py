@@ -26,6 +26,7 @@ PAPER = TrainingConfig(
     heal=False,
     ssim_lambda=0.0,
     point_pixels=0.0,
+    coarse=0.0,
     density=DensityConfig(price=0.0),
 )
 """What Shiu and Subr 2026 did, as far as it is published; docs/reference.md says where it is not."""

@@ -99,10 +99,10 @@ class ExactTrainer(Trainer):
         """Set the learning rate and say what to train on next: whole views, or random parts."""
         self.stopwatch.start()
         self._pace.set(self.batch, exponential_decay(self.progress, 1.0, self.config.means_lr_decay))
-        step, rows = self.state.step, tuple(sorted(self.views))
-        samples = []
+        step, views = self.state.step, self.run.views_at(self.run.reduction)
+        rows, samples = tuple(sorted(views)), []
         for place in range(self.batch):
-            view = self.views[endless_order(rows, step * self.batch + place, self.config.seed)]
+            view = views[endless_order(rows, step * self.batch + place, self.config.seed)]
             behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
             crop = part_to_draw(self.config, view.full, step, place)
             share = crop.pixels / view.full.pixels

@@ -33,6 +33,9 @@ class TrainingConfig:
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
+    coarse: float = 0.2
+    """Share of the run that is trained on reduced pictures: its first half at a quarter of their width, then
+    at a half, where no side is below 100 pixels then. 0 for none."""
     visit_views: int = 32
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
     first_passes: int = 8
@@ -82,6 +85,7 @@ class TrainingConfig:
         recipe = self.recipe
         for name, fits, words in (
             ("warmup", 0 <= self.warmup < 1, "from 0 to below 1"),
+            ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
             ("influence-share", self.influence_share > 0, "above 0"),
             ("window-weight", 0 <= self.window_weight < 1, "from 0 to below 1"),
         ):

@@ -44,9 +44,10 @@ class LayerSource:
         run, config = self._run, self._run.config
         if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
             return None
+        views_in_use = run.views_at(active.reduction)
         painter = Painter(
             self._around(),
-            list(run.views.values()),
+            list(views_in_use.values()),
             run.rasterizer,
             ownership=config.recipe.ownership,
             pass_gaussians=config.limits.pass_gaussians or default_pass(run.scene),
@@ -57,7 +58,7 @@ class LayerSource:
             LayerStore(run.device, self.room.device // active.crew, self.room.ram // active.crew),
             active.geometry,
             run.scene.gaussians_at_rest(active.geometry.block),
-            run.views,
+            views_in_use,
             PaintSettings(active.sh_degree, config.antialiased),
             window_weight=config.window_weight,
         )

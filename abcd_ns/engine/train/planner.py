@@ -72,9 +72,7 @@ class Planner:
         self._run = run
         self._config, self._budget, self._scene = run.config, run.budget, run.scene
         self._views = run.views
-        side = run.rasterizer.window_side
-        self._frusta = Frusta(((view, view.full) for view in self._views.values()), side)
-        self._optics = Optics(list(self._views.values()), side)
+        self._culling: dict[int, tuple[Frusta, Optics]] = {}
 
     def begin(self) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
@@ -124,13 +122,16 @@ class Planner:
             plan = self._next_plan(state)
             if self._is_hidden(state, plan.block) and state.sweep % LOOK_AGAIN:
                 continue
-            geometry = self._survey(plan.block)
+            reduction = self._run.reduction
+            geometry = self._survey(plan.block, reduction)
             kept = self._worth_training(state, geometry)
             state.views[plan.block] = len(kept)
             if kept and self._scene.tree.num_blocks == 1:
                 return self._sole_visit(state, plan.block, kept, sh_degree, began)
             if kept:
-                return self._visit(state, plan, geometry, kept, sh_degree, began)
+                active = self._visit(state, plan, geometry, kept, sh_degree, began)
+                active.reduction = reduction
+                return active
 
     @staticmethod
     def _is_hidden(state: RunState, block: int) -> bool:
@@ -205,7 +206,7 @@ class Planner:
         views, share = {}, self._config.influence_share
         for block in range(self._scene.tree.num_blocks):
             known = state.influence.get(block) if share < 1 else None
-            views[block] = len(worth_training(known, share) if known else self._survey(block).views)
+            views[block] = len(worth_training(known, share) if known else self._survey(block, 1).views)
         return views
 
     def _views_used(self, state: RunState, seen: int) -> int:
@@ -213,11 +214,16 @@ class Planner:
         most = max(state.views.values())
         return views_per_visit(seen, most, self._config.visit_views) if most else 0
 
-    def _survey(self, block: int) -> VisitGeometry:
+    def _survey(self, block: int, reduction: int) -> VisitGeometry:
         bounds = self._scene.bounds(block)
         if bounds is None:
             return VisitGeometry(block, {})
-        (shows,) = self._frusta.may_show([self._optics.drawn_within(bounds)]).tolist()
-        seeing = [view for view, may in zip(self._views.values(), shows, strict=True) if may]
+        views = list(self._run.views_at(reduction).values())
+        if reduction not in self._culling:
+            side = self._run.rasterizer.window_side
+            self._culling[reduction] = Frusta(((v, v.full) for v in views), side), Optics(views, side)
+        frusta, optics = self._culling[reduction]
+        (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
+        seeing = [view for view, may in zip(views, shows, strict=True) if may]
         gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)
         return survey(gaussians, block, seeing, self._run.rasterizer)

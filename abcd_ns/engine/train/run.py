@@ -12,7 +12,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl, for_blocks
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.train.schedule import sh_degree_at
+from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
 from abcd_ns.engine.types import View
 
 
@@ -40,6 +40,8 @@ class TrainingRun:
         self.config, self.budget, self.scene = config, budget, scene
         self.params, self.optimizers = params, optimizers
         self.views = {view.index: view for view in views}  # on the CPU, whatever the device
+        self._reduced = {1: self.views}
+        self._shortest = min((min(view.width, view.height) for view in views), default=0)
         self.rasterizer = rasterizer
         self.device = torch.device(device)
         self.announce = Announcer()
@@ -48,6 +50,21 @@ class TrainingRun:
         may_act = config.heal and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
         self.fit_density(scene.tree.num_blocks)
+
+    def views_at(self, reduction: int) -> dict[int, View]:
+        """The training views by index, their pictures reduced."""
+        if reduction not in self._reduced:
+            views = {index: view.reduced(reduction) for index, view in self.views.items()}
+            self._reduced[reduction] = views
+        return self._reduced[reduction]
+
+    @property
+    def reduction(self) -> int:
+        """By how much pictures are reduced in the visit that is under way, or if one began now."""
+        active = self.state.active
+        if active is not None and not active.is_all:
+            return active.reduction
+        return reduction_at(self.progress, self.config.coarse, self._shortest)
 
     def fit_density(self, blocks: int) -> None:
         """Density control for a scene of so many blocks."""

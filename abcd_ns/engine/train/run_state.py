@@ -58,6 +58,9 @@ class ActiveVisit:
     cut."""
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
+    reduction: int = 1
+    """Of the pictures, from the visit's first step to its last: its layers are as large. What is trained as a
+    whole has none, and changes to larger pictures at any step."""
     began: float = 0.0
     """Training time when the visit began."""
     since: float = 0.0
@@ -75,9 +78,14 @@ class ActiveVisit:
         return self.geometry.block == WHOLE
 
     @property
+    def is_all(self) -> bool:
+        """Whether all that there is of the scene by now is in training."""
+        return self.is_whole or self.sole
+
+    @property
     def is_alone(self) -> bool:
         """Whether what is trained has nothing around it, and may go on for as long as it likes."""
-        return self.is_whole or self.sole or self.steps >= UNLIMITED
+        return self.is_all or self.steps >= UNLIMITED
 
     def share(self, progress: float) -> float:
         """Share of the visit's part of the run that is done, 0..1; that part is mostly all of it.

@@ -20,6 +20,9 @@ leave less room for Gaussians."""
 SCAFFOLD_PASSES = 24
 """Uses of each view in the warm-up, at most: so few Gaussians soon are as good as they can be."""
 
+LEAST_SIDE = 100
+"""Of a reduced picture, pixels, at least: what is smaller has too little to teach."""
+
 LAYER_SHARE = 0.1
 """Of a visit's time, for its layers, where visits are as long as they should be."""
 FROZEN_COST, WINDOW_COST = 0.3, 0.4
@@ -163,6 +166,17 @@ def _one_pass(views: tuple[int, ...], number: int, seed: int) -> tuple[int, ...]
 def exponential_decay(progress: float, initial: float, final: float) -> float:
     """initial (final / initial)^progress for progress 0..1, as 3DGS decays the rate of the means."""
     return initial * (final / initial) ** min(max(progress, 0.0), 1.0)
+
+
+def reduction_at(progress: float, coarse: float, shortest: int) -> int:
+    """By how much pictures are reduced: to a quarter, then to a half of their width, then not at all.
+
+    Args:
+        coarse: share of the run after which they are not.
+        shortest: side of any picture, pixels.
+    """
+    wanted = 4 if progress < coarse / 2 else 2 if progress < coarse else 1
+    return max(by for by in (1, 2, 4) if by == 1 or (by <= wanted and shortest // by >= LEAST_SIDE))
 
 
 def sh_degree_at(progress: float, ramp: float, highest: int) -> int:

@@ -27,7 +27,7 @@ def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
         coordinator.await_step()
         return
     batch = coordinator.next_batch()
-    read = (photo(sample.view.index, sample.crop) for sample in batch.samples)
+    read = (sample.reduced(photo(sample.view.index, sample.source)) for sample in batch.samples)
     photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
     rendered = coordinator.render(batch)
     loss = coordinator.loss(batch, rendered.pictures, photos)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import sandwich
@@ -46,6 +47,26 @@ class Sample:
         """What the rasterizer is to draw."""
         return Shot(self.view, self.crop, self.interleaved, None if self.interleaved is None else self.window)
 
+    @property
+    def source(self) -> Crop:
+        """The pixels of the photo that the crop shows."""
+        return self.crop.enlarged(self.view.reduction)
+
+    def reduced(self, photo: Float[Tensor, "_h _w c"]) -> Float[Tensor, "h w c"]:
+        """The photo's `source`, as large as the crop: means of squares; with alpha, of what it shows."""
+        by = self.view.reduction
+        if by == 1:
+            return photo
+        if photo.shape[-1] == 4:
+            shown = _mean_of_squares(torch.cat((photo[..., :3] * photo[..., 3:], photo[..., 3:]), dim=-1), by)
+            return torch.cat((shown[..., :3] / shown[..., 3:].clamp_min(1e-6), shown[..., 3:]), dim=-1)
+        return _mean_of_squares(photo, by)
+
+    def reduced_mask(self, mask: Bool[Tensor, "_h _w 1"] | None) -> Bool[Tensor, "h w 1"] | None:
+        """The mask of `source`, as large as the crop: a pixel counts where all of its square does."""
+        by = self.view.reduction
+        return mask if by == 1 or mask is None else _mean_of_squares((~mask).float(), by) == 0
+
     def picture(self, raster: Raster) -> Float[Tensor, "h w 3"]:
         """What the rasterizer drew, between the layers and on the background, 0..1."""
         if self.layers is None:
@@ -68,6 +89,10 @@ class Sample:
             pixel_loss=config.recipe.pixel_loss,
         )
         return found / self.share
+
+
+def _mean_of_squares(pixels: Float[Tensor, "_h _w c"], by: int) -> Float[Tensor, "h w c"]:
+    return F.avg_pool2d(pixels.permute(2, 0, 1), by).permute(1, 2, 0)
 
 
 @dataclass(frozen=True)

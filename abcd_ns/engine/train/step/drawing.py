@@ -29,7 +29,7 @@ from abcd_ns.engine.train.step.weighing import weighed
 from abcd_ns.engine.train.step.workers.crew import Crew
 from abcd_ns.engine.train.step.workers.helper_process import can_fork
 from abcd_ns.engine.train.step.workers.share import Contribution, DrawShare, Share, Target, Task, share_of
-from abcd_ns.engine.types import Crop, Gaussians
+from abcd_ns.engine.types import Crop, Gaussians, View
 
 
 class StepDrawing:
@@ -84,7 +84,8 @@ class StepDrawing:
         """The influence that the block has on each of these views by now."""
         shown, live = {}, live_gaussians(self._run.params)
         for view in views:
-            sample = self._sample_of(view, self._run.active.geometry.crops[view], 0, self._run.state.step)
+            seen, crop = self._run.views_at(self._run.reduction)[view], self._run.active.geometry.crops[view]
+            sample = self._sample_of(seen, crop, 0, self._run.state.step)
             before = sample.layers and sample.layers.front.transmittance
             antialiased = self._run.config.antialiased
             shown[view] = share_shown(
@@ -165,15 +166,16 @@ class StepDrawing:
 
     def _sample(self, view: int, place: int, step: int) -> Sample:
         """What is drawn at one place of a step: all that a view shows of the block, or a part."""
-        whole = self._run.active.geometry.crops[view]
+        seen, active = self._run.views_at(self._run.reduction)[view], self._run.active
+        whole = seen.full if active.is_all else active.geometry.crops[view]
         crop = part_to_draw(self._run.config, whole, step, place)
-        sample = self._sample_of(view, crop, place, step)
+        sample = self._sample_of(seen, crop, place, step)
         return replace(sample, share=crop.pixels / whole.pixels)
 
-    def _sample_of(self, view: int, crop: Crop, place: int, step: int) -> Sample:
-        around = self.layers.around(view, crop) if self.layers else None
+    def _sample_of(self, view: View, crop: Crop, place: int, step: int) -> Sample:
+        around = self.layers.around(view.index, crop) if self.layers else None
         return Sample(
-            view=self._run.views[view],
+            view=view,
             crop=crop,
             layers=around and around.layers,
             interleaved=around and around.interleaved,
