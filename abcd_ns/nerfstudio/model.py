@@ -358,7 +358,7 @@ class AbcdModel(SplatfactoModel):
         return image_metrics(outputs["rgb"], photo), {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """A photo as float32 in 0..1 on the device; ABCD trains at full resolution from the start."""
+        """A photo as float32 in 0..1 on the device; training reduces it where the sample is (see `Sample.reduced`)."""
         return (image.float() / 255 if image.dtype == torch.uint8 else image).to(self.device)
 
     def get_training_callbacks(
