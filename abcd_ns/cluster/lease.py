@@ -37,6 +37,8 @@ class VisitTask:
     views: int
     """Worth training the block on."""
     health: BlockHealth
+    light: dict[str, str]
+    """As in RunState; the worker applies it, and leaves it as it is."""
     allowance: int | None
     """Gaussians by which the block may grow, for the sake of a limit on the scene; None for any number."""
 

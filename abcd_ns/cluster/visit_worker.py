@@ -176,6 +176,9 @@ class VisitWorker:
             health={block: copy.copy(task.health)},
             active=copy.deepcopy(task.active),
         )
+        if run.light is not None:  # two workers may show one photo: whose transform should stay?
+            run.light.restore(task.light)
+            run.light.learns = False
         run.stopwatch = Stopwatch(task.seconds)
         return run
 

@@ -18,8 +18,10 @@ FETCH = "ABCD_FETCH_LPIPS"
 """The environment variable that allows torchvision to download them; ns-eval has no options for it."""
 
 
-def image_metrics(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> dict[str, float]:
-    """`psnr` (dB), `ssim` and, where LPIPS' weights are on this machine, `lpips`.
+def image_metrics(
+    rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], corrected: bool = False
+) -> dict[str, float]:
+    """`psnr` (dB), `ssim` and, where LPIPS' weights are on this machine, `lpips`; `cc_psnr` if `corrected`.
 
     SSIM is left out of pictures smaller than its window.
     """
@@ -27,9 +29,21 @@ def image_metrics(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"
     found = {"psnr": float(psnr(rendered, photo))}
     if min(rendered.shape[:2]) >= SSIM_WINDOW:
         found["ssim"] = float(ssim(a, b, data_range=1.0, size_average=True))
+    if corrected:
+        found["cc_psnr"] = corrected_psnr(rendered, photo)
     if lpips_missing() is None:
         found["lpips"] = float(_lpips(str(rendered.device))(a.clamp(0, 1), b.clamp(0, 1)))
     return found
+
+
+def corrected_psnr(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> float:
+    """PSNR, dB, after the picture's colours were warped to the photo's by least squares (quadratic, as in
+    RawNeRF's code), as splatfacto's `cc_psnr`: the light of the photo, which nothing else shows, is left out.
+    """
+    from nerfstudio.model_components.lib_bilagrid import color_correct
+
+    rendered, photo = rendered.cpu(), photo.cpu()  # where least squares may be short of rank: black pictures
+    return float(psnr(color_correct(rendered, photo), photo))
 
 
 def lpips_missing() -> str | None:

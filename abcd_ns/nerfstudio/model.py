@@ -355,7 +355,8 @@ class AbcdModel(SplatfactoModel):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of a whole picture, and photo and picture side by side."""
         photo = self.photo_on(batch["image"], outputs["background"])
-        return image_metrics(outputs["rgb"], photo), {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
+        found = image_metrics(outputs["rgb"], photo, self.config.color_corrected_metrics)
+        return found, {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """A photo as float32 in 0..1 on the device; training reduces it where the sample is (see `Sample.reduced`)."""

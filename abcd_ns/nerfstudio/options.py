@@ -15,7 +15,7 @@ from abcd_ns.nerfstudio.workers import check_workers
 
 MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
 """Splatfacto's model options that nerfstudio's tools read; `mirror` sets them."""
-HONOURED = {"random_init", "num_random", "random_scale", "rasterize_mode"}
+HONOURED = {"random_init", "num_random", "random_scale", "rasterize_mode", "color_corrected_metrics"}
 """Splatfacto's model options that are flags of `ns-train abcd` too."""
 TOLERATED = {"eval_num_rays_per_chunk"}
 """ns-render sets it for all methods; pictures of Gaussians are not drawn by rays."""
@@ -120,6 +120,8 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         )
     if model.rasterize_mode == "antialiased":
         training.antialiased = True
+    if training.light != "none":  # held-out photos have a light of their own, too
+        model.color_corrected_metrics = True
     mirrored = {
         "sh_degree": ("sh_degree", training.sh_degree),
         "ssim_lambda": ("ssim_lambda", training.ssim_lambda),

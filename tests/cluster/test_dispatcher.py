@@ -11,6 +11,7 @@ from abcd_ns.cluster.lease import Finished, Lost, StepsSeen, WorkersError
 from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded, WorkerLost
 from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.light import Light
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.cluster.conftest import in_process
@@ -199,3 +200,19 @@ def test_a_limit_on_gaussians_holds_for_all_that_are_out(make, photos):
         train_step(run, photos)
         assert run.count() <= 100
     assert run.count() > 90
+
+
+def test_workers_apply_the_light_of_the_moment_and_leave_it(make, photos):
+    """So the light is what the warm-up has made of it."""
+    run = make(workers=2, lag=2, density=STILL, scaffold=40, warmup=0.3, light="affine")
+    while not run.trains_elsewhere:
+        train(run, photos, steps=1)
+    before = run.run.light.to_json()
+    assert before != Light("affine", list(run.views)).to_json()
+    lent = []
+    submit = run.workers.submit
+    run.workers.submit = lambda lease: (lent.append(lease.task.light), submit(lease))
+    train(run, photos)
+    assert lent
+    assert all(light == before for light in lent)
+    assert run.run.light.to_json() == before

@@ -97,6 +97,13 @@ def test_the_antialiased_mode_of_splatfacto_is_ours():
     assert pipeline.model.rasterize_mode == "antialiased"
 
 
+@pytest.mark.parametrize("kind", ["none", "exposure", "affine"])
+def test_where_light_is_compensated_held_out_pictures_are_corrected_too(kind):
+    pipeline = parsed("--pipeline.training.light", kind).pipeline
+    mirror(pipeline.training, pipeline.model)
+    assert pipeline.model.color_corrected_metrics == (kind != "none")
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

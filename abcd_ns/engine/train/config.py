@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.light import Kind
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 
@@ -57,6 +58,10 @@ class TrainingConfig:
     """Scale opacities by gsplat's compensation for its low-pass filter."""
     background: Literal["random", "black", "white"] = "random"
     """What lies behind the scene while training."""
+    light: Kind = "none"
+    """Makes good for photos that were taken in different light, by a colour transform of each finished
+    picture. exposure: a gain for each channel. affine: a matrix, 3 x 4. Their mean over the photos is the
+    identity, in which held-out views are drawn; these are scored as `cc_psnr`, too."""
     means_lr_decay: float = 0.01
     """Learning rate of the means at the end, as a share of the start's; exponential over the run."""
     point_pixels: float = 2.0
@@ -92,6 +97,8 @@ class TrainingConfig:
             if not fits:
                 value = getattr(self, name.replace("-", "_"))
                 raise UserError(f"--pipeline.training.{name} must be {words}, not {value}.")
+        if self.light != "none" and recipe.exact:
+            raise UserError("--pipeline.training.light is for methods that train by visits, not abcd-exact.")
         if recipe.overlap < 0 or (recipe.overlap > 0 and (recipe.layers or recipe.exact or recipe.migrate)):
             raise UserError(
                 f"training.recipe.overlap is {recipe.overlap}: it must be 0, or more where layers, exact "

@@ -11,6 +11,7 @@ from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl, for_blocks
 from abcd_ns.engine.train.health.health import Health
+from abcd_ns.engine.train.light import Light
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
 from abcd_ns.engine.types import View
@@ -47,6 +48,7 @@ class TrainingRun:
         self.announce = Announcer()
         self.stopwatch = Stopwatch()
         self.state = RunState()
+        self.light = None if config.light == "none" else Light(config.light, list(self.views), self.device)
         may_act = config.heal and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
         self.fit_density(scene.tree.num_blocks)
@@ -112,9 +114,13 @@ class TrainingRun:
     def rest(self, tree: BlockTree, updates: dict[int, BlockState], within: float) -> None:
         """Put blocks and the run's state to rest, as one moment; on disk within so many seconds."""
         self.state.seconds = self.stopwatch.seconds
+        if self.light is not None:
+            self.state.light = self.light.to_json()
         self.scene.rest(tree, updates, self.state.to_json(), within)
 
     def restore(self) -> None:
         """Stand where the store's newest generation stands."""
         self.state = RunState.from_json(self.scene.store.state)
         self.stopwatch = Stopwatch(self.state.seconds)
+        if self.light is not None and self.state.light:
+            self.light.restore(self.state.light)

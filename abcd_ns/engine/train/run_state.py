@@ -117,6 +117,8 @@ class RunState:
     """Gaussians of the blocks that were visited in this sweep, when their visits began."""
     frozen: int = 0
     """Gaussians that were drawn around them."""
+    light: dict[str, str] = field(default_factory=dict)
+    """See Light, at rest; empty where there is none."""
     health: Ledger = field(default_factory=dict)
     """What had to be mended, by block."""
     active: ActiveVisit | None = None

@@ -9,6 +9,7 @@ from abcd_ns.engine.events import StepTaken, VisitBegan
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Pace
 from abcd_ns.engine.train.layer_source import LayerSource
+from abcd_ns.engine.train.light import AMONG_OTHERS, LAST, gradients_of
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -96,6 +97,7 @@ class VisitTraining:
         """
         run, active = self.run, self.run.active
         taken = len(rendered.pictures) * active.crew
+        self._adapt_light(rendered)
         run.state.step += 1
         active.done += 1
         sound, psnr = run.health.end_step(psnrs)
@@ -107,6 +109,15 @@ class VisitTraining:
             if self.live.is_due_to_shed(taken):
                 self.live.shed()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
+
+    def _adapt_light(self, rendered: Rendered) -> None:
+        run = self.run
+        if run.light is None:
+            return
+        helped = [gradient for part in self.steps.contributions() for gradient in part.lights]
+        damping = exponential_decay(run.progress, 1.0, LAST)
+        share = 1.0 if run.active.is_alone else AMONG_OTHERS
+        run.light.step([*gradients_of(rendered.lights), *helped], share * damping)
 
     @property
     def is_over(self) -> bool:

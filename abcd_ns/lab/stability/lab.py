@@ -33,6 +33,7 @@ from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step, views
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.stability.world import TABLE, World, ring
+from abcd_ns.nerfstudio.metrics import corrected_psnr
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
@@ -230,6 +231,17 @@ class Lab:
         """Mean PSNR of merged pictures, dB."""
         drawn = self.pictures(merged(coordinator), views)
         return sum(float(psnr(a, b)) for a, b in zip(drawn, photos, strict=True)) / len(views)
+
+    def corrected(self, stage: Stage, method: Method, **options) -> float:
+        """As `compared`, each picture warped to its photo's colours before it is scored.
+
+        Args:
+            options: of `coordinator`.
+        """
+        usual = {"budget": self.views_drawn(BUDGET), "density": LIMITED}
+        trained = self.train(stage, method, **{**usual, **options})
+        drawn = self.pictures(merged(trained.coordinator), stage.held_out)
+        return sum(corrected_psnr(a, b) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
 
     def error(self, coordinator: Coordinator, stage: Stage) -> float:
         """The full objective, near enough: the mean absolute error over all training photos."""

@@ -16,6 +16,7 @@ from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.light import Uses, lit
 from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, View
@@ -67,13 +68,13 @@ class Sample:
         by = self.view.reduction
         return mask if by == 1 or mask is None else _mean_of_squares((~mask).float(), by) == 0
 
-    def picture(self, raster: Raster) -> Float[Tensor, "h w 3"]:
-        """What the rasterizer drew, between the layers and on the background, 0..1."""
+    def picture(self, raster: Raster, light: Float[Tensor, "3 4"] | None = None) -> Float[Tensor, "h w 3"]:
+        """What the rasterizer drew, between the layers and on the background, in its photo's light, 0..1."""
         if self.layers is None:
             rgb = raster.color + raster.transmittance[..., None] * self.background
         else:
             rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
-        return rgb.clamp(0, 1)
+        return (rgb if light is None else lit(rgb, light)).clamp(0, 1)
 
     def loss(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig
@@ -122,6 +123,8 @@ class Rendered:
     transmittances: tuple[Float[Tensor, "_h _w"], ...]
     """Of the active block and what was sorted in with it."""
     infos: tuple[dict[str, Any], ...]
+    lights: Uses = ()
+    """The transforms that the pictures were drawn with."""
 
 
 def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "3"]:

@@ -200,8 +200,12 @@ class StepDrawing:
         if crew > 1:  # density control judges by gradients of the sum over all of a step's views
             infos = tuple({**info, "n_cameras": info["n_cameras"] * crew} for info in infos)
         run.density.before_backward(infos)
-        pictures = (sample.picture(raster) for sample, raster in zip(samples, rasters, strict=True))
-        return Rendered(tuple(pictures), tuple(raster.transmittance for raster in rasters), infos)
+        light = run.light
+        lights = [None if light is None else light.of(sample.view.index) for sample in samples]
+        drawn = zip(samples, rasters, lights, strict=True)
+        pictures = tuple(sample.picture(raster, transform) for sample, raster, transform in drawn)
+        uses = [] if light is None else [(s.view.index, t) for s, t in zip(samples, lights, strict=True)]
+        return Rendered(pictures, tuple(raster.transmittance for raster in rasters), infos, uses)
 
     # -- helpers -------------------------------------------------------------------------------------
 

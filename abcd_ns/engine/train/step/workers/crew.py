@@ -66,9 +66,9 @@ class Helper:
         """What its share adds to the step; waits for it."""
         self.drawn()
         if self._share is None:
-            counted = self._answer()
-            if counted is not None and self._asked is not None:
-                return self._room.take(len(self._asked[0]), counted)
+            given = self._answer()
+            if given is not None and self._asked is not None:
+                return self._room.take(len(self._asked[0]), given)
             self._share = self._stand_in()
         return self._share.differentiate()
 

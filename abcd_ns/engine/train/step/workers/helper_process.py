@@ -28,6 +28,10 @@ PR_SET_PDEATHSIG = 1
 """Of Linux' prctl: a signal for this process when its parent ends, however that ends."""
 
 
+Given = tuple[bool, list[tuple[int, list[list[float]]]]]
+"""Whether there were counts, and the gradients of the pictures' transforms."""
+
+
 class Room:
     """What processes share: the block's parameters, and for one helper what it gives back.
 
@@ -41,16 +45,18 @@ class Room:
         self.gradients = SharedRows.like(like, rows)
         self.counts = SharedRows(dict.fromkeys(COUNTED, ()), rows)
 
-    def give(self, part: Contribution) -> bool:
-        """Write what a share adds; whether there were counts."""
+    def give(self, part: Contribution) -> Given:
+        """Write what a share adds, but for what is small."""
         self.gradients.write(part.gradients)
         self.counts.write(part.counts)
-        return bool(part.counts)
+        return bool(part.counts), [(view, gradient.tolist()) for view, gradient in part.lights]
 
-    def take(self, rows: int, counted: bool) -> Contribution:
+    def take(self, rows: int, given: Given) -> Contribution:
         """Read it: shared memory, to be used before the next step."""
         gradients = {name: self.gradients.rows(name, rows) for name in PARAM_NAMES}
-        return Contribution(gradients, {n: self.counts.rows(n, rows) for n in COUNTED} if counted else {})
+        counted, lights = given
+        counts = {name: self.counts.rows(name, rows) for name in COUNTED} if counted else {}
+        return Contribution(gradients, counts, [(view, torch.tensor(values)) for view, values in lights])
 
     def leaves(self, rows: int) -> Gaussians:
         """The parameters, to be differentiated by."""
@@ -82,7 +88,7 @@ class HelperProcess:
             self._pipe.send((rows, task))
 
     def answer(self) -> Any | None:
-        """The next thing that it says: Drawn, then whether there are counts. None if it is lost."""
+        """The next thing that it says: Drawn, then Given. None if it is lost."""
         with suppress(OSError, EOFError):
             if self._pipe.poll(PATIENCE):
                 return self._pipe.recv()

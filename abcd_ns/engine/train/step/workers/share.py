@@ -10,6 +10,7 @@ from torch import Tensor
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.health.health_rules import share_of_picture
+from abcd_ns.engine.train.light import Uses, gradients_of
 from abcd_ns.engine.train.step.batch import Rendered, Sample
 from abcd_ns.engine.types import Gaussians
 
@@ -48,6 +49,8 @@ class Contribution:
     """By parameter."""
     counts: dict[str, Tensor]
     """What density control adds up for each Gaussian, by name; may be empty."""
+    lights: Uses = ()
+    """Gradients of the pictures' transforms."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,8 @@ def share_of(
         if loss.requires_grad:
             loss.backward()
         gradients = {n: torch.zeros_like(v) if v.grad is None else v.grad for n, v in gaussians.items()}
-        return Contribution(gradients, density.count(gaussians.means, rendered.infos))
+        counts = density.count(gaussians.means, rendered.infos)
+        return Contribution(gradients, counts, gradients_of(rendered.lights))
 
     drawn = Drawn(tuple(zip(indices, numbers, strict=True)), float(loss.detach()), float(max(shown)))
     return Share(drawn, differentiate)

@@ -1,0 +1,170 @@
+"""Photos that were taken in different light: a transform of each finished picture makes good for it."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.light import Light, lit
+from abcd_ns.engine.train.step.workers.helper_process import can_fork
+from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.types import PARAM_NAMES
+from abcd_ns.errors import UserError
+from tests.reference.scenes import (
+    Photos,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    training_config,
+    whole_scene,
+)
+
+STILL = DensityConfig(strategy="off")
+GAINS = (0.75, 1.0, 1.25)
+"""Their mean is 1: the light that held-out views are drawn in."""
+TRUTH = random_gaussians(150, seed=7, size=0.12)
+
+
+class Drifting(Photos):
+    """Photos whose exposure changes from one to the next."""
+
+    def __call__(self, index, crop):
+        return (GAINS[index % 3] * super().__call__(index, crop)).clamp(0, 1)
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return ring_of_views(6)
+
+
+@pytest.fixture(scope="module")
+def drifting(ring):
+    return Drifting(TRUTH, ring)
+
+
+@pytest.fixture
+def make(tmp_path, ring):
+    """Makes coordinators that begin with the truth, each in a folder of its own or in an earlier one's."""
+
+    def made(name: str = "run", **options):
+        (tmp_path / name).mkdir(exist_ok=True)
+        return make_coordinator(tmp_path / name, TRUTH, ring, **{"density": STILL, **options})
+
+    return made
+
+
+def transforms(light: Light) -> torch.Tensor:
+    return torch.stack([light.of(view).detach() for view in sorted(light._rows)])
+
+
+@given(st.integers(0, 10**6), st.integers(1, 6), st.sampled_from(["exposure", "affine"]))
+def test_the_mean_transform_is_the_identity_whatever_the_gradients(seed, steps, kind):
+    generator, light = torch.Generator().manual_seed(seed), Light(kind, range(5))
+    for _ in range(steps):
+        shown = torch.randint(5, (3,), generator=generator).tolist()  # the same view twice, at times
+        light.step([(view, torch.randn(3, 4, generator=generator)) for view in shown])
+    found = transforms(light)
+    assert torch.allclose(found.mean(dim=0), torch.eye(3, 4), atol=1e-6)
+    assert not torch.allclose(found, torch.eye(3, 4).expand(5, 3, 4), atol=1e-3)
+    assert kind == "affine" or torch.equal(found * torch.eye(3, 4), found)
+
+
+def test_gradients_that_are_no_numbers_change_nothing():
+    light = Light("affine", range(2))
+    light.step([(0, torch.full((3, 4), torch.nan))])
+    assert torch.equal(transforms(light), torch.eye(3, 4).expand(2, 3, 4))
+
+
+def test_layers_and_cuts_are_those_of_a_run_without_it(make):
+    """Layers, crops and transmittances know nothing of a transform: it is of the finished picture."""
+    drawn = []
+    for kind in ("none", "affine"):
+        made = make(kind, light=kind)
+        batch = made.next_batch()
+        if kind == "affine":
+            made.run.light._changes += 0.1 * torch.randn(6, 3, 4, generator=torch.Generator().manual_seed(3))
+        rendered = made.render(batch)
+        drawn.append(list(zip(batch.samples, rendered.pictures, rendered.transmittances, strict=True)))
+    for (one, plain, alone), (other, changed, same) in zip(*drawn, strict=True):
+        assert one.crop == other.crop
+        assert torch.equal(alone, same)
+        for side in ("front", "back"):
+            a, b = getattr(one.layers, side), getattr(other.layers, side)
+            assert torch.equal(a.color, b.color)
+            assert torch.equal(a.transmittance, b.transmittance)
+        whole = ((plain > 0) & (plain < 1)).all(dim=-1)  # the others were clamped
+        expected = lit(plain, made.run.light.of(other.view.index)).clamp(0, 1)
+        assert whole.any()
+        assert torch.allclose(changed[whole], expected[whole], atol=1e-6)
+        assert not torch.allclose(changed, plain, atol=1e-2)
+
+
+@pytest.mark.parametrize(("blocks", "steps", "kind"), [(1, 160, "affine"), (4, 120, "exposure")])
+def test_drifting_light_costs_next_to_nothing_once_it_is_compensated(
+    make, ring, drifting, blocks, steps, kind
+):
+    def error(name: str, photos, light: str) -> float:
+        made = make(name, blocks=blocks, steps=steps, light=light, background="black")
+        train(made, photos)
+        scene, draw = whole_scene(made), TorchRasterizer()
+        with torch.no_grad():
+            pictures = [draw(scene, view, sh_degree=1).color.clamp(0, 1) for view in ring]
+        pairs = zip(pictures, ring, strict=True)
+        return float(torch.stack([(p - drifting.images[v.index]).abs().mean() for p, v in pairs]).mean())
+
+    steady = error("steady", Photos(TRUTH, ring), "none")
+    cost = error("drift", drifting, "none") - steady
+    left = error("compensated", drifting, kind) - steady
+    assert cost > steady
+    assert left < 0.5 * cost
+
+
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_a_run_that_stops_goes_on_with_its_transforms_and_moments(make, drifting, blocks):
+    options = {"blocks": blocks, "steps": 30, "light": "affine"}
+    whole, stopped = make("whole", **options), make("stopped", **options)
+    train(whole, drifting)
+    train(stopped, drifting, steps=14)
+    stopped.save()
+    stopped.scene.store.close()
+    went_on = make("stopped", resume=True, **options)
+    assert torch.equal(transforms(went_on.run.light), transforms(stopped.run.light))
+    train(went_on, drifting)
+    assert torch.equal(transforms(went_on.run.light), transforms(whole.run.light))
+    assert not torch.equal(transforms(whole.run.light), transforms(stopped.run.light))
+    for name in PARAM_NAMES:
+        assert torch.equal(getattr(whole_scene(went_on), name), getattr(whole_scene(whole), name)), name
+
+
+@pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
+def test_helpers_see_the_transforms_of_each_step_and_send_back_gradients(make, drifting):
+    """The same, whether a helper lives or the training process draws its share."""
+    found = []
+    for name in ("helped", "stood in"):
+        options = {"blocks": 2, "steps": 20, "processes": 2, "light": "affine"}
+        made = make(name, target=lambda s: (drifting(s.view.index, s.crop), None), **options)
+        made.next_batch()
+        if name == "stood in":
+            made.visit.steps.crew.dismiss()
+        assert bool(made.visit.steps.crew.pids) == (name == "helped")
+        for _ in range(6):
+            batch = made.next_batch()
+            rendered = made.render(batch)
+            made.loss(
+                batch, rendered.pictures, [drifting(s.view.index, s.crop) for s in batch.samples]
+            ).backward()
+            own = {view for view, _ in rendered.lights}
+            helped = {view for part in made.visit.steps.contributions() for view, _ in part.lights}
+            made.after_step(rendered)
+            assert helped - own
+        found.append(transforms(made.run.light))
+        made.visit.steps.end_visit()
+    assert torch.equal(*found)
+    assert float((found[0] - torch.eye(3, 4)).abs().max()) > 1e-3
+
+
+def test_joint_training_over_blocks_refuses_it():
+    with pytest.raises(UserError, match=r"training\.light"):
+        training_config(exact=True, light="affine").check()

@@ -1,0 +1,21 @@
+"""How close a picture is to its photo, with its light or without."""
+
+import pytest
+import torch
+
+from abcd_ns.nerfstudio.metrics import image_metrics
+
+
+def test_a_corrected_psnr_leaves_the_light_of_the_photo_out():
+    picture = 0.2 + 0.4 * torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0))
+    noise = 0.01 * torch.randn(20, 30, 3, generator=torch.Generator().manual_seed(1))
+    photo = 1.3 * picture + 0.05 + noise
+    assert "cc_psnr" not in image_metrics(picture, photo)
+    found = image_metrics(picture, photo, corrected=True)
+    assert found["psnr"] < 17
+    assert found["cc_psnr"] == pytest.approx(40, abs=0.5)  # the noise alone
+
+
+def test_black_pictures_are_scored_too():
+    black = torch.zeros(20, 30, 3)
+    assert image_metrics(black, black + 0.5, corrected=True)["cc_psnr"] > 0
