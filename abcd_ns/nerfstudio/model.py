@@ -359,7 +359,7 @@ class AbcdModel(SplatfactoModel):
         return found, {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """A photo as float32 in 0..1 on the device; training reduces it where the sample is (see `Sample.reduced`)."""
+        """A photo as float32 in 0..1 on the device; samples have theirs reduced already."""
         return (image.float() / 255 if image.dtype == torch.uint8 else image).to(self.device)
 
     def get_training_callbacks(
