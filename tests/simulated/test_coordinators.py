@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("simulated_gsplat")
 
 
 def on_device(folder, start, views, rasterizer="gsplat", **options):
-    """A coordinator on the simulated device, with gsplat, as it is without its check, unless told otherwise."""
+    """A coordinator on the simulated device, with gsplat (without its check) unless told otherwise."""
     draws = TorchRasterizer("never") if rasterizer == "torch" else GsplatRasterizer()
     return make_coordinator(folder, start, views, device=DEVICE, rasterizer=draws, **options)
 
