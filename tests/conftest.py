@@ -1,5 +1,6 @@
 """Set-up that must happen before any test module is imported."""
 
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -14,8 +15,9 @@ from jaxtyping import install_import_hook
 # modules that are not imported yet, hence here and not in a fixture.
 install_import_hook(["abcd_ns.engine", "abcd_ns.peers"], "beartype.beartype")
 
-# The same sums in the same order on any machine, and room for other processes.
+# The same sums in the same order on any machine, and room for other processes; those that tests start, too.
 torch.set_num_threads(1)
+os.environ["OMP_NUM_THREADS"] = "1"
 
 # derandomize: a failure shows up on every run or on none. No deadline: shared machines stall.
 settings.register_profile("abcd", derandomize=True, deadline=None, max_examples=25, database=None)

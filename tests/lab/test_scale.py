@@ -172,10 +172,10 @@ def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are
 @pytest.mark.cli
 def test_the_command_measures_writes_and_reuses(tmp_path, capsys):
     out = tmp_path / "out"
-    assert scale(out, blocks=(2, 4), gaussians=200, visits=1) == 0
+    assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
     first = read_json(out / "results.json")
-    assert {arm["value"] for arm in first["arms"]} == {2, 4}
-    assert scale(out, blocks=(2, 4), gaussians=200, visits=1) == 0
+    assert [(arm["method"], arm["value"]) for arm in first["arms"]] == [("abcd", 2), ("abcd", 4), (WHOLE, 2)]
+    assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
     assert read_json(out / "results.json")["arms"] == first["arms"]
     assert not list(out.glob("runs/*/*/store"))
     assert "peak RAM grows by" in capsys.readouterr().out.replace("\n", " ")

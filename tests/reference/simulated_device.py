@@ -190,12 +190,14 @@ def _map(function: Callable[[Any], Any], value: Any) -> Any:
     return value
 
 
-def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
+def _tensors(values: Iterable[Any]) -> list[Tensor]:
+    found = []
     for value in values:
         if isinstance(value, Tensor):
-            yield value
+            found.append(value)
         elif isinstance(value, (list, tuple)):
-            yield from _tensors(value)
+            found += _tensors(value)
+    return found
 
 
 def _is_device(device: Any) -> bool:
@@ -212,7 +214,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         _counts.move(args[1], to_device=to_device, blocks=not (to_device and _non_blocking(args, kwargs)))
         func(_inner(args[0]), _inner(args[1]), *args[2:], **kwargs)
         return args[0]
-    tensors = [*_tensors(args), *_tensors(kwargs.values())]
+    tensors = _tensors(args) + _tensors(kwargs.values())
     here = [x for x in tensors if isinstance(x, OnDevice)]
     if not here and not _is_device(kwargs.get("device")):
         return func(*args, **kwargs)
@@ -351,6 +353,11 @@ for _name, _function in (
 
 class _Dispatch(TorchDispatchMode):
     """Operations that begin without a tensor on the device."""
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Nothing is compiled here, and a wrapper around each operation takes a third of all time."""
+        return False
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         return _run(func, args, kwargs or {})

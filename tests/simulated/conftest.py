@@ -2,6 +2,7 @@
 
 import pytest
 
+from abcd_ns.engine.train.step import batch
 from tests.engine.conftest import photos, start, views
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.simulated_device import simulated_device
@@ -21,3 +22,11 @@ def simulated_gsplat(counts):
     """The same, with gsplat's functions."""
     with lent():
         yield counts
+
+
+@pytest.fixture(autouse=True, scope="package")
+def _few_backgrounds():
+    """Runs are short, and each draws those of thousands of steps at once: half a second here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch, "BACKGROUNDS", 64)
+        yield

@@ -7,7 +7,8 @@ import torch
 
 from abcd_ns.engine.events import Mended, StepTaken
 from abcd_ns.engine.gaussians.param_swap import PARAM_NAMES
-from abcd_ns.engine.render import TorchRasterizer, make_rasterizer
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.transfer import StepNumbers
@@ -27,7 +28,7 @@ def listen(coordinator, kind) -> list:
     return found
 
 
-@pytest.mark.parametrize(("blocks", "parts"), [(1, 0), (8, 0), (8, 300)])
+@pytest.mark.parametrize(("blocks", "parts"), [(1, 0), (4, 0), (4, 300)])
 def test_a_step_waits_once_and_copies_its_photos_alone(
     tmp_path, start, views, photos, simulated_gsplat, blocks, parts
 ):
@@ -41,7 +42,7 @@ def test_a_step_waits_once_and_copies_its_photos_alone(
         steps=3 * blocks,
         density=GATHERING,
         crop_pixels=parts,
-        rasterizer=make_rasterizer("auto", DEVICE),
+        rasterizer=GsplatRasterizer(),
         device=DEVICE,
     )
     watch = Watch(counts)
@@ -60,7 +61,7 @@ def test_a_step_waits_once_and_copies_its_photos_alone(
 
 @pytest.mark.parametrize("crop", [None, Crop(16, 0, 20, 20)])
 def test_a_drawing_leaves_nothing_behind(start, views, simulated_gsplat, crop):
-    rasterizer, live = make_rasterizer("auto", DEVICE), []
+    rasterizer, live = GsplatRasterizer(), []
     leaves = as_leaves(start.to(DEVICE))
     for _ in range(3):
         raster = rasterizer(leaves, views[0], sh_degree=1, crop=crop, absgrad=True)

@@ -1,5 +1,6 @@
 """Several processes share the views of a step, and nobody can tell from the result."""
 
+import functools
 import os
 import signal
 import subprocess
@@ -36,18 +37,35 @@ def photos(views):
     return Photos(random_gaussians(60, seed=1), views)
 
 
+def gather(folder, views, photos, processes: int = 2, **options):
+    """A coordinator that gathers crews."""
+    folder.mkdir(exist_ok=True)
+    options = {"blocks": 2, "steps": 30, "density": GROWING, **options}
+    options = {"target": lambda s: (photos(s.view.index, s.crop), None), **options}
+    return make_coordinator(folder, random_gaussians(60, seed=2), views, processes=processes, **options)
+
+
 @pytest.fixture
 def make(tmp_path, views, photos):
     """Makes coordinators that gather crews."""
 
     def made(name: str = "run", processes: int = 2, **options):
-        (tmp_path / name).mkdir(exist_ok=True)
-        options = {"blocks": 2, "steps": 30, "density": GROWING, **options}
-        start = random_gaussians(60, seed=2)
-        target = options.pop("target", lambda s: (photos(s.view.index, s.crop), None))
-        return make_coordinator(tmp_path / name, start, views, processes=processes, target=target, **options)
+        return gather(tmp_path / name, views, photos, processes, **options)
 
     return made
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory, views, photos):
+    """Scenes of runs that nothing befell: of blocks alone, and after a warm-up."""
+
+    @functools.cache
+    def trained(warm: bool):
+        run = gather(tmp_path_factory.mktemp("undisturbed"), views, photos, **(WARM if warm else {}))
+        train(run, photos)
+        return whole_scene(run)
+
+    return lambda options: trained(options is WARM)
 
 
 def equal(one, other) -> bool:
@@ -139,10 +157,9 @@ def test_a_step_of_the_warm_up_is_the_one_that_a_single_process_takes(make, phot
 
 
 @pytest.mark.parametrize("options", [{}, WARM], ids=["blocks", "warm-up"])
-def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch, options):
+def test_a_run_does_not_depend_on_helpers_that_live(make, photos, undisturbed, monkeypatch, options):
     """Nor on those that are killed in the midst of it."""
-    helped, lost, never = (make(name, **options) for name in ("helped", "lost", "never"))
-    train(helped, photos)
+    helped, lost, never = undisturbed(options), make("lost", **options), make("never", **options)
     while not lost.finished:
         train_step(lost, photos)
         if lost.state.step % 4 == 0 and lost.visit.steps.crew is not None:
@@ -150,38 +167,37 @@ def test_a_run_does_not_depend_on_helpers_that_live(make, photos, monkeypatch, o
                 os.kill(pid, signal.SIGKILL)
     monkeypatch.setattr("abcd_ns.engine.train.step.drawing.can_fork", lambda _: False)
     train(never, photos)
-    assert len(whole_scene(helped)) > 60  # blocks grew
-    assert equal(whole_scene(helped), whole_scene(lost))
-    assert equal(whole_scene(helped), whole_scene(never))
+    assert len(helped) > 60  # blocks grew
+    assert equal(helped, whole_scene(lost))
+    assert equal(helped, whole_scene(never))
 
 
-def test_a_block_that_outgrows_the_shared_memory_is_trained_all_the_same(make, photos, monkeypatch):
-    wide = make("wide")
-    train(wide, photos)
+def test_a_block_that_outgrows_the_shared_memory_is_trained_all_the_same(
+    make, photos, undisturbed, monkeypatch
+):
+    wide = undisturbed({})
     monkeypatch.setattr(crew_module, "GROWTH", 1)
     monkeypatch.setattr(crew_module, "SPARE", 3)
     narrow = make("narrow")
     train(narrow, photos)
-    assert len(whole_scene(wide)) > 66
-    assert equal(whole_scene(wide), whole_scene(narrow))
+    assert len(wide) > 66
+    assert equal(wide, whole_scene(narrow))
 
 
 @pytest.mark.parametrize(("options", "stop"), [({}, 3), ({}, 8), ({}, 17), (WARM, 5), (WARM, 12)])
-def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, options, stop):
-    straight, stopped = make("straight", **options), make("stopped", **options)
-    train(straight, photos)
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, undisturbed, options, stop):
+    stopped = make("stopped", **options)
     train(stopped, photos, steps=stop)
     stopped.save()
     stopped.scene.store.close()
     resumed = make("stopped", resume=True, **options)
     train(resumed, photos)
-    assert equal(whole_scene(straight), whole_scene(resumed))
+    assert equal(undisturbed(options), whole_scene(resumed))
 
 
-def test_each_member_has_its_part_of_the_room_for_layers(make, photos):
+def test_each_member_has_its_part_of_the_room_for_layers(make, photos, undisturbed):
     """And draws anew what has no room there."""
-    roomy, tight = make("roomy"), make("tight", layer_bytes=80_000)
-    train(roomy, photos)
+    tight = make("tight", layer_bytes=80_000)
     held = []
     while not tight.finished:
         train_step(tight, photos)
@@ -189,7 +205,7 @@ def test_each_member_has_its_part_of_the_room_for_layers(make, photos):
             assert len(tight.visit.steps.crew.pids) == 1
             held.append(tight.layer_bytes)
     assert 0 < max(held) <= 40_000
-    assert equal(whole_scene(roomy), whole_scene(tight))
+    assert equal(undisturbed({}), whole_scene(tight))
 
 
 def test_helpers_end_with_their_visit(make, photos):
