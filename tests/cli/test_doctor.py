@@ -28,6 +28,7 @@ HEALTHY = Facts(
         commit=None,
         python="3.11.9",
         versions=dict.fromkeys(VERSIONS, "1.0") | TESTED | {"viser": "1.0.25"},
+        ray="2.60.0",
         broken={},
         registered=True,
         has_ns_train=True,
@@ -41,6 +42,7 @@ HEALTHY = Facts(
         disk_free_bytes=500 * GIB,
         may_write=True,
         gpu=Gpu("a GPU", 80 * GIB, "9.0"),
+        gpus=2,
         torch_cuda="13.0",
         driver="580.1",
     ),
@@ -74,6 +76,22 @@ def with_hardware(**changes) -> Facts:
 
 def with_kernels(facts: Facts = HEALTHY, **changes) -> Facts:
     return replace(facts, kernels=replace(facts.kernels, **changes))
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        (HEALTHY, "up to 2, one for each GPU: --pipeline.workers, by Ray 2.60.0"),
+        (with_packages(ray=None), "up to 2, one for each GPU: --pipeline.workers, after pip install"),
+        (with_hardware(gpus=1), "none here: one GPU"),
+        (NO_GPU, "up to 8, one for each core"),
+    ],
+)
+def test_it_says_how_many_workers_there_could_be(capsys, monkeypatch, facts, said):
+    monkeypatch.setattr(command, "gather", lambda: facts)
+    assert doctor() == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("workers"))
+    assert said in line
 
 
 def test_a_healthy_machine_has_no_findings():

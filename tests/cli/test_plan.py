@@ -120,7 +120,27 @@ def test_the_screen_is_short_and_says_more_when_asked(capsys):
     assert math.isfinite(found.hours[1])
 
 
-@pytest.mark.parametrize("option", [{"blocks": -1}, {"downscale": 0}, {"steps": 0}, {"max_gaussians": -5}])
+def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
+    alone, found = (
+        forecast(capture(), Wanted(max_gaussians=600, workers=n), Console(quiet=True)) for n in (1, 3)
+    )
+    assert (alone.fit.blocks, found.fit.blocks) == (1, 6)
+    numbers = DeviceNeeds(48 * 36, 4).parameter_bytes
+    block, around = (share.nbytes for share in found.sent)
+    assert block == 2 * 3 * 100 * numbers  # with both moments, there and back
+    assert around == 500 * numbers
+    more = sum(s.nbytes for s in found.ram) - sum(s.nbytes for s in alone.ram)
+    assert more == 600 * numbers + 6 * block  # six visits are out at once
+    print_forecast(alone, Console(width=120))
+    assert "sent" not in capsys.readouterr().out
+    print_forecast(found, Console(width=120), verbose=True)
+    shown = capsys.readouterr().out
+    assert all(share.what in shown for share in found.sent)
+
+
+@pytest.mark.parametrize(
+    "option", [{"blocks": -1}, {"downscale": 0}, {"steps": 0}, {"max_gaussians": -5}, {"workers": 0}]
+)
 def test_options_out_of_range_are_refused(tmp_path, option):
     with pytest.raises(UserError, match=next(iter(option)).replace("_", "-")):
         plan(tmp_path, **option)

@@ -80,6 +80,8 @@ def _lines(facts: Facts, verbose: bool) -> Iterator[str]:
         versions if verbose else {"packages": ", ".join(f"{n} {version}" for n, version in versions.items())}
     )
     rows |= _hardware(facts.hardware, verbose) if facts.hardware else {"machine": UNKNOWN}
+    if facts.hardware:
+        rows["workers"] = _workers(facts.hardware, packages.ray)
     if facts.kernels is None:
         rows["kernels"] = "unknown, as packages do not start"
     else:
@@ -105,6 +107,15 @@ def _hardware(hardware: Hardware, verbose: bool) -> dict[str, str]:
         "torch's CUDA": hardware.torch_cuda or "none",
     }
     return {**rows, **more} if verbose else rows
+
+
+def _workers(hardware: Hardware, ray: str | None) -> str:
+    """How many blocks could be trained at once."""
+    most, of = (hardware.gpus, "GPU") if hardware.gpu else (hardware.cores, "core")
+    if most < 2:
+        return f"none here: one {of}"
+    said = f"up to {most}, one for each {of}: --pipeline.workers"
+    return f"{said}, by Ray {ray}" if ray else f"{said}, after pip install 'abcd-ns[cluster]'"
 
 
 def _kernels(kernels: Kernels, on_gpu: bool, verbose: bool) -> dict[str, str]:

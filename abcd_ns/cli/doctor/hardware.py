@@ -42,6 +42,8 @@ class Hardware:
     """Whether this user may write there."""
     gpu: Gpu | None
     """As torch sees it."""
+    gpus: int
+    """How many there are."""
     torch_cuda: str | None
     """The CUDA version that torch was built for, if any."""
     driver: str | None
@@ -63,6 +65,7 @@ def look_at_hardware() -> Hardware:
         disk_free_bytes=shutil.disk_usage(place).free,
         may_write=os.access(place, os.W_OK),
         gpu=_gpu(),
+        gpus=torch.cuda.device_count(),
         torch_cuda=torch.version.cuda,
         driver=_driver(),
     )

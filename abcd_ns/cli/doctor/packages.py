@@ -16,6 +16,8 @@ from abcd_ns.machine import own_commit, package_version
 
 VERSIONS = ("torch", "torchvision", "nerfstudio", "gsplat", "viser", "pycolmap", "numpy", "pillow")
 """Distributions that are listed."""
+RAY = "ray"
+"""What workers need, an extra."""
 STARTED = ("torch", "torchvision", "cv2", "pycolmap", "gsplat", "abcd_ns.nerfstudio.method_configs")
 """Modules that are imported, each after what it needs. The last one brings nerfstudio."""
 EXPORT = "open3d"
@@ -31,6 +33,8 @@ class Packages:
     python: str
     versions: dict[str, str | None]
     """By distribution; None where it is not installed."""
+    ray: str | None
+    """Its version; None where it is not installed."""
     broken: dict[str, str]
     """The error with which a module's import ends, by module."""
     registered: bool
@@ -60,6 +64,7 @@ def look_at_packages(done: Callable[[], None]) -> Packages:
         commit=own_commit(),
         python=platform.python_version(),
         versions={name: package_version(name) for name in VERSIONS},
+        ray=package_version(RAY),
         broken=broken,
         registered="abcd" in methods,
         has_ns_train=beside.exists() or shutil.which("ns-train") is not None,

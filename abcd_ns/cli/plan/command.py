@@ -22,6 +22,7 @@ from abcd_ns.cli.plan.forecast import (
     device_shares,
     disk_shares,
     ram_shares,
+    sent_shares,
     time_steps,
     views_of_blocks,
 )
@@ -38,6 +39,7 @@ from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.fit import GB, Demand, Fit, device_budget, find_fit
 from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.nerfstudio.workers import BLOCKS_EACH
 
 R = TypeVar("R")
 FEW_VIEWS = 3
@@ -52,6 +54,7 @@ def plan(
     device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0,
     max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000,
+    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
     verbose: bool = False,
 ) -> int:
     """Say what a run on these photos will need, and what would not fit; trains nothing, writes nothing.
@@ -60,6 +63,8 @@ def plan(
 
     abcd plan --data garden --device-budget-gb 6
 
+    abcd plan --data garden --workers 4
+
     Args:
         data: the scene, as for `ns-train abcd --data`.
         downscale: divides the photos' width and height; left out, no side is over 1600 px, as in training.
@@ -67,6 +72,7 @@ def plan(
         device_budget_gb: memory of the device that training may take; 0 takes what is free.
         max_gaussians: limit on Gaussians in the whole scene; 0 is none, and five for each point are expected.
         steps: of the run.
+        workers: blocks trained at once, each by a process on a GPU of its own or on a part of the cores.
         verbose: show what takes the room, and how points and views are spread over the blocks.
 
     Returns:
@@ -78,11 +84,11 @@ def plan(
     for option, value in (("--blocks", blocks), ("--max-gaussians", max_gaussians)):
         if value < 0:
             raise UserError(f"{option} is {value}; it must be 0 or more.")
-    for option, value in (("--downscale", downscale), ("--steps", steps)):
+    for option, value in (("--downscale", downscale), ("--steps", steps), ("--workers", workers)):
         if value is not None and value < 1:
             raise UserError(f"{option} is {value}; it must be at least 1.")
     console = Console()
-    options = (blocks, device_budget_gb, max_gaussians, steps)
+    options = (blocks, device_budget_gb, max_gaussians, steps, workers)
     found = forecast(read(data, downscale, console), Wanted(*options), console)
     print_forecast(found, console, verbose)
     return 1 if found.warnings else 0
@@ -96,6 +102,7 @@ class Wanted:
     device_budget_gb: float = 0.0
     max_gaussians: int = 0
     steps: int = 30_000
+    workers: int = 1
 
 
 @dataclass(frozen=True)
@@ -145,7 +152,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
     demand = Demand(pixels, len(points), training, most=most, factor=capture.factor, on_cpu=on_cpu)
     fit = find_fit(device_budget(wanted.device_budget_gb, device), demand)
-    fit = replace(fit, blocks=wanted.blocks or fit.blocks)
+    at_least = BLOCKS_EACH * wanted.workers if wanted.workers > 1 else 1
+    fit = replace(fit, blocks=wanted.blocks or max(fit.blocks, at_least))
     training = replace(training, limits=replace(training.limits, **fit.limits))
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
@@ -159,7 +167,9 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     seconds = _said(console, "Timing a step", lambda: time_steps(gaussians, spread, training, batch))
     shares = {
         "device": device_shares(fit, needs),
-        "ram": ram_shares(fit, needs, sum(3 * view.full.pixels for view in views), default_budget()),
+        "ram": ram_shares(
+            fit, needs, sum(3 * view.full.pixels for view in views), default_budget(), wanted.workers
+        ),
         "disk": disk_shares(fit, needs),
     }
     return Forecast(
@@ -172,6 +182,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         steps=wanted.steps,
         seconds_per_step=seconds,
         warnings=tuple(warnings_of(fit, seen, **shares)),
+        workers=wanted.workers,
+        sent=sent_shares(fit, needs) if wanted.workers > 1 else (),
     )
 
 
@@ -224,6 +236,11 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         rows[title] = f"{_total(shares) / GB:.2f} GB at most, {free / GB:.1f} GB may be taken"
         if verbose:
             rows |= {f"  {share.what}": f"{share.nbytes / GB:.2f} GB" for share in shares}
+    if found.workers > 1:
+        rows["workers"] = f"{found.workers}, each with as much of a GPU, or of the RAM, as the device above"
+        rows["sent a visit"] = f"{_total(found.sent) / GB:.2f} GB at most"
+        if verbose:
+            rows |= {f"  {share.what}": f"{share.nbytes / GB:.2f} GB" for share in found.sent}
     if verbose:
         for what, values in (("points", found.points_of_block), ("views", found.views_of_block)):
             spread = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"

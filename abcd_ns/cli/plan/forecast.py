@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from abcd_ns.cluster.dispatcher import SLACK
 from abcd_ns.engine.render import Shot, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.space.tree import BlockTree
@@ -51,6 +52,9 @@ class Forecast:
     seconds_per_step: float
     """Measured with the initial points."""
     warnings: tuple[str, ...]
+    workers: int = 1
+    sent: tuple[Share, ...] = ()
+    """What a visit by a worker moves through Ray; nothing without workers."""
 
     @property
     def hours(self) -> tuple[float, float]:
@@ -78,8 +82,7 @@ def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple
 
 def device_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
     """What a visit to a block of the expected size takes on the device."""
-    limit = fit.sole if fit.blocks == 1 else fit.limit
-    largest = min(-(-fit.gaussians // fit.blocks), limit)
+    largest = _largest(fit)
     trained = largest * needs.gaussian_bytes
     return (
         Share(f"a block of {largest:,} Gaussians in training", trained),
@@ -89,10 +92,29 @@ def device_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
     )
 
 
-def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int) -> tuple[Share, ...]:
+def _largest(fit: Fit) -> int:
+    """Gaussians of the largest block, as far as can be said."""
+    return min(-(-fit.gaussians // fit.blocks), fit.sole if fit.blocks == 1 else fit.limit)
+
+
+def sent_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
+    """What a visit by a worker moves: at most, for a machine keeps what it was sent until it changes."""
+    block = _largest(fit) * needs.parameter_bytes
+    return (
+        Share("its block, with the optimiser's state, there and back", 2 * STATES * block),
+        Share("the blocks around it, as they are drawn", fit.gaussians * needs.parameter_bytes - block),
+    )
+
+
+def ram_shares(
+    fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int, workers: int = 1
+) -> tuple[Share, ...]:
     """What the rest takes in RAM, beside Python and torch."""
     scene = fit.gaussians * needs.parameter_bytes
+    out = 2 * SLACK * workers * STATES * _largest(fit) * needs.parameter_bytes
+    lent = (Share("blocks that are out, there and back, and those around them", out + scene),)
     return (
+        *(lent if workers > 1 else ()),
         Share("decoded photos", min(photo_bytes, photo_budget)),
         Share("frozen blocks", min(scene, FROZEN_BYTES)),
         Share("the whole scene, while a checkpoint is written", scene),
