@@ -5,6 +5,8 @@ be no less than that, and no more than LAVISH times as much, or devices would be
 kernels take inside, and what an allocator cannot use, is not seen here.
 """
 
+import gc
+
 import pytest
 
 from abcd_ns.engine.layers.layer_store import LayerStore
@@ -22,6 +24,7 @@ GROWING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=2)
 
 def run_on(folder, *, gaussians: int, width: int, size: float = 0.02, **options):
     """A coordinator for square pictures, after two steps, and its photos."""
+    gc.collect()  # earlier ones hang in cycles, and would be counted until chance takes them
     views = ring_of_views(4, width=width, height=width)
     photos = Photos(random_gaussians(30, seed=7, size=0.12), views)
     start = random_gaussians(gaussians, seed=1, size=size, sh_degree=3)
