@@ -10,7 +10,7 @@ import torch
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
-from abcd_ns.engine.layers.painter import FrozenLayers, Painter, PaintSettings
+from abcd_ns.engine.layers.painter import FrozenLayers, Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.influence import coarser
@@ -144,12 +144,11 @@ class BlockPictures:
 
     def _around(self, block: int, window: ZWindow | None) -> FrozenLayers:
         painter, view = self.painter, self.view
-        seen_by = painter.frusta([(view, view.full)])
+        seen_by, seen = painter.frusta([(view, view.full)]), [Seen(view, view.full, window)]
         parts: dict[int, FrozenLayers | None] = {}
         for unit in painter.units(exclude=block):
             loaded = painter.load(unit, block, seen_by)
-            cut = {"active": block, "window": window}
-            parts[unit] = painter.paint(unit, loaded, view, view.full, self.settings, **cut)
+            (parts[unit],) = painter.paint(unit, loaded, seen, self.settings, active=block)
             painter.fold_up(parts, unit, view)
         return painter.fold(parts, view, view.full)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.layers.compositing import fold, sandwich
-from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow
+from abcd_ns.engine.render import CutShot, Shot, TorchRasterizer, ZWindow
 from abcd_ns.engine.space.intervals import cell_windows
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_kd
@@ -186,10 +186,10 @@ def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(ras
     active, frozen = everyone[torch.arange(100)], everyone[torch.arange(100, 300)]
     window = rasterizer.depth_window(active, view(), crop=crop, visible=0.0)
     every = ZWindow.everything(window.grid, device, torch.float32)
-    asked = {"front": every.before(window), "inside": window, "back": every.behind(window)}
+    shot = CutShot(view(), crop, every.before(window), window, every.behind(window))
     cuts = []
     for backend in (rasterizer, TorchRasterizer("never", tile_side=16)):
-        cut = backend.cut(frozen, view(), **asked, crop=crop, sh_degree=3)
+        cut = backend.cut(frozen, shot, sh_degree=3)
         (middle,) = backend.draw(active, [Shot(view(), crop, cut.inside, window)], sh_degree=3)
         found = sandwich(cut.front, middle.layer, cut.back, torch.zeros(3, device=device))
         whole = backend(everyone, view(), sh_degree=3, crop=crop)

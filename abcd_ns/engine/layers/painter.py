@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
-from abcd_ns.engine.render import Rasterizer, ZWindow
+from abcd_ns.engine.render import CutShot, Rasterizer, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.culling import Frusta, Optics, intersection
 from abcd_ns.engine.space.intervals import ray_interval
@@ -45,6 +45,16 @@ class FrozenLayers:
     back: Layer
     inside: Splats | None = None
     """The unit's own Gaussians that have fragments in the window, if there are any; None by means."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Whose picture is drawn."""
+
+    view: View
+    crop: Crop
+    window: ZWindow | None = None
+    """Of the active block, by fragments: what lies in it is drawn neither in front nor behind."""
 
 
 @dataclass(frozen=True)
@@ -158,38 +168,46 @@ class Painter:
         self,
         unit: int,
         loaded: Loaded,
-        view: View,
-        crop: Crop,
+        seen: Sequence[Seen],
         settings: PaintSettings,
         *,
         active: int | None = None,
-        window: ZWindow | None = None,
-    ) -> FrozenLayers | None:
-        """Draw a unit, loaded by `load`, cut by the window of the active block (by fragments) or put
-        whole before or behind the active block (by means). Without an active block all is in front.
-        None if the view sees nothing of it."""
-        gaussians, nothing = loaded.gaussians, self._nothing(view, crop)
-        if not loaded.shows_in(view):
-            return None
-        if self.ownership == "means":
-            layer = self._draw(gaussians, view, crop, settings, None)
-            front = active is None or self._is_in_front(unit, active, view)
-            return FrozenLayers(layer, nothing) if front else FrozenLayers(nothing, layer)
-        span = self.span(unit, view, crop)
-        if window is None:
-            return FrozenLayers(self._draw(gaussians, view, crop, settings, span), nothing)
-        cut = self.rasterizer.cut(
-            gaussians,
-            view,
-            front=span.before(window),
-            inside=window,
-            back=span.behind(window),
-            crop=crop,
-            sh_degree=settings.sh_degree,
-            antialiased=settings.antialiased,
-        )
-        # What reaches in from another unit is inside that one's.
-        return FrozenLayers(cut.front, cut.back, cut.inside[torch.where(cut.members < loaded.own)[0]])
+    ) -> Iterator[FrozenLayers | None]:
+        """Draw a unit, loaded by `load`, for each of these views: cut by the window of the active block (by
+        fragments) or put whole before or behind the active block (by means). Without an active block all
+        is in front. None where the view sees nothing of it."""
+        shows = [loaded.shows_in(one.view) for one in seen]
+        shots = [
+            self._cut_shot(unit, one)
+            for one, shown in zip(seen, shows, strict=True)
+            if shown and one.window is not None
+        ]
+        options = {"sh_degree": settings.sh_degree, "antialiased": settings.antialiased}
+        cuts = self.rasterizer.cuts(loaded.gaussians, shots, **options)
+        for one, shown in zip(seen, shows, strict=True):
+            if not shown:
+                yield None
+            elif one.window is None:
+                yield self._paint_whole(unit, loaded.gaussians, one, settings, active)
+            else:
+                cut = next(cuts)
+                # What reaches in from another unit is inside that one's.
+                own = cut.inside[torch.where(cut.members < loaded.own)[0]]
+                yield FrozenLayers(cut.front, cut.back, own)
+
+    def _cut_shot(self, unit: int, seen: Seen) -> CutShot:
+        span, window = self.span(unit, seen.view, seen.crop), seen.window
+        return CutShot(seen.view, seen.crop, span.before(window), window, span.behind(window))
+
+    def _paint_whole(
+        self, unit: int, gaussians: Gaussians, seen: Seen, settings: PaintSettings, active: int | None
+    ) -> FrozenLayers:
+        by_means = self.ownership == "means"
+        span = None if by_means else self.span(unit, seen.view, seen.crop)
+        layer = self._draw(gaussians, seen.view, seen.crop, settings, span)
+        nothing = self._nothing(seen.view, seen.crop)
+        front = not by_means or active is None or self._is_in_front(unit, active, seen.view)
+        return FrozenLayers(layer, nothing) if front else FrozenLayers(nothing, layer)
 
     def span(self, unit: int, view: View, crop: Crop) -> ZWindow:
         """Where the rays through the crop's tiles are inside a unit."""
@@ -235,7 +253,7 @@ class Painter:
         parts: dict[int, FrozenLayers | None] = {}
         for unit in self.units():
             loaded = self.load(unit, seen_by=self.frusta([(view, crop)]))
-            parts[unit] = self.paint(unit, loaded, view, crop, settings)
+            (parts[unit],) = self.paint(unit, loaded, [Seen(view, crop)], settings)
             self.fold_up(parts, unit, view)
         return self.fold(parts, view, crop).front
 

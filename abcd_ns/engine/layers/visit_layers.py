@@ -9,7 +9,7 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
-from abcd_ns.engine.layers.painter import FrozenLayers, Loaded, Painter, PaintSettings
+from abcd_ns.engine.layers.painter import FrozenLayers, Loaded, Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -155,8 +155,8 @@ class VisitLayers:
         for unit in self._units:
             loaded = self._painter.load(unit, exclude=block, seen_by=self._seen_by)
             self._loaded[unit] = len(loaded.gaussians)
-            for view in views:
-                parts[view][unit] = self._paint(unit, loaded, view)
+            for view, part in zip(views, self._paint(unit, loaded, views), strict=True):
+                parts[view][unit] = part
                 self._painter.fold_up(parts[view], unit, self._views[view])
                 if unit == self._units[-1]:
                     yield view, self._keep(view, parts.pop(view))
@@ -189,30 +189,21 @@ class VisitLayers:
     def _find_windows(self, views: Iterable[int]) -> None:
         if self._own is None:
             return
-        own = self._own.to(self._painter.device)
-        for view in views:
-            if view not in self._windows:
-                self._windows[view] = self._painter.rasterizer.depth_window(
-                    own,
-                    self._views[view],
-                    crop=self._geometry.crops[view],
-                    visible=self._window_weight,
-                    antialiased=self._settings.antialiased,
-                )
+        new = [view for view in views if view not in self._windows]
+        found = self._painter.rasterizer.depth_windows(
+            self._own.to(self._painter.device),
+            [(self._views[view], self._geometry.crops[view]) for view in new],
+            visible=self._window_weight,
+            antialiased=self._settings.antialiased,
+        )
+        self._windows.update(zip(new, found, strict=True))
 
     def _window(self, view: int) -> ZWindow | None:
         return None if self._own is None else self._windows[view]
 
-    def _paint(self, unit: int, loaded: Loaded, view: int) -> FrozenLayers | None:
-        return self._painter.paint(
-            unit,
-            loaded,
-            self._views[view],
-            self._geometry.crops[view],
-            self._settings,
-            active=self._geometry.block,
-            window=self._window(view),
-        )
+    def _paint(self, unit: int, loaded: Loaded, views: Sequence[int]) -> Iterator[FrozenLayers | None]:
+        seen = [Seen(self._views[view], self._geometry.crops[view], self._window(view)) for view in views]
+        return self._painter.paint(unit, loaded, seen, self._settings, active=self._geometry.block)
 
     def _keep(self, view: int, parts: dict[int, FrozenLayers | None]) -> Kept:
         folded = self._painter.fold(parts, self._views[view], self._geometry.crops[view])

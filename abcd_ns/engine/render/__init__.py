@@ -4,13 +4,14 @@ from typing import Literal
 
 import torch
 
-from abcd_ns.engine.render.base import Raster, Rasterizer, Shot
+from abcd_ns.engine.render.base import CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.cpu.chunk_kernels import CompilePolicy
 from abcd_ns.engine.render.self_check import self_check
 from abcd_ns.engine.render.z_window import ZWindow
 
 __all__ = [
+    "CutShot",
     "Raster",
     "Rasterizer",
     "Shot",

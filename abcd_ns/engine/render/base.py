@@ -1,6 +1,6 @@
 """What every rasterizer takes and gives."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -45,6 +45,17 @@ class Shot:
     """What occludes and is occluded, without gradients: projected into `view` by the same rasterizer."""
     z_window: ZWindow | None = None
     """Masks the fragments of `frozen` where it is given, else those of the Gaussians; of this crop."""
+
+
+@dataclass(frozen=True)
+class CutShot:
+    """One picture to cut: its pixels, and the windows that its fragments are parted by."""
+
+    view: View
+    crop: Crop
+    front: ZWindow
+    inside: ZWindow
+    back: ZWindow
 
 
 @dataclass(frozen=True)
@@ -143,24 +154,34 @@ class Rasterizer(Protocol):
         options = {"sh_degree": sh_degree, "antialiased": antialiased, "absgrad": absgrad}
         return self.draw(gaussians, [shot], **options)[0]
 
-    def cut(
+    def cuts(
+        self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
+    ) -> Iterator[Cut]:
+        """For each shot the fragments in two windows as layers, and what has fragments in a third; no
+        gradients. Drawn as they are asked for, a few at a time."""
+        ...
+
+    def cut(self, gaussians: Gaussians, shot: CutShot, *, sh_degree: int, antialiased: bool = False) -> Cut:
+        """`cuts` for a single shot."""
+        (cut,) = self.cuts(gaussians, [shot], sh_degree=sh_degree, antialiased=antialiased)
+        return cut
+
+    def depth_windows(
         self,
         gaussians: Gaussians,
-        view: View,
+        seen: Sequence[tuple[View, Crop]],
         *,
-        front: ZWindow,
-        inside: ZWindow,
-        back: ZWindow,
-        crop: Crop,
-        sh_degree: int,
+        visible: float,
         antialiased: bool = False,
-    ) -> Cut:
-        """The fragments in two windows as layers, and what has fragments in a third; no gradients."""
+    ) -> Iterator[ZWindow]:
+        """For each crop the range of camera z, in each of its tiles, in which the Gaussians show, with
+        nothing else in the scene; no gradients. See z_window.showing."""
         ...
 
     def depth_window(
         self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
     ) -> ZWindow:
-        """In each tile of the crop the range of camera z in which the Gaussians show, with nothing else in
-        the scene; no gradients. See z_window.showing."""
-        ...
+        """`depth_windows` for a single crop."""
+        options = {"visible": visible, "antialiased": antialiased}
+        (window,) = self.depth_windows(gaussians, [(view, crop)], **options)
+        return window

@@ -136,12 +136,16 @@ class TileSheet:
         columns = [(crop.x, crop.y, crop.width, crop.height, self.side) for crop in crops]
         return like.new_tensor(columns).T.contiguous()
 
+    @property
+    def starts(self) -> list[int]:
+        """The number of each grid's first tile, and one past the last grid's last."""
+        return list(itertools.accumulate(self._sizes, initial=0))
+
     def places(self, device: torch.device) -> Int[Tensor, "2 g"]:
         """Of each grid (a, c): the tile in row r and column q of the image has the number a + c r + q."""
-        starts = list(itertools.accumulate(self._sizes, initial=0))
         places = [
             (start - grid.first_row * grid.cols - grid.first_col, grid.cols)
-            for start, grid in zip(starts, self.grids, strict=False)
+            for start, grid in zip(self.starts, self.grids, strict=False)
         ]
         return torch.tensor(places, device=device).T.contiguous()
 

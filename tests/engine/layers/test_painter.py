@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.layers.compositing import fold
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.painter import Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.intervals import cell_windows, ray_interval
@@ -156,10 +156,8 @@ def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussian
             draw.depth_window(own, view, crop=view.full, visible=0.05),
         ]
         for window in windows:
-            parts = {
-                unit: paint.paint(unit, loaded[unit], view, view.full, SETTINGS, active=3, window=window)
-                for unit in units
-            }
+            seen = [Seen(view, view.full, window)]
+            parts = {unit: next(paint.paint(unit, loaded[unit], seen, SETTINGS, active=3)) for unit in units}
             cut = paint.fold(parts, view, view.full)
             splats = cut.inside.planes if cut.inside is not None else torch.zeros(2, 0)
             assert splats.unique(dim=1).shape == splats.shape

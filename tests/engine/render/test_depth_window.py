@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from abcd_ns.engine.layers.compositing import sandwich
-from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow
+from abcd_ns.engine.render import CutShot, Shot, TorchRasterizer, ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -121,10 +121,39 @@ def test_at_0_front_inside_and_back_are_the_merged_picture(seed, crop):
     )
     span = ZWindow.everything(window.grid, "cpu", torch.float64)
     before, behind = span.before(window), span.behind(window)
-    cut = DRAW.cut(frozen, view, front=before, inside=window, back=behind, crop=crop, sh_degree=0)
+    cut = DRAW.cut(frozen, CutShot(view, crop, before, window, behind), sh_degree=0)
     assert torch.equal(cut.members, cut.members.unique())
     assert torch.equal(cut.inside.planes, DRAW.project(frozen, view)[cut.members].planes)
     (middle,) = DRAW.draw(active, [Shot(view, crop, cut.inside, window)], sh_degree=0)
     found = sandwich(cut.front, middle.layer, cut.back, torch.zeros(3, dtype=torch.float64))
     whole = DRAW(everyone, view, sh_degree=0, crop=crop)
     assert float((found - whole.color).abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("compile", ["never", "auto"])
+@pytest.mark.parametrize("at_once", [(1, 10**6), (600, 10**6), (10**6, 130), (10**6, 10**6)])
+def test_views_that_are_drawn_together_have_the_pictures_of_each_alone(monkeypatch, compile, at_once):
+    monkeypatch.setattr("abcd_ns.engine.render.cpu.backend.PIXELS_AT_ONCE", at_once[0])
+    monkeypatch.setattr("abcd_ns.engine.render.cpu.backend.SPLATS_AT_ONCE", at_once[1])
+    draw = TorchRasterizer(compile)
+    views = ring_of_views(5, width=32, height=24)
+    seen = [(view, Crop(k, 2 * k, 12 + 4 * k, 9 + 2 * k)) for k, view in enumerate(views)]
+    active, frozen = random_gaussians(30, seed=1), random_gaussians(60, seed=2)
+    windows = list(draw.depth_windows(active, seen, visible=0.02))
+    assert [window.grid for window in windows] == [draw.window_grid(crop) for _, crop in seen]
+    shots = []
+    for (view, crop), window in zip(seen, windows, strict=True):
+        alone = draw.depth_window(active, view, crop=crop, visible=0.02)
+        assert torch.equal(window.near, alone.near)
+        assert torch.equal(window.far, alone.far)
+        span = ZWindow.everything(window.grid, "cpu", torch.float32)
+        shots.append(CutShot(view, crop, span.before(window), window, span.behind(window)))
+    for cut, shot in zip(draw.cuts(frozen, shots, sh_degree=1), shots, strict=True):
+        alone = draw.cut(frozen, shot, sh_degree=1)
+        assert torch.equal(cut.members, alone.members)
+        assert torch.equal(cut.inside.planes, alone.inside.planes)
+        for side in ("front", "back"):
+            found, expected = getattr(cut, side), getattr(alone, side)
+            assert torch.equal(found.color, expected.color)
+            assert torch.equal(found.transmittance, expected.transmittance)
+            assert float((1 - found.transmittance).max()) > 0

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.render import Rasterizer, Shot, TorchRasterizer, ZWindow, self_check
+from abcd_ns.engine.render import CutShot, Rasterizer, Shot, TorchRasterizer, ZWindow, self_check
 from abcd_ns.engine.render.cuda import backend as gsplat_backend
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
@@ -208,10 +208,8 @@ def test_where_many_views_see_gaussians_is_what_each_says(backend, monkeypatch):
 def test_cut_is_that_of_the_torch_backend(backend, crop):
     gaussians, inside = random_gaussians(60), window_for(crop)
     span = ZWindow.everything(inside.grid, "cpu", torch.float64)
-    windows = {"front": span.before(inside), "inside": inside, "back": span.behind(inside)}
-    found, expected = (
-        draw.cut(gaussians, VIEW, crop=crop, sh_degree=1, **windows) for draw in (backend, TILED)
-    )
+    shot = CutShot(VIEW, crop, span.before(inside), inside, span.behind(inside))
+    found, expected = (draw.cut(gaussians, shot, sh_degree=1) for draw in (backend, TILED))
     for side in ("front", "back"):
         one, other = getattr(found, side), getattr(expected, side)
         torch.testing.assert_close(one.color, other.color, rtol=1e-9, atol=1e-10)

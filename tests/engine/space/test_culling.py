@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.painter import Painter, PaintSettings, Seen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.culling import BOUNDS_SLANT, EVERYWHERE, Frusta, Optics, bounds_of, intersection
 from abcd_ns.engine.space.partition import build_kd
@@ -148,7 +148,7 @@ def test_few_parts_are_held_while_units_are_folded(ownership):
     for view in views:
         parts, most = {}, 0
         for unit in paint.units():
-            parts[unit] = paint.paint(unit, paint.load(unit), view, view.full, SETTINGS)
+            (parts[unit],) = paint.paint(unit, paint.load(unit), [Seen(view, view.full)], SETTINGS)
             paint.fold_up(parts, unit, view)
             most = max(most, len(parts))
         assert list(parts) == [0]

@@ -1,14 +1,15 @@
 """The torch rasterizer: gsplat's drawing in plain torch, for any device."""
 
+import itertools
 import weakref
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.render.base import Cut, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu.binning import Candidates, find_candidates
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.render.cpu.compositing_function import Composite, Job, pair_weights
@@ -23,6 +24,9 @@ TILE_SIDE = 4
 """Pixels along a tile's side; small, since Gaussians of low-resolution views are a few pixels wide."""
 CHUNK = 8
 """Gaussians per kernel call and tile."""
+PIXELS_AT_ONCE, SPLATS_AT_ONCE = 1 << 17, 200_000
+"""Of the views that layers are drawn for in one pass, at most: for a few pixels or Gaussians calls cost more
+than what they compute."""
 
 
 class _TakeColumns(torch.autograd.Function):
@@ -129,49 +133,72 @@ class TorchRasterizer(Rasterizer):
         images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, candidates.rows), job))
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
+    def cuts(
+        self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
+    ) -> Iterator[Cut]:
+        """See Rasterizer.cuts. Each view is projected and binned once, and a few are drawn in one pass."""
+        for few in _a_few(shots, [shot.crop for shot in shots], gaussians):
+            yield from self._cut_together(gaussians, few, sh_degree, antialiased)
+
     @torch.no_grad()
-    def cut(
+    def _cut_together(
+        self, gaussians: Gaussians, shots: Sequence[CutShot], sh_degree: int, antialiased: bool
+    ) -> list[Cut]:
+        options = {"sh_degree": sh_degree, "antialiased": antialiased}
+        seen = [self.project(gaussians, shot.view, **options) for shot in shots]
+        splats, candidates = self._candidates(seen, [shot.crop for shot in shots])
+        members = candidates.within([shot.inside for shot in shots]).members
+        firsts = torch.arange(len(shots) + 1, device=members.device) * len(gaussians)
+        ends = torch.searchsorted(members, firsts).tolist()
+        members = [members[a:b] - k * len(gaussians) for k, (a, b) in enumerate(itertools.pairwise(ends))]
+        front = self._layers(splats, candidates.within([shot.front for shot in shots]))
+        back = self._layers(splats, candidates.within([shot.back for shot in shots]))
+        inside = [own[which] for own, which in zip(seen, members, strict=True)]
+        return [Cut(*parts) for parts in zip(front, back, inside, members, strict=True)]
+
+    def depth_windows(
         self,
         gaussians: Gaussians,
-        view: View,
+        seen: Sequence[tuple[View, Crop]],
         *,
-        front: ZWindow,
-        inside: ZWindow,
-        back: ZWindow,
-        crop: Crop,
-        sh_degree: int,
+        visible: float,
         antialiased: bool = False,
-    ) -> Cut:
-        """See Rasterizer.cut. Projected and binned once."""
-        splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
-        candidates = self._candidates(splats, crop)
-        members = candidates.within([inside]).members
-        layers = (self._layer(splats, candidates.within([window])) for window in (front, back))
-        return Cut(*layers, splats[members], members)
+    ) -> Iterator[ZWindow]:
+        """See Rasterizer.depth_windows. A few views are drawn in one pass."""
+        for few in _a_few(seen, [crop for _, crop in seen], gaussians):
+            yield from self._windows_together(gaussians, few, visible, antialiased)
 
     @torch.no_grad()
-    def depth_window(
-        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
-    ) -> ZWindow:
-        """See Rasterizer.depth_window."""
-        splats = self.project(gaussians, view, antialiased=antialiased)
-        candidates = self._candidates(splats, crop)
+    def _windows_together(
+        self, gaussians: Gaussians, seen: Sequence[tuple[View, Crop]], visible: float, antialiased: bool
+    ) -> list[ZWindow]:
+        projected = [self.project(gaussians, view, antialiased=antialiased) for view, _ in seen]
+        splats, candidates = self._candidates(projected, [crop for _, crop in seen])
         drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
         weight = pair_weights(drawn, self._job(candidates, splats.planes))
-        grid, drawn_in = self.window_grid(crop), candidates.sheet.grids[0]
         # Pairs come by depth, so that sorting by tile alone keeps them in order.
-        tile, order = grid.holding(drawn_in, candidates.pairs.tile).sort(stable=True)
-        return showing(grid, tile, candidates.z[order], weight[order], visible)
+        tile, order = candidates.pairs.tile.int().sort(stable=True)
+        z, weight = candidates.z.index_select(0, order), weight.index_select(0, order)
+        firsts = candidates.sheet.starts
+        ends = torch.searchsorted(tile, tile.new_tensor(firsts)).tolist()
+        found = []
+        for k, drawn_in in enumerate(candidates.sheet.grids):
+            grid, own = self.window_grid(drawn_in.crop), slice(ends[k], ends[k + 1])
+            held, again = grid.holding(drawn_in, tile[own].long() - firsts[k]).sort(stable=True)
+            found.append(showing(grid, held, z[own][again], weight[own][again], visible))
+        return found
 
-    def _candidates(self, splats: Splats, crop: Crop) -> Candidates:
-        sheet = TileSheet((TileGrid(crop, self.tile_side),))
-        grid_of = torch.zeros(len(splats), dtype=torch.long, device=splats.planes.device)
-        return find_candidates(splats, grid_of, sheet, built=self.kernels.built)
+    def _candidates(self, seen: Sequence[Splats], crops: Sequence[Crop]) -> tuple[Splats, Candidates]:
+        """What several views see, as one drawing; splats are numbered through, view by view."""
+        sheet = TileSheet(tuple(TileGrid(crop, self.tile_side) for crop in crops))
+        splats = Splats(torch.cat([splats.planes for splats in seen], dim=1)) if len(seen) > 1 else seen[0]
+        grid_of = torch.arange(len(seen), device=splats.planes.device).repeat_interleave(len(seen[0]))
+        return splats, find_candidates(splats, grid_of, sheet, built=self.kernels.built)
 
-    def _layer(self, splats: Splats, candidates: Candidates) -> Layer:
+    def _layers(self, splats: Splats, candidates: Candidates) -> list[Layer]:
         drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
-        (image,) = candidates.sheet.to_images(Composite.apply(drawn, self._job(candidates, splats.planes)))
-        return Layer(image[1:4].permute(1, 2, 0), image[0])
+        images = candidates.sheet.to_images(Composite.apply(drawn, self._job(candidates, splats.planes)))
+        return [Layer(image[1:4].permute(1, 2, 0), image[0]) for image in images]
 
     def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
         """`pack`, kept for the next view of the same Gaussians."""
@@ -183,6 +210,22 @@ class TorchRasterizer(Rasterizer):
         self, candidates: Candidates, planes: Float[Tensor, "r n"], absgrad_target: Tensor | None = None
     ) -> Job:
         return Job(candidates.lists(self.chunk), planes.shape[1], self.kernels, absgrad_target)
+
+
+Item = TypeVar("Item")
+
+
+def _a_few(items: Sequence[Item], crops: Sequence[Crop], gaussians: Gaussians) -> Iterator[list[Item]]:
+    """The items, with a crop each, in runs that are drawn in one pass."""
+    few, pixels = list[Item](), 0
+    for item, crop in zip(items, crops, strict=True):
+        pixels += crop.pixels
+        if few and (pixels > PIXELS_AT_ONCE or (len(few) + 1) * len(gaussians) > SPLATS_AT_ONCE):
+            yield few
+            few, pixels = [], crop.pixels
+        few.append(item)
+    if few:
+        yield few
 
 
 def _without_depths(planes: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:

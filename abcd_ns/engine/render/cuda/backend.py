@@ -4,7 +4,7 @@ Importing this module imports gsplat, which compiles its CUDA extension at the f
 """
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.render.base import Cut, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, Packed
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_screen, project
 from abcd_ns.engine.render.extents import extents_of
@@ -89,31 +89,37 @@ class GsplatRasterizer(Rasterizer):
             raster.info["n_cameras"] = len(shots)
         return tuple(rasters[k] for k in range(len(shots)))
 
-    @torch.no_grad()
-    def cut(
-        self,
-        gaussians: Gaussians,
-        view: View,
-        *,
-        front: ZWindow,
-        inside: ZWindow,
-        back: ZWindow,
-        crop: Crop,
-        sh_degree: int,
-        antialiased: bool = False,
-    ) -> Cut:
-        """See Rasterizer.cut. Projected and sorted once."""
-        splats = self.project(gaussians, view, sh_degree=sh_degree, antialiased=antialiased)
-        drawing = self._drawing_of(splats, crop, windowed=True)
-        members = drawing.members(drawing.inside([inside]))
-        layers = (drawing.only(drawing.inside([window])).layer() for window in (front, back))
-        return Cut(*layers, splats[members], members)
+    def cuts(
+        self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
+    ) -> Iterator[Cut]:
+        """See Rasterizer.cuts. Each is projected and sorted once."""
+        for shot in shots:
+            yield self._cut(gaussians, shot, sh_degree, antialiased)
 
     @torch.no_grad()
-    def depth_window(
-        self, gaussians: Gaussians, view: View, *, crop: Crop, visible: float, antialiased: bool = False
+    def _cut(self, gaussians: Gaussians, shot: CutShot, sh_degree: int, antialiased: bool) -> Cut:
+        splats = self.project(gaussians, shot.view, sh_degree=sh_degree, antialiased=antialiased)
+        drawing = self._drawing_of(splats, shot.crop, windowed=True)
+        members = drawing.members(drawing.inside([shot.inside]))
+        layers = (drawing.only(drawing.inside([window])).layer() for window in (shot.front, shot.back))
+        return Cut(*layers, splats[members], members)
+
+    def depth_windows(
+        self,
+        gaussians: Gaussians,
+        seen: Sequence[tuple[View, Crop]],
+        *,
+        visible: float,
+        antialiased: bool = False,
+    ) -> Iterator[ZWindow]:
+        """See Rasterizer.depth_windows."""
+        for view, crop in seen:
+            yield self._depth_window(gaussians, view, crop, visible, antialiased)
+
+    @torch.no_grad()
+    def _depth_window(
+        self, gaussians: Gaussians, view: View, crop: Crop, visible: float, antialiased: bool
     ) -> ZWindow:
-        """See Rasterizer.depth_window."""
         drawing = self._drawing_of(self.project(gaussians, view, antialiased=antialiased), crop)
         return showing(drawing.sheet.grids[0], drawing.tile, drawing.z, drawing.weights(), visible)
 
