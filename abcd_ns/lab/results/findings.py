@@ -1,16 +1,14 @@
-"""What an experiment says: the gap of best and worst, the knee of a curve, differences to the default."""
+"""What an experiment says: the gap of best and worst, differences to the default, growth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
+from abcd_ns.lab.results import frontier
 from abcd_ns.lab.results.results import Arm, Outcome, Results
 
 GOAL_DB = 0.5
 """Between the best and the worst number of blocks, no more than this: no cliff."""
-KNEE_DB = 0.2
-"""How far below the best a smaller budget of Gaussians may be and still count as enough."""
-
 GOAL_GROWTH = 0.05
 """Growth of peak memory that is allowed from the smallest scene to the largest."""
 
@@ -50,14 +48,6 @@ def find_gap(arms: Sequence[Arm]) -> Gap | None:
     if len(arms) < 2:
         return None
     return Gap(max(arms, key=lambda arm: arm.psnr), min(arms, key=lambda arm: arm.psnr))
-
-
-def find_knee(arms: Sequence[Arm]) -> Arm | None:
-    """The arm with the smallest budget that is within KNEE_DB of the best; None with fewer than two arms."""
-    if len(arms) < 2:
-        return None
-    best = max(arm.psnr for arm in arms)
-    return min((arm for arm in arms if best - arm.psnr <= KNEE_DB), key=lambda arm: arm.value)
 
 
 def find_growth(results: Results, name: str) -> float | None:
@@ -102,23 +92,7 @@ def _of_blocks(results: Results) -> tuple[str, ...]:
 
 
 def _of_gaussians(results: Results) -> tuple[str, ...]:
-    found = []
-    for method in results.methods:
-        arms = results.of(method)
-        knee = find_knee(arms)
-        if knee is None:
-            continue
-        best = max(arms, key=lambda arm: arm.psnr)
-        text = (
-            f"{method}: a limit of {knee.value:,} Gaussians is enough: {knee.psnr:.2f} dB, within "
-            f"{KNEE_DB:g} dB of the best measured ({best.psnr:.2f} dB, limit {best.value:,})."
-        )
-        if knee.value == max(arm.value for arm in arms):
-            text += " It is the largest that was tried: more may be better."
-        elif knee.value == min(arm.value for arm in arms):
-            text += " It is the smallest that was tried: fewer may do."
-        found.append(text)
-    return tuple(found)
+    return tuple(frontier.findings(results))
 
 
 def _of_options(results: Results) -> tuple[str, ...]:

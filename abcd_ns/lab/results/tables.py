@@ -14,6 +14,7 @@ from rich.table import Table
 
 from abcd_ns.lab.job import HELD_OUT_EVERY
 from abcd_ns.lab.results.findings import find_default, find_difference
+from abcd_ns.lab.results.frontier import label_of
 from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.machine import Machine
@@ -81,7 +82,7 @@ _MEMORY = ("peak RAM (GiB)", "peak GPU memory (GiB)")
 _OF_OPTIONS = ("PSNR, merged (dB)", "SSIM, merged", "Gaussians", "steps", "training (s)")
 COLUMNS: dict[str, tuple[str, tuple[Measure, ...]]] = {
     "study of blocks": ("blocks", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
-    "study of gaussians": ("limit", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
+    "study of gaussians": ("Gaussians by", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
     "study of options": ("changed", tuple(map(_BY_TITLE.get, _OF_OPTIONS))),
     "study of scale": ("tiles", SCALE_MEASURES),
 }
@@ -109,6 +110,7 @@ def rows(results: Results) -> Rows:
     body = []
     for arm in results.arms:
         name = arm.variant if options or arm.value is None else f"{arm.value:,}"
+        name = label_of(arm) if results.kind == "study of gaussians" else name
         begin = [arm.method] * several + [name] + [_difference(arm, results)] * options
         body.append([*begin, *(cell(arm.runs, measure) for measure in measures)])
     return [[*titles, *(measure.title for measure in measures)], *body]

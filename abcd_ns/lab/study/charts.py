@@ -8,16 +8,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from abcd_ns.lab.results.findings import (
     GOAL_DB,
-    KNEE_DB,
     find_default,
     find_difference,
     find_gap,
-    find_knee,
 )
+from abcd_ns.lab.results.frontier import AS_IT_IS, LIMIT, MCMC, PRICE, curves, way_of
 from abcd_ns.lab.results.results import Arm, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.style import (
@@ -33,8 +32,8 @@ from abcd_ns.lab.results.style import (
     write_beside,
 )
 
-KNEE_LINE = 0.065
-"""Height of a line of text, as a share of the axis' height."""
+WAYS = {PRICE: ("#0072B2", "o"), LIMIT: ("#8A6A00", "s"), MCMC: ("#B3306B", "D")}
+"""Colour and mark of each way to a number of Gaussians."""
 BETTER, WORSE, SAME = "#007A5A", "#D55E00", "#666666"
 ROW_INCHES, LINE_INCHES = 0.3, 0.17
 CHANCE = 0.25
@@ -129,49 +128,40 @@ def _draw_line(axes: Axes, arms: Sequence[Arm], value: Value, **look) -> Line2D:
 
 
 def _draw_gaussians(results: Results) -> Figure:
-    figure = Figure(figsize=(6.2, 3.7), layout="constrained")
-    axes = figure.add_subplot()
-    ends = {}
-    for method in results.methods:
-        arms = results.of(method)
+    figure = Figure(figsize=(6.6, 3.7), layout="constrained")
+    axes, ends = figure.add_subplot(), {}
+    for way, arms in curves(results).items():
+        color, marker = WAYS[way]
         if any(len(arm.runs) > 1 for arm in arms):
             points = [(run.gaussians, run.psnr_merged) for arm in arms for run in arm.runs]
-            scatter(axes, *zip(*points, strict=True), COLORS[method])
-        plot(axes, [arm.gaussians for arm in arms], [arm.psnr for arm in arms], method)
-        ends[method] = (arms[-1].gaussians, arms[-1].psnr)
-    tick_at(axes, [arm.value for arm in results.arms], short, base=10)
-    axes.margins(x=0.06, y=0.15)
-    # The largest limit stays in sight, unless growth ended far below it.
-    reached = max(arm.gaussians for arm in results.arms)
-    largest = max(arm.value for arm in results.arms)
-    axes.set_xlim(right=max(axes.get_xlim()[1], 1.1 * min(largest, 1.6 * reached)))
-    low, high = axes.get_ylim()
-    axes.set_ylim(low - KNEE_LINE * len(results.methods) * (high - low), high)  # room for the knees' names
-    for row, method in enumerate(results.methods):
-        _mark_knee(axes, results.of(method), row)
+            scatter(axes, *zip(*points, strict=True), color)
+        x, y = [arm.gaussians for arm in arms], [arm.psnr for arm in arms]
+        plot(axes, x, y, arms[0].method, color=color, marker=marker)
+        ends[way] = (x[-1], y[-1])
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.margins(x=0.08, y=0.15)
+    for arm in results.arms:
+        if way_of(arm) == AS_IT_IS:
+            _mark_stop(axes, arm)
     axes.yaxis.set_major_locator(MaxNLocator(7))
-    axes.set_xlabel("Gaussians at the end (marked: the limits)")
+    axes.set_xlabel("Gaussians at the end")
     axes.set_ylabel("held-out PSNR (dB)")
-    ring = f"ring: knee, the fewest within {KNEE_DB:g} dB of the best"
-    axes.set_title(f"{_title(results)}\n{ring}", loc="left")
+    axes.set_title(f"{_title(results, results.methods[0])}\nstar: where it stops by itself", loc="left")
     lay_grid(axes)
-    label_ends(axes, ends, 1.04 * axes.get_xlim()[1])
+    right = axes.get_xlim()[1] * 1.06
+    label_ends(axes, ends, right, {way: color for way, (color, _) in WAYS.items()}, lambda way, _: way)
     return figure
 
 
-def _mark_knee(axes: Axes, arms: Sequence[Arm], row: int) -> None:
-    """A ring around the knee, a line down to its number, in the method's colour."""
-    knee = find_knee(arms)
-    if knee is None:
-        return
-    color, (low, high) = COLORS[knee.method], axes.get_ylim()
-    axes.plot(knee.gaussians, knee.psnr, "o", markersize=12, markerfacecolor="none", markeredgecolor=color)
-    axes.vlines(knee.gaussians, low, knee.psnr, color=color, linewidth=0.8, linestyle=(0, (3, 3)), zorder=1)
-    axes.set_ylim(low, high)
-    far = axes.transAxes.inverted().transform(axes.transData.transform((knee.gaussians, low)))[0] > 0.8
-    look = {"xycoords": ("data", "axes fraction"), "ha": "right" if far else "left", "color": color}
-    at = (knee.gaussians, 0.02 + KNEE_LINE * row)
-    write_beside(axes, f"knee {short(knee.gaussians)}", at, (-4 if far else 4, 0), **look)
+def _mark_stop(axes: Axes, arm: Arm) -> None:
+    color, at = WAYS[PRICE][0], (arm.gaussians, arm.psnr)
+    axes.plot(*at, "*", markersize=15, color=color, markeredgecolor="white", zorder=4)
+    text = f"{short(arm.gaussians)}, {arm.psnr:.2f} dB"
+    label = write_beside(axes, text, at, (-6, 9), ha="right", color=color, zorder=5)
+    label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
 # -- options -----------------------------------------------------------------------------------------

@@ -10,13 +10,14 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.job import AS_IT_IS, METHODS, Change, Job, Plan, Variant
+from abcd_ns.lab.job import AS_IT_IS, Change, Job, Plan, Variant
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, check_numbers, make_settings, words
 from abcd_ns.lab.study.charts import draw_study
 
 AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic", "abcd-partition", "abcd-exact", "abcd-paper"]
 BLOCKS, LIMIT = "blocks", "training.density.max_gaussians"
+PRICE, STRATEGY = "training.density.price", "training.density.strategy"
 """The options that the first two studies vary."""
 Number = Annotated[int, tyro.conf.arg(metavar="N")]
 Numbers = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")]
@@ -98,17 +99,16 @@ class BlocksStudy(Conditions):
 
 @dataclass(frozen=True, kw_only=True)
 class GaussiansStudy(Conditions):
-    """How few Gaussians a scene needs: held-out quality against the limit on their number, and the knee of
-    each curve, the smallest limit within 0.2 dB of the best measured. A limit below the number of initial
-    points begins with a random choice of them."""
+    """How few Gaussians a scene needs: held-out quality against their number. The method as it is, which
+    finds its number by itself, is marked on the curve of other prices for a Gaussian; beside it growth that
+    is cut off at a limit, and 3DGS-MCMC's relocation up to a limit."""
 
-    max_gaussians: Numbers = (2000, 4000, 8000, 16000, 32000)
-    """Limits to try, for the whole scene."""
-    methods: Annotated[tuple[AbcdMethod, ...], tyro.conf.arg(metavar="METHOD ...")] = (
-        "abcd",
-        "abcd-monolithic",
-    )
-    """Of the abcd methods; a curve for each."""
+    prices: Annotated[tuple[float, ...], tyro.conf.arg(metavar="PIXELS ...")] = (0.0, 1.0, 4.0, 16.0, 64.0)
+    """What a Gaussian must fill to stay, see training.density.price."""
+    max_gaussians: Numbers = (2000, 8000, 32000)
+    """Limits for the whole scene; below the number of initial points a random choice of them begins."""
+    method: AbcdMethod = "abcd"
+    """What is trained."""
     blocks: Number = 8
     """Blocks of all but abcd-monolithic."""
 
@@ -118,13 +118,17 @@ class GaussiansStudy(Conditions):
         Raises:
             UserError: an option cannot be used.
         """
-        check_numbers("--max-gaussians", self.max_gaussians, 1, several=True)
-        if not self.methods or len(set(self.methods)) < len(self.methods):
-            raise UserError("--methods: give at least one, and none twice.")
-        methods = [method for method in METHODS if method in self.methods]
-        varied = ["--methods", *methods, "--max-gaussians", *sorted(self.max_gaussians)]
-        variants = [_one(LIMIT, limit) for limit in sorted(self.max_gaussians)]
-        return self._planned("gaussians", methods, variants, varied, blocks=self.blocks)
+        if self.max_gaussians:
+            check_numbers("--max-gaussians", self.max_gaussians, 1, several=True)
+        prices, limits = sorted(set(self.prices)), sorted(self.max_gaussians)
+        if prices and prices[0] < 0:
+            raise UserError(f"--prices {prices[0]:g}: a price is 0 or more, in pixels.")
+        varied = ["--method", self.method, "--prices", *(f"{price:g}" for price in prices)]
+        varied += ["--max-gaussians", *limits]
+        variants = [AS_IT_IS, *(_one(PRICE, f"{price:g}") for price in prices)]
+        variants += [_one(LIMIT, limit) for limit in limits]
+        variants += [Variant((Change(STRATEGY, "mcmc"), Change(LIMIT, str(limit)))) for limit in limits]
+        return self._planned("gaussians", [self.method], variants, varied, blocks=self.blocks)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +183,7 @@ Study = (
 
 @tyro.conf.configure(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
 def study(wanted: Annotated[Study, tyro.conf.arg(name="")]) -> int:
-    """Vary one thing and see what it does: the number of blocks, the limit on Gaussians, or any options.
+    """Vary one thing and see what it does: the number of blocks, the number of Gaussians, or any options.
 
     Each run has a process of its own, one after the other, under the protocol of `abcd compare`. OUT gets
     results.json, table.md and a chart (png and svg). Called again with the same OUT, a study reuses the runs
@@ -211,5 +215,5 @@ def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     return experiment.carry_out(plan, console, draw_study, overwrite)
 
 
-def _one(path: str, value: int) -> Variant:
+def _one(path: str, value: int | str) -> Variant:
     return Variant((Change(path, str(value)),))

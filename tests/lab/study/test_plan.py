@@ -115,16 +115,17 @@ def test_a_job_trains_with_what_is_changed_and_in_its_folder(scene, position, bl
     assert methods.abcd.config.pipeline.blocks == 0
 
 
-def test_limits_go_to_every_method(scene):
-    plan = GaussiansStudy(**given(scene, blocks=4), max_gaussians=(500, 100)).plan()
-    assert plan.methods == ("abcd-monolithic", "abcd")
+def test_a_study_of_gaussians_has_the_method_as_it_is_prices_limits_and_mcmc(scene):
+    plan = GaussiansStudy(**given(scene, blocks=4), prices=(8, 0.5), max_gaussians=(500, 100)).plan()
     configs = [trainer_config(job, Path("out")).pipeline for job in plan.jobs]
-    assert [(c.blocks, c.training.density.max_gaussians) for c in configs] == [
-        (1, 100),
-        (1, 500),
-        (4, 100),
-        (4, 500),
-    ]
+    found = [(c.training.density.price, c.training.density.max_gaussians) for c in configs]
+    assert found == [(None, 0), (0.5, 0), (8.0, 0), (None, 100), (None, 500), (None, 100), (None, 500)]
+    assert [c.training.density.strategy for c in configs] == ["default"] * 5 + ["mcmc"] * 2
+    assert {c.blocks for c in configs} == {4}
+    assert "--prices 0.5 8 --max-gaussians 100 500" in plan.command
+    assert not GaussiansStudy(**given(scene), prices=(), max_gaussians=()).plan().jobs[1:]
+    with pytest.raises(UserError, match="--prices -1: a price is 0 or more"):
+        GaussiansStudy(**given(scene), prices=(-1.0,)).plan()
 
 
 def test_an_ablation_begins_with_the_method_as_it_is(scene):

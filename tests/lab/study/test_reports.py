@@ -9,8 +9,9 @@ from rich.console import Console
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Plan
-from abcd_ns.lab.results.findings import find_difference, find_gap, find_knee
-from abcd_ns.lab.results.results import read_results, write_results
+from abcd_ns.lab.results.findings import find_difference, find_gap
+from abcd_ns.lab.results.frontier import LIMIT, MCMC, PRICE, curves, fewest_near_best, psnr_at
+from abcd_ns.lab.results.results import Arm, read_results, write_results
 from abcd_ns.lab.results.tables import notes, rows, write_table
 from abcd_ns.lab.runs import runner
 from abcd_ns.lab.study.charts import draw_study
@@ -49,29 +50,32 @@ def test_a_study_of_blocks_says_whether_the_goal_is_met(worst, verdict):
     assert finding.startswith(f"Best: 1 block, 25.00 dB. Worst: 27 blocks, {worst:.2f} dB.")
 
 
-@pytest.mark.parametrize(
-    ("psnrs", "knee"),
-    [
-        ({2: 20.0, 4: 22.0, 8: 22.15, 16: 22.19}, 4),
-        ({2: 20.0, 4: 21.0, 8: 22.0}, 8),
-        ({2: 22.0, 4: 22.1, 8: 22.1}, 2),
-        ({2: 20.0, 4: 23.0, 8: 22.0}, 4),
-    ],
-)
-def test_the_knee_is_the_smallest_budget_near_the_best(psnrs, knee):
-    assert find_knee(arms(psnrs)).value == knee
+def frontier_arm(variant: str, gaussians: int, psnr: float) -> Arm:
+    return made_up_arm(variant, None, {0: psnr}, gaussians=gaussians)
 
 
-def test_each_method_has_its_own_knee_and_a_knee_at_the_edge_says_so():
+@pytest.mark.parametrize(("near", "fewest"), [(24.9, 4000), (24.79, 9000)])
+def test_the_fewest_gaussians_near_the_best_may_be_on_any_curve(near, fewest):
+    arms = [frontier_arm("default", 9000, 24.95), frontier_arm("training.density.price=1", 20_000, 25.0)]
+    arms.append(frontier_arm("training.density.max_gaussians=4000", 4000, near))
+    assert fewest_near_best(arms).gaussians == fewest
+
+
+def test_other_ways_are_read_at_the_number_that_the_method_comes_to_by_itself():
+    mcmc = "training.density.strategy=mcmc training.density.max_gaussians="
     study = made_up_study(
         "gaussians",
-        *arms({2: 20.0, 4: 23.0, 8: 23.1}, "abcd-monolithic"),
-        *arms({2: 18.0, 4: 19.0, 8: 20.0}),
+        frontier_arm("default", 4000, 25.0),
+        frontier_arm(f"{mcmc}2000", 2000, 22.0),
+        frontier_arm(f"{mcmc}8000", 8000, 24.0),
+        frontier_arm("training.density.max_gaussians=2000", 2000, 21.0),
     )
-    monolithic, blocks = study.findings
-    assert monolithic.startswith("abcd-monolithic: a limit of 4 Gaussians is enough: 23.00 dB")
-    assert "tried" not in monolithic
-    assert blocks.endswith("It is the largest that was tried: more may be better.")
+    assert list(curves(study)) == [PRICE, LIMIT, MCMC]
+    own, fewest, other = study.findings  # the only limit says nothing about 4,000
+    assert own == "As it is, abcd comes to 4,000 Gaussians and 25.00 dB."
+    assert "are 4,000 (as it is: 25.00 dB)" in fewest
+    assert other == "MCMC, with as many Gaussians as the method as it is: 23.00 dB (-2.00)."
+    assert psnr_at(curves(study)[MCMC], 9000) is None
 
 
 def test_differences_are_taken_seed_by_seed():
@@ -113,10 +117,13 @@ def test_an_ablation_has_a_row_for_each_change_with_its_difference():
 
 
 def test_several_methods_have_a_column_of_their_own():
+    study = made_up_study("options", *arms({0: 20.0}, "abcd-monolithic"), *arms({0: 21.0}))
+    titles, *body = rows(study)
+    assert titles[:2] == ["method", "changed"]
+    assert [row[0] for row in body] == ["abcd-monolithic", "abcd"]
     titles, *body = rows(gaussians_study())
-    assert titles[:2] == ["method", "limit"]
-    assert len(body) == 10
-    assert body[-1][:2] == ["abcd", "32,000"]
+    assert titles[0] == "Gaussians by"
+    assert [row[0] for row in body][::5] == ["as it is", "price 64", "MCMC, limit 8,000"]
     titles, *_ = rows(blocks_study())
     assert titles[0] == "blocks"
     assert "peak RAM (GiB)" in titles
@@ -159,7 +166,7 @@ def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp
     texts = texts_of(paths[1])
     wanted = {
         "blocks": ["held-out PSNR (dB)", "blocks", "27", "Gaussians", "peak RAM (GiB)", "best - 0.5 dB"],
-        "gaussians": ["held-out PSNR (dB)", "32k", "knee 16k"],
+        "gaussians": ["held-out PSNR (dB)", "20k", "by price", "by limit", "MCMC"],
         "options": ["training.warmup=0", "change", "PSNR", "Gaussians"],
     }[name_of(study)]
     assert [text for text in wanted if text not in texts] == []
