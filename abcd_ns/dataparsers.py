@@ -5,14 +5,14 @@ nerfstudio loads this while it is itself half loaded, and for each of its comman
 
 import sys
 import warnings
-from pathlib import Path
 
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from abcd_ns.errors import IMPORT_TROUBLE, UserError, missing
+from abcd_ns.nerfstudio.flags import opens_ours, trains_ours
 
-if Path(sys.argv[0]).stem == "ns-train" and sys.argv[1:2] and sys.argv[1].startswith("abcd"):
+if trains_ours(sys.argv) or opens_ours(sys.argv):
     # What nerfstudio 1.1.5 calls is still there under these names. It is called when modules are loaded that
     # come after this one, so later would be too late; other commands' warnings are not ours to hide.
     warnings.filterwarnings("ignore", r"`torch\.cuda\.amp\.", FutureWarning)

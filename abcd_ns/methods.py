@@ -4,6 +4,7 @@ nerfstudio loads this for each of its commands, other methods' too, and an excep
 So where something that ABCD needs is missing or does not start, its methods say so when they are asked for.
 """
 
+import sys
 from dataclasses import dataclass
 
 import tyro
@@ -12,11 +13,18 @@ from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.errors import IMPORT_TROUBLE, missing
+from abcd_ns.nerfstudio.flags import trains_ours
 
 try:
+    from abcd_ns.data.input_errors import exit_on_user_error
     from abcd_ns.nerfstudio import method_configs as _methods
+    from abcd_ns.nerfstudio.options import refuse_flags
 except IMPORT_TROUBLE as error:
     _methods, _trouble = None, missing(error)
+else:
+    if trains_ours(sys.argv):  # before tyro reads them, which knows no reasons
+        with exit_on_user_error():
+            refuse_flags(sys.argv[2:])
 
 
 @dataclass

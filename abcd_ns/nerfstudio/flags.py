@@ -1,9 +1,28 @@
-"""Which options of a config class stand on the command line of `ns-train`, and how they are named."""
+"""Command lines of nerfstudio's: which are about our methods, and which options of a config are flags."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
+
+METHODS = "abcd"
+"""What the names of all our methods begin with."""
+
+
+def trains_ours(words: Sequence[str]) -> bool:
+    """Whether a command line is `ns-train` with a method of ours."""
+    return Path(words[0]).stem == "ns-train" and len(words) > 1 and words[1].startswith(METHODS)
+
+
+def opens_ours(words: Sequence[str]) -> bool:
+    """Whether a command line opens a run of ours, OUTPUTS/SCENE/METHOD/TIME/config.yml: the path tells."""
+    flags = [word.partition("=")[0].replace("_", "-") for word in words]
+    if not Path(words[0]).stem.startswith("ns-") or "--load-config" not in flags:
+        return False
+    place = flags.index("--load-config")
+    path = words[place].partition("=")[2] or "".join(words[place + 1 : place + 2])
+    return any(part.startswith(METHODS) for part in Path(path).parts[-3:-2])
 
 
 def hidden(*names: str) -> Callable[[type], type]:

@@ -1,7 +1,9 @@
 """Which options of a run go together, and which of nerfstudio's count."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from itertools import product
 from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
@@ -33,16 +35,29 @@ SAME = {
     },
 }
 """By class and field, the flag of splatfacto's under --pipeline.model that means the same; taken too."""
-INSTEAD = {
-    "warmup_length": "training.density.refine-start, a share of the run",
-    "stop_split_at": "training.density.refine-stop, a share of the run",
-    "reset_alpha_every": "training.density.reset-every, in steps",
-    "refine_every": "training.density.refine-every",
-    "cull_alpha_thresh": "training.density.cull-alpha-thresh",
-    "densify_grad_thresh": "training.density.densify-grad-thresh",
-    "use_absgrad": "training.density.use-absgrad",
+_FIXED = "it is fixed at splatfacto's value"
+_REDUCED = "set --pipeline.training.coarse, a share of the run, instead"
+_GIANTS = "--pipeline.training.heal shrinks giants"
+_LIGHT = "set --pipeline.training.light, a colour transform for each photo, instead"
+_RAYS = "it is about rays, and Gaussians are not drawn by rays"
+UNUSED_OF_MODEL = {
+    "warmup_length": "set --pipeline.training.density.refine-start, a share of the run, instead",
+    "stop_split_at": "set --pipeline.training.density.refine-stop, a share of the run, instead",
+    "reset_alpha_every": "set --pipeline.training.density.reset-every, in steps, instead",
+    **{name: f"set --pipeline.training.density.{flag} instead" for name, flag in SAME[DensityConfig].items()},
+    **dict.fromkeys(("cull_scale_thresh", "densify_size_thresh", "n_split_samples"), _FIXED),
+    "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",
+    **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),
+    **dict.fromkeys(("cull_screen_size", "split_screen_size", "stop_screen_size_at"), _GIANTS),
+    **dict.fromkeys(("use_scale_regularization", "max_gauss_ratio"), _GIANTS),
+    **dict.fromkeys(("use_bilateral_grid", "grid_shape"), _LIGHT),
+    "camera_optimizer": "cameras stay where the data has them",
+    "output_depth_during_training": "no loss here needs depth; trained scenes have it",
+    **dict.fromkeys(("enable_collider", "collider_params", "eval_num_rays_per_chunk"), _RAYS),
+    "loss_coefficients": "set --pipeline.training.ssim-lambda instead",
+    "prompt": "ABCD trains on photos",
 }
-"""What has the place of an option of splatfacto's."""
+"""Options of splatfacto's model that ABCD has no use for, and why."""
 UNUSED = {
     "gradient_accumulation_steps": "a step draws as many views as --pipeline.training.batch says",
     "mixed_precision": "ABCD trains in float32",
@@ -51,6 +66,14 @@ UNUSED = {
     "prompt": "ABCD trains on photos",
 }
 """Options of nerfstudio's trainer that ABCD has no use for, and why."""
+NOT_CLIPPED = "steps whose gradients are no numbers are skipped, and others are not clipped"
+UNUSED_OF_OPTIMIZERS = {
+    "camera_opt": "cameras stay where the data has them",
+    "bilateral_grid": _LIGHT,
+    "*.scheduler.*": "--pipeline.training.means-lr-decay is the means' rate at the end, and other rates stay",
+    "*.optimizer.max_norm": NOT_CLIPPED,
+}
+"""Options of splatfacto's optimizers that ABCD has no use for, and why."""
 HIDDEN = tuple(
     option.name
     for option in dataclasses.fields(SplatfactoModelConfig)
@@ -80,10 +103,7 @@ def check_options(config: TrainerConfig) -> None:
     refuse_changed(pipeline.datamanager, UNUSED_OF_DATA, "pipeline.datamanager.")
     for name, group in config.optimizers.items():
         if group["optimizer"].max_norm is not None:
-            raise UserError(
-                f"--optimizers.{name}.optimizer.max-norm has no effect here: steps whose gradients are no "
-                "numbers are skipped, and others are not clipped."
-            )
+            raise UserError(_no_effect(f"optimizers.{name}.optimizer.max_norm", NOT_CLIPPED))
     mirror(pipeline.training, pipeline.model)
 
 
@@ -99,7 +119,30 @@ def refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None:
     """
     for name, why in unused.items():
         if getattr(config, name) != _default(type(config), name):
-            raise UserError(f"--{prefix}{name.replace('_', '-')} has no effect here: {why}.")
+            raise UserError(_no_effect(f"{prefix}{name}", why))
+
+
+def refuse_flags(words: Sequence[str]) -> None:
+    """See that no word is a flag of splatfacto's that is none here; tyro would name other methods' flags.
+
+    Args:
+        words: of `ns-train`, after the method's name.
+
+    Raises:
+        UserError: one is.
+    """
+    taken = {flag.replace("-", "_") for flags in SAME.values() for flag in flags.values()} | HONOURED
+    of_model = {name: why for name, why in UNUSED_OF_MODEL.items() if name not in taken}
+    found = {
+        **UNUSED,
+        **{f"pipeline.model.{name}": why for name, why in of_model.items()},
+        **{f"pipeline.datamanager.{name}": why for name, why in UNUSED_OF_DATA.items()},
+        **{f"optimizers.{name}": why for name, why in UNUSED_OF_OPTIMIZERS.items()},
+    }
+    flags = [word.partition("=")[0] for word in words if word.startswith("--")]
+    for flag, (pattern, why) in product(flags, found.items()):
+        if fnmatchcase(f"{flag[2:].replace('-', '_')}.", f"{pattern}.*"):
+            raise UserError(_no_effect(flag[2:], why))
 
 
 def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
@@ -111,13 +154,8 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
     for name in HIDDEN:
         if name in MIRRORED | TOLERATED or getattr(model, name) == _default(type(model), name):
             continue
-        flag = f"--pipeline.model.{name.replace('_', '-')}"
-        if name in INSTEAD:
-            raise UserError(f"{flag} has no effect here; set --pipeline.{INSTEAD[name]}, instead.")
-        raise UserError(
-            f"{flag} is splatfacto's and has no effect here; see the options under --pipeline.training in "
-            "`ns-train abcd --help`."
-        )
+        why = UNUSED_OF_MODEL.get(name, "it is splatfacto's; `ns-train abcd --help` has ABCD's")
+        raise UserError(_no_effect(f"pipeline.model.{name}", why))
     if model.rasterize_mode == "antialiased":
         training.antialiased = True
     if training.light != "none":  # held-out photos have a light of their own, too
@@ -134,6 +172,10 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
             flags = (f"--pipeline.model.{name}".replace("_", "-"), source.replace("_", "-"))
             raise UserError(f"{flags[0]} has no effect here; set --pipeline.training.{flags[1]} instead.")
         setattr(model, name, value)
+
+
+def _no_effect(option: str, why: str) -> str:
+    return f"--{option.replace('_', '-')} has no effect here: {why}."
 
 
 def _default(config: type, name: str) -> Any:

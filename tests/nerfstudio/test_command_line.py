@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from nerfstudio.scripts.train import entrypoint
 
+from abcd_ns.nerfstudio.flags import opens_ours, trains_ours
 from tests.reference.colmap_scene import write_scene
 
 BIN = Path(sys.executable).parent
@@ -33,7 +34,35 @@ def test_train_then_evaluate(tmp_path):
     run = tmp_path / "out" / "wall" / "abcd" / "run"
     evaluate = shell("ns-eval", "--load-config", run / "config.yml", "--output-path", tmp_path / "eval.json")
     assert evaluate.returncode == 0, evaluate.stderr[-3000:]
+    assert "Warning" not in evaluate.stdout + evaluate.stderr
     assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 14
+
+
+@pytest.mark.cli
+def test_a_flag_of_splatfactos_that_is_none_here_is_one_line():
+    ended = shell("ns-train", "abcd", "--data", "x", "--pipeline.model.stop-split-at", 99)
+    assert ended.returncode == 2
+    (line,) = (ended.stdout + ended.stderr).splitlines()
+    assert line.startswith("error: --pipeline.model.stop-split-at has no effect here")
+
+
+@pytest.mark.parametrize(
+    ("line", "ours"),
+    [
+        ("ns-train abcd --data x", True),
+        ("/venv/bin/ns-train abcd-paper", True),
+        ("ns-train splatfacto --data abcd", False),
+        ("ns-train", False),
+        ("ns-eval --load-config outputs/fox/abcd/now/config.yml --output-path x.json", True),
+        ("ns-render dataset --load-config=/a/fox/abcd-exact/now/config.yml", True),
+        ("ns-viewer --load_config out/abcd/splatfacto/now/config.yml", False),
+        ("ns-eval --load-config", False),
+        ("pytest --load-config outputs/fox/abcd/now/config.yml", False),
+    ],
+)
+def test_command_lines_about_our_methods_are_known(line, ours):
+    words = line.split()
+    assert (trains_ours(words) or opens_ours(words)) == ours
 
 
 def test_a_wrong_folder_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):

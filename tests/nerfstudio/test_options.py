@@ -17,7 +17,17 @@ from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.options import HONOURED, SAME, UNUSED, check_options, mirror
+from abcd_ns.nerfstudio.options import HIDDEN as HIDDEN_OF_MODEL
+from abcd_ns.nerfstudio.options import (
+    HONOURED,
+    MIRRORED,
+    SAME,
+    UNUSED,
+    UNUSED_OF_MODEL,
+    check_options,
+    mirror,
+    refuse_flags,
+)
 from abcd_ns.nerfstudio.run.settings import flat_options
 
 METHODS = {
@@ -130,6 +140,41 @@ def test_what_has_no_effect_is_refused_from_files_too(change, says):
     with pytest.raises(UserError) as refused:
         check_options(config)
     assert says in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("--pipeline.model.stop-split-at", "training.density.refine-stop"),
+        ("--pipeline.model.num_downscales=2", "training.coarse"),
+        ("--pipeline.model.camera-optimizer.mode", "cameras stay"),
+        ("--pipeline.model.use-bilateral-grid", "training.light"),
+        ("--pipeline.datamanager.cache-images", "device-budget-gb"),
+        ("--gradient-accumulation-steps", "training.batch"),
+        ("--mixed-precision", "float32"),
+        ("--optimizers.means.scheduler.lr-final", "means-lr-decay"),
+        ("--optimizers.scales.optimizer.max-norm", "not clipped"),
+    ],
+)
+def test_a_flag_of_splatfactos_that_is_none_here_is_refused_by_its_reason(word, says):
+    with pytest.raises(UserError) as refused:
+        refuse_flags(["--data", "x", word, "1"])
+    assert says in str(refused.value)
+    assert word.partition("=")[0].replace("_", "-") in str(refused.value)
+
+
+def test_every_option_of_splatfactos_model_is_a_flag_or_refused_by_a_reason():
+    for name in HIDDEN_OF_MODEL:
+        assert name in UNUSED_OF_MODEL or name in MIRRORED, name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_flags_that_are_offered_are_not_refused(name, capsys):
+    with pytest.raises(SystemExit):
+        tyro.cli(AnnotatedBaseConfigUnion, args=[name, "--help"])
+    words = set(re.findall(r"--[\w.-]+", capsys.readouterr().out))
+    assert len(words) > 100
+    refuse_flags(sorted(words))
 
 
 def test_what_ns_render_sets_is_let_be():

@@ -1,9 +1,11 @@
-"""What the terminal says of a run's health: alarms at once, the blocks' standing at the end."""
+"""What the terminal says of a run: the time left, alarms at once, the blocks' standing at the end."""
 
 import pytest
 
-from abcd_ns.engine.events import Mended, VisitUndone
+from abcd_ns.engine.events import Mended, StepTaken, VisitBegan, VisitUndone
 from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.run_state import Stopwatch
+from abcd_ns.nerfstudio.run import progress
 from abcd_ns.nerfstudio.run.progress import ProgressReport
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
@@ -11,6 +13,18 @@ from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_v
 @pytest.fixture
 def coordinator(tmp_path):
     return make_coordinator(tmp_path, random_gaussians(40), ring_of_views(3), blocks=3)
+
+
+def test_no_time_is_left_before_a_step_tells_how_long_it_takes(coordinator, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.0)
+    coordinator.run.stopwatch = Stopwatch(0.6)
+    report = ProgressReport(coordinator)
+    report(VisitBegan(0, 0, None, steps=8, views=3, gaussians=40))
+    coordinator.state.step = 1
+    report(StepTaken(1, 0, 1, psnr=20.0))
+    before, after = capsys.readouterr().out.splitlines()
+    assert " left" not in before
+    assert after.endswith(" left")
 
 
 def test_what_is_no_number_and_what_is_undone_is_said_at_once(coordinator, capsys):

@@ -25,6 +25,7 @@ from abcd_ns.engine.events import (
 from abcd_ns.engine.train.health_record import MENDED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.viewer.run_history import seconds_left
 from abcd_ns.viewer.texts import clock
 
 SECONDS_BETWEEN_LINES = 10.0
@@ -154,12 +155,10 @@ class ProgressReport:
         else:
             where = f"sweep {self._sweep} block {'-' if visit is None else visit.block + 1}/{blocks}"
         quality = "" if self._psnr is None else f"{self._psnr:.2f} dB  "
-        left = clock(self._seconds_left())
-        return f"{where}  {what}  {quality}{coordinator.count():,} Gaussians  {_memory()}  {left} left"
-
-    def _seconds_left(self) -> float:
-        progress = self._coordinator.progress
-        return self._coordinator.stopwatch.seconds * (1 - progress) / max(progress, 1e-6)
+        left = ""
+        if coordinator.state.step:  # what workers are at counts as progress, and says nothing of time
+            left = f"  {clock(seconds_left(coordinator.stopwatch.seconds, coordinator.progress))} left"
+        return f"{where}  {what}  {quality}{coordinator.count():,} Gaussians  {_memory()}{left}"
 
     def _bar(self) -> Progress:
         if self._live is None:
