@@ -22,6 +22,7 @@ from pathlib import Path
 
 import torch
 import tyro
+from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
 from abcd_ns.cluster.dispatcher import Dispatcher
@@ -91,8 +92,8 @@ class Watch:
                 row.kills += 1
 
 
-def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
-    """One run."""
+def config_of(args: Args, workers: int, out: Path) -> TrainerConfig:
+    """ns-train's, with nothing but training in it."""
     config = copy.deepcopy(methods.abcd.config)
     config.pipeline.datamanager.data = args.data
     config.pipeline.datamanager.dataparser.downscale_factor = args.downscale
@@ -101,11 +102,17 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     config.pipeline.training.seed = config.machine.seed = args.seed
     config.pipeline.max_seconds = args.seconds
     config.max_num_iterations = args.steps or 10**9
-    config.output_dir, config.experiment_name, config.vis = out, f"{workers}-{kills}", "tensorboard"
+    config.output_dir, config.experiment_name, config.vis = out, "run", "tensorboard"
     config.logging.local_writer.enable = False
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.steps_per_save = 0
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    return config
+
+
+def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
+    """One run."""
+    config = config_of(args, workers, out)
     if workers == 1:
         config.pipeline.training.processes = 1
         torch.set_num_threads(1)
