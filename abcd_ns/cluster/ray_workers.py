@@ -36,7 +36,7 @@ from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import StepTaken, WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.errors import UserError
+from abcd_ns.errors import UserError, is_out_of_memory
 
 SILENCE, SLOW_START = 60.0, 600.0
 """Seconds after which a worker that does not answer, or does not begin, counts as lost."""
@@ -45,8 +45,6 @@ LOOK_EVERY = 1.0
 STARTS = 3
 """Workers in a row that may end before they are ready; then there is something wrong with all of them."""
 FULL = (ObjectStoreFullError, OutOfDiskError)
-TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
-"""In what torch raises where RAM is full: a RuntimeError."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +247,7 @@ class RayWorkers:
         try:
             answer = ray.get(ref)
         except RayTaskError as error:
-            if _is_out_of_memory(error.cause):  # as if the kernel had killed it: a new one begins with none
+            if is_out_of_memory(error.cause):  # as if the kernel had killed it: a new one begins with none
                 ray.kill(member.actor)
                 return self._replace(member, "out of memory")
             raise _as_user_error(error, member.number) from error
@@ -306,11 +304,6 @@ def _no_room(error: Exception) -> WorkersError:
         f"Ray has no room for a block: {_first_line(error)}. Free the disk of Ray's folder (RAY_TMPDIR "
         "says where), or start a cluster with a larger --object-store-memory."
     )
-
-
-def _is_out_of_memory(cause: Exception) -> bool:
-    """Of RAM, which others take and give back; what does not fit a device never will."""
-    return isinstance(cause, MemoryError) or TORCH_OUT_OF_MEMORY in str(cause)
 
 
 def _as_user_error(error: RayTaskError, number: int) -> Exception:
