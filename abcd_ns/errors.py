@@ -1,4 +1,4 @@
-"""The one error that is the user's to mend, and what is said where packages are missing."""
+"""The one error that is the user's to mend, how full RAM is told, and what is said where packages are missing."""
 
 
 class UserError(Exception):
@@ -7,6 +7,11 @@ class UserError(Exception):
     The command line prints the message alone, without a traceback. Derive from this class for every
     error that a user can cause; any other exception that reaches the command line is a bug of ours.
     """
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether RAM was full, which others take and give back. Torch says so by a RuntimeError."""
+    return isinstance(error, MemoryError) or "DefaultCPUAllocator: can't allocate memory" in str(error)
 
 
 IMPORT_TROUBLE = (ImportError, OSError, RuntimeError, AttributeError, TypeError, ValueError)

@@ -1,14 +1,16 @@
 """What several workers bring, what they cost the driver, and what it costs when they are killed.
 
     python -m benchmarks.workers --data DIR --downscale 4 --workers 1 2 --seconds 60
-    python -m benchmarks.workers --data DIR --downscale 4 --workers 2 --steps 3000 --kills 20
+    python -m benchmarks.workers --data DIR --downscale 4 --workers 2 --steps 3000 --kills 20 --out FILE
 
 Runs of ns-train's own trainer, one after the other. A rate is over the time in which blocks were lent: the
 warm-up, which the driver trains, is left out. With --kills a random worker is killed again and again, in
-equal shares of the run; what that cost is seen against the run of the same row without.
+equal shares of the steps that workers take, each when the last one's visit is lent again. A second table says
+what each cost. Of a run with a budget of steps nobody can tell from its scene that any was.
 """
 
 import copy
+import json
 import multiprocessing
 import os
 import platform
@@ -17,16 +19,22 @@ import signal
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
 import tyro
+from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.engine.events import Event, StepTaken, VisitBegan, VisitEnded, WorkersSeen
+from abcd_ns.cluster.lease import Lease
+from abcd_ns.engine.events import Event, VisitBegan, VisitEnded, WorkerLost, WorkersSeen
 from abcd_ns.lab.runs.evaluate import mean_psnr
+from abcd_ns.machine import describe_machine, describe_versions
+from abcd_ns.nerfstudio.run import STATE
+from tests.reference.crash_runs import digest
 
 
 @dataclass
@@ -45,6 +53,23 @@ class Args:
     kills: int = 0
     """Of workers, in a second run of each row."""
     seed: int = 0
+    out: Path | None = None
+    """Where to write the results, JSON."""
+
+
+@dataclass
+class Kill:
+    """Of a worker, and what it cost."""
+
+    step: int
+    """Steps that the run had heard of, visits that are out included."""
+    block: int | None = None
+    """Whose visit was lost, from 0; None where the worker had none."""
+    steps_lost: int = 0
+    """Of that visit, as far as the driver had heard."""
+    seconds_to_notice: float | None = None
+    seconds_to_lend: float | None = None
+    """From the kill until the visit was with another worker."""
 
 
 @dataclass
@@ -52,47 +77,81 @@ class Row:
     """What came of one run."""
 
     workers: int
-    kills: int = 0
+    kills: list[Kill] = field(default_factory=list)
     began: float = 0.0
     """When the first visit to a block began."""
     seconds: float = 0.0
     """From then to the end."""
+    ended: list[int] = field(default_factory=list)
+    """Numbers of the visits that were taken in, in order, the warm-up's included."""
     visits: int = 0
+    """To blocks."""
     steps: int = 0
     waited: float = 0.0
     """Share of the driver's time in which it waited for workers."""
     lent: int = 0
     """Bytes that were put into Ray's store."""
     psnr: float = 0.0
-    deaths: list[int] = field(default_factory=list)
+    digest: str = ""
+    """Of all that the run has left in its store, but for times."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether each visit was taken in, and once."""
+        return self.ended == list(range(len(self.ended)))
 
 
 class Watch:
-    """Follows a run: counts visits, and kills workers when their time has come."""
+    """Follows a run: notes visits, and kills workers when their time has come."""
 
     def __init__(self, row: Row, trainer: Dispatcher, kills: int, seed: int) -> None:
-        self._row, self._trainer = row, trainer
-        self._moments = [(k + 0.5) / kills for k in range(kills)]
-        self._rng = random.Random(seed)
+        self._row, self._trainer, self._left = row, trainer, kills
+        self._kills, self._rng = kills, random.Random(seed)
+        self._done: dict[int | None, int] = {}
+        self._first, self._killed_at = None, 0.0
+        if kills:
+            self._submit, trainer.workers.submit = trainer.workers.submit, self._lend
 
     def __call__(self, event: Event) -> None:
-        row, trainer = self._row, self._trainer
-        if isinstance(event, VisitEnded) and event.block is not None:
-            row.visits += 1
-        if isinstance(event, VisitBegan) and event.block is not None:
-            row.began = row.began or time.perf_counter()
-        if isinstance(event, WorkersSeen):
-            row.deaths = [worker.deaths for worker in event.workers]
-        if isinstance(event, (WorkersSeen, StepTaken)) and self._moments and isinstance(trainer, Dispatcher):
-            pids = trainer.workers.pids if trainer.trains_elsewhere else []
-            if pids and trainer.progress >= self._moments[0]:
-                self._moments.pop(0)
-                os.kill(self._rng.choice(pids), signal.SIGKILL)
-                row.kills += 1
+        match event:
+            case VisitBegan(block=int()):
+                self._row.began = self._row.began or time.perf_counter()
+            case VisitEnded():
+                self._row.ended.append(event.visit)
+                self._row.visits += event.block is not None
+            case WorkerLost() if self._pending:
+                kill = self._row.kills[-1]
+                kill.block, kill.steps_lost = event.block, self._done.get(event.block, 0)
+                kill.seconds_to_notice = time.perf_counter() - self._killed_at
+            case WorkersSeen():
+                self._done = {worker.block: worker.done for worker in event.workers}
+                if self._left and not self._pending:
+                    self._kill()
+
+    @property
+    def _pending(self) -> bool:
+        """Whether the last kill's visit is not lent again."""
+        return bool(self._row.kills) and self._row.kills[-1].seconds_to_lend is None
+
+    def _kill(self) -> None:
+        trainer = self._trainer
+        step = trainer.state.step + sum(self._done.values())
+        self._first = step if self._first is None else self._first
+        share = (self._kills - self._left + 0.5) / self._kills
+        if step >= self._first + share * (trainer.run.budget.steps - self._first):
+            with suppress(ProcessLookupError):  # it has just ended by itself
+                os.kill(self._rng.choice(trainer.workers.pids), signal.SIGKILL)
+                self._killed_at, self._left = time.perf_counter(), self._left - 1
+                self._row.kills.append(Kill(step))
+
+    def _lend(self, lease: Lease) -> None:
+        self._submit(lease)
+        if self._pending and self._row.kills[-1].block == lease.task.active.geometry.block:
+            self._row.kills[-1].seconds_to_lend = time.perf_counter() - self._killed_at
 
 
-def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
-    """One run."""
+def config_of(args: Args, workers: int, out: Path) -> TrainerConfig:
+    """ns-train's, with nothing but training in it."""
     config = copy.deepcopy(methods.abcd.config)
     config.pipeline.datamanager.data = args.data
     config.pipeline.datamanager.dataparser.downscale_factor = args.downscale
@@ -101,11 +160,17 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     config.pipeline.training.seed = config.machine.seed = args.seed
     config.pipeline.max_seconds = args.seconds
     config.max_num_iterations = args.steps or 10**9
-    config.output_dir, config.experiment_name, config.vis = out, f"{workers}-{kills}", "tensorboard"
+    config.output_dir, config.experiment_name, config.vis = out, "run", "tensorboard"
     config.logging.local_writer.enable = False
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.steps_per_save = 0
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    return config
+
+
+def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
+    """One run."""
+    config = config_of(args, workers, out)
     if workers == 1:
         config.pipeline.training.processes = 1
         torch.set_num_threads(1)
@@ -123,6 +188,8 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     row.waited = waiting[0] / row.seconds
     row.steps = coordinator.state.step
     row.psnr = mean_psnr(trainer.pipeline)
+    coordinator.close()
+    row.digest = digest(trainer.base_dir / STATE)
     return row
 
 
@@ -147,31 +214,53 @@ def _count_waiting(row: Row) -> list[float]:
     return waiting
 
 
-def main() -> None:
-    """Measure, and print a table."""
-    args = tyro.cli(Args, description=__doc__)
-    if (args.seconds is None) == (args.steps is None):
-        sys.exit("give --seconds or --steps")
+def main(args: Args) -> None:
+    """Measure, and print tables."""
+    if (args.seconds is None) == (args.steps is None) or (args.kills and args.steps is None):
+        sys.exit("give --seconds or --steps; with --kills it must be --steps")
     budget = f"{args.seconds:g} s" if args.seconds else f"{args.steps:,} steps"
     print(f"{args.data.name}, downscale {args.downscale}, {args.blocks} blocks, {budget}, seed {args.seed}")
     print(f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}\n")
     print("| workers | kills | visits | visits/s | steps | seconds | driver waits | MB lent a visit | PSNR |")
     print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    rows = []
     for workers in args.workers:
-        for kills in dict.fromkeys((0, args.kills)):
+        for kills in dict.fromkeys((0, args.kills if workers > 1 else 0)):
             # A process of its own: nothing of one run is left for the next.
             with (
                 tempfile.TemporaryDirectory() as out,
                 multiprocessing.get_context("spawn").Pool(1) as process,
             ):
                 row = process.apply(measure, (args, workers, kills, Path(out)))
-            lent = row.lent / max(row.visits, 1) / 1e6
+            rows.append(row)
+            lent, rate = row.lent / max(row.visits, 1) / 1e6, row.visits / row.seconds
             print(
-                f"| {row.workers or 'none'} | {row.kills} | {row.visits} | {row.visits / row.seconds:.2f} | "
+                f"| {row.workers or 'none'} | {len(row.kills)} | {row.visits} | {rate:.2f} | "
                 f"{row.steps:,} | {row.seconds:.1f} | {row.waited:.0%} | {lent:.1f} | {row.psnr:.2f} |",
                 flush=True,
             )
+            if kills:
+                print(table_of_kills(row, rows[-2]))
+    if args.out is not None:
+        told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
+        asked = {**asdict(args), "data": args.data.name, "out": None}
+        found = {**told, "asked": asked, "runs": [asdict(row) for row in rows]}
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def table_of_kills(row: Row, undisturbed: Row) -> str:
+    """What each kill cost, and whether anything is left of them."""
+    lines = ["\n| kill | at step | block | steps lost | noticed after | lent again after |"]
+    lines += ["| ---: " * 6 + "|"]
+    for number, kill in enumerate(row.kills, start=1):
+        block = "-" if kill.block is None else kill.block + 1
+        times = (kill.seconds_to_notice, kill.seconds_to_lend)
+        noticed, lent = ("-" if t is None else f"{t:.1f} s" for t in times)
+        lines += [f"| {number} | {kill.step:,} | {block} | {kill.steps_lost} | {noticed} | {lent} |"]
+    once = "each visit was taken in once" if row.is_whole else "VISITS ARE MISSING, OR THERE TWICE"
+    same = "the same to the last bit" if row.digest == undisturbed.digest else "ANOTHER"
+    return "\n".join([*lines, "", f"{once}; the scene and its run's state are {same} as without kills\n"])
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Args, description=__doc__))

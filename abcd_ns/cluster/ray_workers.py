@@ -13,7 +13,14 @@ from typing import Any
 
 import ray
 import torch
-from ray.exceptions import GetTimeoutError, RayActorError, RayError, RayTaskError
+from ray.exceptions import (
+    GetTimeoutError,
+    ObjectStoreFullError,
+    OutOfDiskError,
+    RayActorError,
+    RayError,
+    RayTaskError,
+)
 
 from abcd_ns.cluster.lease import (
     Finished,
@@ -29,7 +36,7 @@ from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import StepTaken, WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.errors import UserError
+from abcd_ns.errors import UserError, is_out_of_memory
 
 SILENCE, SLOW_START = 60.0, 600.0
 """Seconds after which a worker that does not answer, or does not begin, counts as lost."""
@@ -37,6 +44,7 @@ LOOK_EVERY = 1.0
 """Seconds between two questions."""
 STARTS = 3
 """Workers in a row that may end before they are ready; then there is something wrong with all of them."""
+FULL = (ObjectStoreFullError, OutOfDiskError)
 
 
 @dataclass(frozen=True)
@@ -49,9 +57,16 @@ class Shared:
 
     @staticmethod
     def of(value: Gaussians | BlockState) -> "Shared":
-        """Put it there; the caller owns it."""
+        """Put it there; the caller owns it.
+
+        Raises:
+            WorkersError: memory is full, and the disk that stands in for it.
+        """
         tensors, meta = (dict(value.items()), None) if isinstance(value, Gaussians) else value.to_tensors()
-        return Shared(ray.put({name: tensor.numpy() for name, tensor in tensors.items()}), meta)
+        try:
+            return Shared(ray.put({name: tensor.numpy() for name, tensor in tensors.items()}), meta)
+        except FULL as error:
+            raise _no_room(error) from error
 
     def __call__(self) -> Gaussians | BlockState:
         """Read it; not to be written to."""
@@ -232,6 +247,9 @@ class RayWorkers:
         try:
             answer = ray.get(ref)
         except RayTaskError as error:
+            if is_out_of_memory(error.cause):  # as if the kernel had killed it: a new one begins with none
+                ray.kill(member.actor)
+                return self._replace(member, "out of memory")
             raise _as_user_error(error, member.number) from error
         except RayError as error:
             return self._replace(member, _first_line(error))
@@ -281,6 +299,13 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
+def _no_room(error: Exception) -> WorkersError:
+    return WorkersError(
+        f"Ray has no room for a block: {_first_line(error)}. Free the disk of Ray's folder (RAY_TMPDIR "
+        "says where), or start a cluster with a larger --object-store-memory."
+    )
+
+
 def _as_user_error(error: RayTaskError, number: int) -> Exception:
     """What a worker raised, as it would have been raised here."""
     cause = error.cause
@@ -288,4 +313,6 @@ def _as_user_error(error: RayTaskError, number: int) -> Exception:
         return WorkersError(f"worker {number + 1}: {cause}")
     if isinstance(cause, torch.cuda.OutOfMemoryError):
         return cause
+    if isinstance(cause, FULL):
+        return _no_room(cause)
     return error

@@ -54,16 +54,9 @@ def dispatcher_for(local: Coordinator, config: TrainerConfig, budget: int) -> Di
     Raises:
         WorkersError: they cannot be had.
     """
-    pipeline, run, count = config.pipeline, local.run, config.pipeline.workers
+    pipeline, count = config.pipeline, config.pipeline.workers
     on_gpu = config.machine.device_type == "cuda"
-    room = local.source.room
-    setup = RunSetup(
-        replace(run.config, processes=1),
-        run.budget,
-        list(run.views.values()),
-        {name: AdamOptions.of(optimizer) for name, optimizer in run.optimizers.items()},
-        LayerRoom(room.device if on_gpu else room.device // count, room.ram // count),
-    )
+    setup = setup_of(local, count, on_gpu)
     config = copy.deepcopy(config)
     config.pipeline.datamanager.photo_cache_gb = pipeline.datamanager.photo_cache_gb / count
     threads = max(torch.get_num_threads() // count, 1)
@@ -83,6 +76,18 @@ def dispatcher_for(local: Coordinator, config: TrainerConfig, budget: int) -> Di
     while not on_gpu and workers.idle < count:  # the warm-up, too, wants the cores that they start on
         workers.wait(1.0)
     return Dispatcher(local, workers)
+
+
+def setup_of(local: Coordinator, count: int, on_gpu: bool) -> RunSetup:
+    """What each of `count` workers needs to know of a run."""
+    run, room = local.run, local.source.room
+    return RunSetup(
+        replace(run.config, processes=1),
+        run.budget,
+        list(run.views.values()),
+        {name: AdamOptions.of(optimizer) for name, optimizer in run.optimizers.items()},
+        LayerRoom(room.device if on_gpu else room.device // count, room.ram // count),
+    )
 
 
 def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int) -> VisitWorker:

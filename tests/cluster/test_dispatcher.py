@@ -186,6 +186,65 @@ def test_a_run_that_stops_goes_on_with_any_number_of_workers(make, photos, goes_
     assert len(whole_scene(resumed)) == len(whole_scene(stopped))
 
 
+def test_from_one_worker_to_two_and_back_nobody_is_lost_and_all_can_be_repeated(make, photos):
+    def trained(name: str):
+        for workers, until in ((1, 15), (2, 40), (1, 60)):
+            run = make(name, workers=workers, resume=workers != 1 or until == 60, density=STILL)
+            began = run.state.step
+            while run.state.step < until:
+                train_step(run, photos)
+            assert began < run.state.step
+            assert run.count() == len(whole_scene(run)) == 90
+            if until < 60:
+                assert run.state.in_flight
+                run.save()
+                run.close()
+        assert run.finished
+        assert run.state.step == 60
+        return run
+
+    one, other = trained("one"), trained("other")
+    assert equal(whole_scene(one), whole_scene(other))
+    assert one.state.to_json() | {"seconds": 0} == other.state.to_json() | {"seconds": 0}
+
+
+class CutOff:
+    """Workers in this process, one of whom is cut off once, given up, and heard again with an answer of its
+    own: `healed` waits later, which may be before or after the one who has its visit now."""
+
+    def __init__(self, inner, healed: int) -> None:
+        self._inner, self._healed, self._waits = inner, healed, 0
+        self._answer = None
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def wait(self, seconds):
+        self._waits += 1
+        reports = []
+        if self._waits == self._healed + 1:
+            reports.append(self._answer)
+        found = self._inner.wait(seconds)
+        if self._waits > 1:
+            return reports + found
+        (self._answer,) = found
+        outcome = self._answer.outcome
+        gaussians = replace(outcome.state.gaussians, means=outcome.state.gaussians.means + 1.0)
+        altered = replace(outcome, state=replace(outcome.state, gaussians=gaussians))
+        self._answer = Finished(self._answer.lease, altered)
+        return [Lost(self._answer.lease, "cut off")]
+
+
+@pytest.mark.parametrize("healed", [1, 2, 4])
+def test_an_answer_that_comes_when_its_lease_has_ended_is_refused(make, photos, healed):
+    steady = make("steady", workers=2, density=STILL)
+    train(steady, photos)
+    cut = make("cut", workers=lambda run: CutOff(in_process(run, photos, 2), healed), density=STILL)
+    train(cut, photos)
+    assert cut.refused == 1
+    assert equal(whole_scene(steady), whole_scene(cut))
+
+
 def test_a_visit_that_ends_every_worker_ends_the_run_with_one_line(make, photos):
     run = make(workers=lambda r: Unreliable(in_process(r, photos, 2), lambda leases: (leases[0], "lost")))
     with pytest.raises(WorkersError, match=rf"lost {LOSSES} workers.*abcd plan"):

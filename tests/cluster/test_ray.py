@@ -5,10 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 
 from abcd_ns.cluster import connect as connecting
 from abcd_ns.cluster.connect import check_installed, connect, keep_to_ourselves
@@ -28,6 +30,7 @@ from tests.reference.scenes import make_coordinator, random_gaussians, whole_sce
 keep_to_ourselves(starts=True)  # before Ray is imported
 ray = pytest.importorskip("ray")
 from ray.cluster_utils import Cluster  # noqa: E402
+from ray.exceptions import ObjectStoreFullError, OutOfDiskError  # noqa: E402
 
 from abcd_ns.cluster import ray_workers  # noqa: E402 - needs Ray
 from abcd_ns.cluster.ray_workers import RayWorkers  # noqa: E402
@@ -36,15 +39,27 @@ pytestmark = pytest.mark.timeout(240)
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
 
 
-def make_worker(setup, photos, seconds: float = 0.0) -> VisitWorker:
+TRAPS = {
+    "memory": MemoryError(),
+    "torch": RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried ..."),
+    "cuda": torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+}
+
+
+def make_worker(setup, photos, seconds: float = 0.0, traps: Path | None = None) -> VisitWorker:
     """In a worker's process.
 
     Args:
         seconds: that each photo takes, so that visits last.
+        traps: a folder; whoever finds a file there takes it away, and raises the error of that name.
     """
 
     def target(sample):
         time.sleep(seconds)
+        for name, error in TRAPS.items() if traps else ():
+            with suppress(FileNotFoundError):
+                (traps / name).unlink()
+                raise error
         return photos(sample.view.index, sample.crop), None
 
     return VisitWorker(setup, TorchRasterizer(compile="off"), target)
@@ -63,7 +78,13 @@ def steady(tmp_path_factory, views, photos):
 
 
 @pytest.fixture(scope="module")
-def workers(steady, photos):
+def traps(tmp_path_factory):
+    """See make_worker."""
+    return tmp_path_factory.mktemp("traps")
+
+
+@pytest.fixture(scope="module")
+def workers(steady, photos, traps):
     """Two real ones on a head of their own, for one run after the other."""
     try:
         connect(None, cores=3, object_store_bytes=100 << 20)
@@ -71,7 +92,7 @@ def workers(steady, photos):
         if "timed out during startup" not in str(error):
             raise
         pytest.skip("this machine is too busy to start Ray, which gives itself 30 s")
-    found = RayWorkers(2, partial(make_worker, steady[1], photos))
+    found = RayWorkers(2, partial(make_worker, steady[1], photos, traps=traps))
     yield found
     found.close()
     ray.shutdown()
@@ -127,6 +148,55 @@ def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos, monkeypatc
     assert equal(whole_scene(lent), steady[0])
 
 
+def test_one_who_is_heard_again_after_it_was_given_up_changes_nothing(steady, lent, photos, monkeypatch):
+    """A partition that heals: nobody could end it meanwhile, and its answer comes late."""
+    monkeypatch.setattr(ray_workers, "SILENCE", 8.0)
+    monkeypatch.setattr(ray_workers.ray, "kill", lambda _: None)
+    lent_first(lent)
+    member = lent.workers._members[0]
+    pid, actor, late = member.pid, member.actor, member.asked
+    lent.announce.subscribe(lambda e: os.kill(pid, signal.SIGCONT) if isinstance(e, WorkerLost) else None)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        train(lent, photos)
+        outcome, _, _ = ray.get(late, timeout=60)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    assert outcome.done > 0
+    assert equal(whole_scene(lent), steady[0])
+    del actor  # with nobody who knows it, Ray ends it
+
+
+@pytest.mark.parametrize("trap", ["memory", "torch"])
+def test_a_worker_that_runs_out_of_memory_takes_nothing_along(steady, lent, photos, traps, trap):
+    lost = []
+    lent.announce.subscribe(lambda e: lost.append(e.why) if isinstance(e, WorkerLost) else None)
+    (traps / trap).touch()
+    train(lent, photos)
+    assert lost == ["out of memory"]
+    assert not (traps / trap).exists()
+    assert equal(whole_scene(lent), steady[0])
+
+
+def test_a_full_object_store_changes_nothing(steady, lent, photos):
+    """What has no room in memory waits on disk."""
+    held = [ray.put(torch.zeros(30 << 18).numpy()) for _ in range(5)]  # 150 MiB, and room for 100
+    train(lent, photos)
+    assert equal(whole_scene(lent), steady[0])
+    assert all(float(ray.get(ref).sum()) == 0 for ref in held)
+
+
+@pytest.mark.parametrize("error", [ObjectStoreFullError, OutOfDiskError])
+def test_where_disk_is_full_too_one_line_says_so(lent, photos, monkeypatch, error):
+    def put(_):
+        raise error("no space left on device")
+
+    monkeypatch.setattr(ray_workers.ray, "put", put)
+    with pytest.raises(WorkersError, match=r"no room for a block: no space left.*--object-store-memory"):
+        train(lent, photos)
+    assert lent.state.step == 0
+
+
 def lent_first(run: Dispatcher) -> None:
     """Have both workers at it, however long they took to begin."""
     while run.workers.idle < 2:
@@ -141,6 +211,17 @@ def test_a_worker_that_cannot_begin_says_why():
     with pytest.raises(WorkersError, match="worker 1: the photos are not here"):
         refusing.wait(60.0)
     refusing.close()
+
+
+@pytest.mark.usefixtures("workers")
+def test_a_visit_that_does_not_fit_a_device_ends_the_run(steady, tmp_path, views, photos, traps):
+    """As in one process: nobody else's device would hold it."""
+    alone = RayWorkers(1, partial(make_worker, steady[1], photos, traps=traps))
+    run = make_run(tmp_path, views, lambda _: alone)
+    (traps / "cuda").touch()
+    with pytest.raises(torch.cuda.OutOfMemoryError, match=r"Tried to allocate 2\.00 GiB"):
+        train(run, photos)
+    alone.close()
 
 
 @pytest.mark.usefixtures("workers")

@@ -18,6 +18,7 @@ from abcd_ns.engine.train.step.workers.helper_process import can_fork
 from abcd_ns.engine.train.step.workers.shared_memory import SharedRows
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES
+from abcd_ns.errors import UserError
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
 pytestmark = pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
@@ -170,6 +171,50 @@ def test_a_run_does_not_depend_on_helpers_that_live(make, photos, undisturbed, m
     assert len(helped) > 60  # blocks grew
     assert equal(helped, whole_scene(lost))
     assert equal(helped, whole_scene(never))
+
+
+def raising_in_helpers(photos, error: Exception):
+    """What gives targets here, and raises in processes that were forked from this one."""
+    here = os.getpid()
+
+    def target(sample):
+        if os.getpid() != here:
+            raise error
+        return photos(sample.view.index, sample.crop), None
+
+    return target
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (KeyError("no photo 3"), r"KeyError: 'no photo 3' \(test_crew\.py:\d+, in target\)\..*processes"),
+        (ValueError("two\nlines"), r"ValueError: two \(test_crew"),
+        (UserError("The photo is gone: put it back."), r"^The photo is gone: put it back\.$"),
+    ],
+)
+def test_what_goes_wrong_in_a_helper_ends_the_run_in_one_line(make, photos, error, words):
+    run = make(target=raising_in_helpers(photos, error))
+    with pytest.raises(UserError, match=words) as raised:
+        train(run, photos)
+    assert "\n" not in str(raised.value)
+    assert run.visit.steps.crew.pids == ()
+
+
+def test_so_does_what_goes_wrong_when_it_gives_its_gradients(make, photos, monkeypatch):
+    def give(*_):
+        raise ValueError("no gradients")
+
+    monkeypatch.setattr("abcd_ns.engine.train.step.workers.helper_process.Room.give", give)
+    with pytest.raises(UserError, match="ValueError: no gradients"):
+        train(make(), photos)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+def test_a_helper_that_runs_out_of_memory_is_stood_in_for(make, photos, undisturbed, error):
+    run = make(target=raising_in_helpers(photos, error))
+    train(run, photos)
+    assert equal(undisturbed({}), whole_scene(run))
 
 
 def test_a_block_that_outgrows_the_shared_memory_is_trained_all_the_same(

@@ -7,7 +7,8 @@ layers of their own views, and end with the visit. In each step they are given t
 back losses, gradients, and what density control counts.
 
 A helper that is lost, or has no room for a block that has grown, is stood in for: the training process draws
-its share as it would have. What a run computes depends on the size of its crew, and not on how many live.
+its share as it would have. What a run computes depends on the size of its crew, and not on how many live. An
+error in a helper ends the run, as one in the training process does.
 """
 
 from collections.abc import Callable, Sequence
@@ -79,9 +80,12 @@ class Helper:
             self._process = None
 
     def _answer(self) -> Any | None:
-        found = self._process and self._process.answer()
-        if found is None:
-            self.end()
+        found = None
+        try:
+            found = self._process and self._process.answer()
+        finally:
+            if found is None:
+                self.end()
         return found
 
     def _stand_in(self) -> Share:

@@ -8,9 +8,11 @@ import ctypes
 import os
 import signal
 import sys
+import traceback
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
@@ -21,6 +23,7 @@ from abcd_ns.engine.train.density.control import COUNTED
 from abcd_ns.engine.train.step.workers.share import Contribution, DrawShare, Task
 from abcd_ns.engine.train.step.workers.shared_memory import SharedRows
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from abcd_ns.errors import UserError, is_out_of_memory
 
 PATIENCE = 600.0
 """Seconds without an answer after which a helper counts as lost."""
@@ -30,6 +33,30 @@ PR_SET_PDEATHSIG = 1
 
 Given = tuple[bool, list[tuple[int, list[list[float]]]]]
 """Whether there were counts, and the gradients of the pictures' transforms."""
+
+
+class HelperError(UserError):
+    """Something went wrong in a helper that was not lost; the message says what and where."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A helper's last words."""
+
+    why: str
+
+    @staticmethod
+    def of(error: Exception) -> "Failed":
+        """What the user can mend as it is; of all else, one line of the traceback's end."""
+        if isinstance(error, UserError):
+            return Failed(str(error))
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{os.path.basename(place.filename)}:{place.lineno}, in {place.name}"
+        what = traceback.format_exception_only(error)[-1].splitlines()[0]
+        return Failed(
+            f"A process that shares steps failed: {what} ({where}). What visits have finished is safe; "
+            "--pipeline.training.processes 1 does without."
+        )
 
 
 class Room:
@@ -88,11 +115,18 @@ class HelperProcess:
             self._pipe.send((rows, task))
 
     def answer(self) -> Any | None:
-        """The next thing that it says: Drawn, then Given. None if it is lost."""
+        """The next thing that it says: Drawn, then Given. None if it is lost.
+
+        Raises:
+            HelperError: something went wrong in it.
+        """
+        found = None
         with suppress(OSError, EOFError):
             if self._pipe.poll(PATIENCE):
-                return self._pipe.recv()
-        return None
+                found = self._pipe.recv()
+        if isinstance(found, Failed):
+            raise HelperError(found.why)
+        return found
 
     def end(self) -> None:
         """Kill it. Harmless when it has ended."""
@@ -115,7 +149,8 @@ def _end(parent: int, pid: int) -> None:
 
 
 def _live(pipe: Connection, begin: Callable[[], DrawShare], room: Room) -> NoReturn:
-    """All of a helper's life. Whatever goes wrong in it ends it; who waits for it then does the work."""
+    """All of a helper's life. Whatever goes wrong in it ends it. Who waits for it is told, and does the work
+    if it was killed or had no memory."""
     status = 1
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -125,6 +160,10 @@ def _live(pipe: Connection, begin: Callable[[], DrawShare], room: Room) -> NoRet
         torch.set_num_threads(1)
         _serve(pipe, room, begin())
         status = 0
+    except Exception as error:
+        if not is_out_of_memory(error):
+            pipe.send(Failed.of(error))
+        raise
     finally:
         os._exit(status)  # none of the training process' own exits and handlers
 

@@ -1,0 +1,125 @@
+"""What it does to a scene that blocks are trained at once: held-out PSNR at a fixed number of steps.
+
+    python -m benchmarks.at_once --data DIR --downscale 4 --visits 1 2 4 8 --seeds 0 1 2 --out FILE
+
+With n visits at once each begins from what the one n before it has left (a lag of n, see docs/cluster.md);
+with 1 the run is that of one process. Visits are trained one after the other, in this process and by one
+thread, so that neither the machine nor how busy it is has a part in the result. Runs of ns-train's trainer.
+"""
+
+import json
+import multiprocessing
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+from abcd_ns.cluster.dispatcher import Dispatcher
+from abcd_ns.cluster.in_process import InProcessWorkers
+from abcd_ns.engine.events import Event, VisitBegan, VisitEnded
+from abcd_ns.lab.runs.evaluate import mean_psnr
+from abcd_ns.machine import describe_machine, describe_versions
+from abcd_ns.nerfstudio import pipeline
+from abcd_ns.nerfstudio.workers import make_worker, setup_of
+from benchmarks import workers
+
+
+@dataclass
+class Args:
+    """What to compare."""
+
+    data: Path
+    """As of ns-train."""
+    downscale: int = 4
+    """Divides the photos' width and height."""
+    visits: tuple[int, ...] = (1, 2, 4, 8)
+    """Numbers of visits at once to try."""
+    blocks: int = 8
+    """Of the scene."""
+    steps: int = 500
+    """Of each run, the warm-up included."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """A run of each number of visits for each."""
+    out: Path | None = None
+    """Where to write the results, JSON; runs that it has are not made again."""
+
+
+@dataclass
+class Row:
+    """One run."""
+
+    at_once: int
+    seed: int
+    most_out: int = 0
+    """Visits that were out at once at most."""
+    visits: int = 0
+    """To blocks; the warm-up is none."""
+    steps: int = 0
+    gaussians: int = 0
+    psnr: float = 0.0
+    """Of held-out views, merged, dB."""
+
+
+def run(args: Args, at_once: int, seed: int) -> Row:
+    """Train and look at held-out views."""
+    torch.set_num_threads(1)
+    pipeline.dispatcher_for = lambda local, config, _: Dispatcher(
+        local, InProcessWorkers(make_worker(config, setup_of(local, 1, False), 0), at_once), lag=at_once
+    )
+    row, out = Row(at_once, seed), 0
+
+    def hear(event: Event) -> None:
+        nonlocal out
+        if isinstance(event, VisitBegan) and event.block is not None:
+            out += 1
+            row.most_out = max(row.most_out, out)
+        elif isinstance(event, VisitEnded) and event.block is not None:
+            out -= 1
+            row.visits += 1
+
+    with tempfile.TemporaryDirectory() as folder:
+        one = workers.Args(args.data, args.downscale, blocks=args.blocks, steps=args.steps, seed=seed)
+        config = workers.config_of(one, 2, Path(folder))  # any number but 1 asks for a dispatcher
+        config.pipeline.training.processes, config.machine.device_type = 1, "cpu"
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        coordinator = trainer.pipeline.coordinator
+        coordinator.announce.subscribe(hear)
+        trainer.train()
+        row.steps, row.gaussians = coordinator.state.step, coordinator.count()
+        row.psnr = mean_psnr(trainer.pipeline)
+    return row
+
+
+def main(args: Args) -> None:
+    """Make the runs that are missing, print the table, write the file after each."""
+    asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
+    rows = []
+    if args.out is not None and args.out.exists():
+        found = json.loads(args.out.read_text())
+        rows = [Row(**row) for row in found["runs"] if asked.items() <= found.items()]
+    for seed in args.seeds:
+        for at_once in args.visits:
+            if any((row.at_once, row.seed) == (at_once, seed) for row in rows):
+                continue
+            # A process of its own: nothing of one run is left for the next.
+            with multiprocessing.get_context("spawn").Pool(1) as process:
+                rows.append(process.apply(run, (args, at_once, seed)))
+            print(rows[-1], flush=True)
+            if args.out is not None:
+                told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
+                found = {**told, **asked, "runs": [asdict(row) for row in rows]}
+                args.out.write_text(json.dumps(found, indent=1) + "\n")
+    print("| visits at once |" + "".join(f" seed {seed} |" for seed in args.seeds) + " mean |")
+    print("| ---: " * (2 + len(args.seeds)) + "|")
+    for at_once in args.visits:
+        by_seed = {row.seed: row.psnr for row in rows if row.at_once == at_once}
+        psnrs = [by_seed[seed] for seed in args.seeds]
+        told = [f"{psnr:.2f}" for psnr in (*psnrs, sum(psnrs) / len(psnrs))]
+        print(f"| {at_once} | {' | '.join(told)} |")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
