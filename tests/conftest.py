@@ -5,6 +5,9 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+# Threads sleep while they wait: spinning, as is usual, burns a busy machine's time. torch reads it once.
+os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+
 import pytest
 import torch
 from hypothesis import settings

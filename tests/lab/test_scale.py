@@ -17,6 +17,7 @@ from abcd_ns.lab.scale.command import make_plan, scale
 from abcd_ns.lab.scale.land import Land, color_of
 from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings, run
 from tests.lab.compare.records import made_up, made_up_run
+from tests.lab.in_process import jobs_in_this_process
 
 MIB = 2**20
 
@@ -170,7 +171,8 @@ def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are
 
 
 @pytest.mark.cli
-def test_the_command_measures_writes_and_reuses(tmp_path, capsys):
+def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):
+    jobs_in_this_process(monkeypatch, first_is_real=True)
     out = tmp_path / "out"
     assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
     first = read_json(out / "results.json")

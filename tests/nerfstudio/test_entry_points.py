@@ -1,30 +1,30 @@
 """What nerfstudio loads for each of its commands: where something is missing, only our own methods are."""
 
-import json
 import re
-import subprocess
 import sys
+import warnings
+from contextlib import redirect_stdout
 from importlib.metadata import packages_distributions
+from io import StringIO
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
 
+import nerfstudio.configs.method_configs  # noqa: F401 - what is stock is there
 import pytest
-
-from tests.test_house_rules import PACKAGE_FILES, PYPROJECT, ROOT
-
-NEEDED = ("viser", "cv2", "fcntl", "safetensors", "pytorch_msssim")
-NOT_NEEDED = ("embreex", "trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray")
-SCRIPT = """
-import json, sys
-import nerfstudio.configs.method_configs  # what is stock is there
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 
-def belongs(module, names):
-    return module.split(".")[0] in names
+from tests.test_house_rules import PACKAGE_FILES, PYPROJECT
 
-def discovered(*missing):
-    for module in [m for m in sys.modules if belongs(m, {"abcd_ns"})]:
+NEEDED = ("viser", "cv2", "fcntl", "safetensors", "pytorch_msssim")
+NOT_NEEDED = ("embreex", "trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray")
+
+
+def discovered(*missing: str) -> tuple[object, str, bool]:
+    """Our method, its words and whether our reader is there, as nerfstudio finds them without modules."""
+    for module in [name for name in sys.modules if name.split(".")[0] == "abcd_ns"]:
         del sys.modules[module]
-    before = {m: found for m, found in sys.modules.items() if belongs(m, missing)}
+    before = {name: found for name, found in sys.modules.items() if name.split(".")[0] in missing}
     sys.modules.update(dict.fromkeys([*missing, *before]))  # None: importing it fails
     methods, words = discover_methods()
     parsers, _ = discover_dataparsers()
@@ -33,29 +33,36 @@ def discovered(*missing):
     sys.modules.update(before)
     return methods["abcd"], words["abcd"], "abcd-data" in parsers
 
-needed, not_needed = json.loads(sys.argv[1])
-found = {name: discovered(name) for name in needed}
-found["others"] = discovered(*not_needed)
-try:
-    found["fcntl"][0].print_to_terminal()
-except SystemExit as end:
-    code = end.code
-kinds = {name: (type(config).__name__, *rest) for name, (config, *rest) in found.items()}
-print(json.dumps({**kinds, "code": code}))
-"""
+
+def discover_all(answer: Connection) -> None:
+    """In a fork, whose modules are its own."""
+    warnings.simplefilter("ignore")
+    sys.meta_path[:] = [finder for finder in sys.meta_path if "jaxtyping" not in type(finder).__module__]
+    found = {name: discovered(name) for name in NEEDED}
+    found["others"] = discovered(*NOT_NEEDED)
+    code, said = None, StringIO()
+    try:
+        with redirect_stdout(said):
+            found["fcntl"][0].print_to_terminal()
+    except SystemExit as end:
+        code = end.code
+    kinds = {name: (type(config).__name__, *rest) for name, (config, *rest) in found.items()}
+    answer.send(({**kinds, "code": code}, said.getvalue()))
 
 
 @pytest.fixture(scope="module")
 def without() -> tuple[dict, str]:
     """What nerfstudio finds while something is missing, by what that is; and what is said on the terminal."""
-    command = [sys.executable, "-W", "ignore", "-c", SCRIPT, json.dumps([NEEDED, NOT_NEEDED])]
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
-    assert ended.returncode == 0, ended.stderr[-3000:]
-    *said, last = ended.stdout.splitlines()
-    return json.loads(last), "\n".join(said)
+    here, there = Pipe()
+    process = get_context("fork").Process(target=discover_all, args=(there,))
+    process.start()
+    there.close()
+    try:
+        return here.recv()
+    finally:
+        process.join()
 
 
-@pytest.mark.cli
 def test_what_training_needs_is_named_when_it_is_missing(without):
     found, said = without
     for name in NEEDED:
@@ -69,7 +76,6 @@ def test_what_training_needs_is_named_when_it_is_missing(without):
     assert "it needs Linux or macOS" in said
 
 
-@pytest.mark.cli
 def test_what_training_does_not_need_may_be_missing(without):
     kind, words, has_parser = without[0]["others"]
     assert kind == "AbcdTrainerConfig", words

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from abcd_ns.lab.compare.command import Options, carry_out, make_plan
 from abcd_ns.lab.results.results import read_results
+from tests.lab.in_process import jobs_in_this_process
 from tests.reference.colmap_scene import HELD_OUT, write_scene
 
 STEPS = 20
@@ -17,7 +18,7 @@ STEPS = 20
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
-    """(results, output folder, plan, what was printed) of two methods, each really trained in a process."""
+    """(results, plan, what was printed) of two methods, really trained, the first in a process of its own."""
     folder = tmp_path_factory.mktemp("compare")
     write_scene(folder / "scene")
     options = Options(
@@ -30,7 +31,9 @@ def compared(tmp_path_factory):
         pictures=1,
     )
     plan, stream = make_plan(options), StringIO()
-    code = carry_out(plan, Console(file=stream, width=100))
+    with pytest.MonkeyPatch.context() as patch:
+        jobs_in_this_process(patch, first_is_real=True)
+        code = carry_out(plan, Console(file=stream, width=100))
     assert code == 0, stream.getvalue()
     return read_results(plan.out / "results.json"), plan, stream.getvalue()
 

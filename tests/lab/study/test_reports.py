@@ -17,6 +17,7 @@ from abcd_ns.lab.runs import runner
 from abcd_ns.lab.study.charts import draw_study
 from abcd_ns.lab.study.command import BlocksStudy, OptionsStudy, carry_out
 from tests.lab.compare.fake_worker import FakeWorker
+from tests.lab.in_process import jobs_in_this_process
 from tests.lab.study.records import (
     blocks_study,
     gaussians_study,
@@ -293,9 +294,9 @@ def test_results_come_back_as_they_were_written(make, tmp_path):
     assert read_results(tmp_path / "results.json") == study
 
 
-@pytest.mark.cli
-def test_a_study_that_really_trains(scene, tmp_path):
+def test_a_study_that_really_trains(scene, tmp_path, monkeypatch):
     """Two numbers of blocks, under a limit below the scene's 300 points."""
+    jobs_in_this_process(monkeypatch)
     given = {"data": scene, "out": tmp_path / "out", "steps": 12, "evals": 2, "max_gaussians": 150}
     code, printed = carried_out(BlocksStudy(**given, blocks=(1, 3)).plan())
     assert code == 0, printed
