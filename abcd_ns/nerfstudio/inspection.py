@@ -67,8 +67,8 @@ def _read(parser: DataParser, split: str) -> DataparserOutputs:
         return parser.get_dataparser_outputs(split=split)
     except EOFError as error:  # of input()
         raise InputError(
-            f"{name} asks the question above, and there is no terminal to answer it: run the command in one, or "
-            f"change what it is about by an option of `ns-train abcd {name} --help`."
+            f"{name} asks the question above, and there is no terminal to answer it: run the command in "
+            f"one, or change what it is about by an option of `ns-train abcd {name} --help`."
         ) from error
     except TROUBLE as error:
         raise InputError(
