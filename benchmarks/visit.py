@@ -38,6 +38,7 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig, for_blocks
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Sample
@@ -146,6 +147,7 @@ def begin(
     steps: int | None = None,
     seconds: float | None = None,
     rasterizer: Rasterizer | None = None,
+    antialiased: bool = False,
 ) -> Coordinator:
     """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -153,8 +155,10 @@ def begin(
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     keep = None if blocks == 1 else len(capture.gaussians) // blocks
     store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=seed))
+    density = for_blocks(DensityConfig(), blocks)
+    config = TrainingConfig(seed=seed, processes=processes, antialiased=antialiased, density=density)
     run = TrainingRun(
-        TrainingConfig(seed=seed, processes=processes),
+        config,
         Budget(steps=steps, seconds=seconds),
         StoredScene(tree, store),
         capture.views,
