@@ -99,7 +99,8 @@ class VisitLayers:
         window_weight: float,
     ) -> None:
         self._painter, self._store = painter, store
-        self._geometry, self._views, self._settings = geometry, views, settings
+        # A copy: whatever becomes of the views, these are drawn.
+        self._geometry, self._views, self._settings = geometry, dict(views), settings
         self._window_weight = window_weight
         self._units = painter.units(exclude=geometry.block)
         self._own = own if painter.ownership == "fragments" else None
@@ -160,6 +161,10 @@ class VisitLayers:
                 self._painter.fold_up(parts[view], unit, self._views[view])
                 if unit == self._units[-1]:
                     yield view, self._keep(view, parts.pop(view))
+
+    def shows(self, view: View) -> bool:
+        """Whether this very view is drawn, from where it was when the visit began."""
+        return self._views[view.index].viewmat is view.viewmat
 
     def around(self, view: int, crop: Crop | None = None) -> Surroundings:
         """What `view` sees around the active block, in a part of the visit's crop or in all of it."""

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.light import Kind
+from abcd_ns.engine.train.light import Kind as LightKind
+from abcd_ns.engine.train.poses import Kind as PosesKind
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 
@@ -58,10 +59,14 @@ class TrainingConfig:
     """Scale opacities by gsplat's compensation for its low-pass filter."""
     background: Literal["random", "black", "white"] = "random"
     """What lies behind the scene while training."""
-    light: Kind = "none"
+    light: LightKind = "none"
     """Makes good for photos that were taken in different light, by a colour transform of each finished
     picture. exposure: a gain for each channel. affine: a matrix, 3 x 4. Their mean over the photos is the
     identity, in which held-out views are drawn; these are scored as `cc_psnr`, too."""
+    poses: PosesKind = "off"
+    """Refines where photos were taken from, by whole pictures in the warm-up and between visits. SO3xR3: how
+    each camera turns and where it is. Held-out views keep the poses that were given. With `workers` poses are
+    refined in the warm-up only."""
     means_lr_decay: float = 0.01
     """Learning rate of the means at the end, as a share of the start's; exponential over the run."""
     point_pixels: float = 2.0
@@ -99,6 +104,11 @@ class TrainingConfig:
                 raise UserError(f"--pipeline.training.{name} must be {words}, not {value}.")
         if self.light != "none" and recipe.exact:
             raise UserError("--pipeline.training.light is for methods that train by visits, not abcd-exact.")
+        if self.poses != "off" and (recipe.exact or recipe.overlap > 0):
+            raise UserError(
+                "--pipeline.training.poses is for methods whose blocks are drawn together while they are "
+                "trained in turn, not abcd-exact nor abcd-partition."
+            )
         if recipe.overlap < 0 or (recipe.overlap > 0 and (recipe.layers or recipe.exact or recipe.migrate)):
             raise UserError(
                 f"training.recipe.overlap is {recipe.overlap}: it must be 0, or more where layers, exact "

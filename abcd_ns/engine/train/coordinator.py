@@ -18,6 +18,7 @@ from abcd_ns.engine.store.settle import settle
 from abcd_ns.engine.store.special_blocks import LIVE
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
+from abcd_ns.engine.train.pose_rounds import PoseRounds
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.splitting import cut_full
@@ -49,6 +50,9 @@ class Coordinator(Trainer):
         super().__init__(run)
         self.visits, self.source = visits or Planner(run), source or LayerSource(run)
         self.visit = VisitTraining(run, self.visits, self.source, target, live)
+        if run.config.poses != "off" and target is None:
+            raise ValueError("poses are refined by photos: give `target`")
+        self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
 
     # -- a step --------------------------------------------------------------------------------------
 
@@ -64,6 +68,10 @@ class Coordinator(Trainer):
             NothingSeenError: no view sees any block.
         """
         self.stopwatch.start()
+        # Before a step, not after one: a run that stops between two goes on to the same round.
+        if self.poses is not None and self.poses.is_due:
+            self.poses.take()
+            self.visit.follow_poses()
         if self.state.active is None:
             self.begin_visit()
         return self.visit.next_batch()
@@ -87,6 +95,8 @@ class Coordinator(Trainer):
         Args:
             psnrs: of each picture, dB; listeners are told their mean.
         """
+        if self.poses is not None:
+            self.poses.count(len(rendered.pictures) * self.run.active.crew)
         self.visit.after_step(rendered, psnrs)
         if self.visit.is_over:
             self.end_visit()

@@ -4,14 +4,14 @@ F, the live block, B and the background are composited first. So no layer hangs 
 valid whatever becomes of it. Transforms belong to the run and not to a block: of each photo there is one.
 """
 
-import base64
 from collections.abc import Sequence
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from abcd_ns.engine.train import per_view
 
 Kind = Literal["none", "exposure", "affine"]
 Uses = Sequence[tuple[int, Tensor]]
@@ -79,13 +79,11 @@ class Light:
 
     def to_json(self) -> dict[str, str]:
         """All of it at rest, bit for bit."""
-        return {name: _packed(value) for name, value in self._tensors().items()}
+        return per_view.to_json(self._tensors())
 
     def restore(self, data: dict[str, str]) -> None:
         """Stand where `to_json` was called."""
-        for name, value in self._tensors().items():
-            found = np.frombuffer(base64.b64decode(data[name]), dtype=np.float32)
-            value.copy_(torch.from_numpy(found.copy()).view_as(value))
+        per_view.restore(self._tensors(), data)
 
     def _tensors(self) -> dict[str, Tensor]:
         return {name: getattr(self, f"_{name}") for name in ("changes", "first", "second", "uses")}
@@ -100,7 +98,3 @@ def lit(picture: Float[Tensor, "h w 3"], transform: Float[Tensor, "3 4"]) -> Flo
     """A composited picture in a photo's light, M c + o in each pixel, not clamped."""
     matrix = transform.to(picture.dtype)
     return picture @ matrix[:, :3].T + matrix[:, 3]
-
-
-def _packed(value: Tensor) -> str:
-    return base64.b64encode(value.cpu().numpy().tobytes()).decode()

@@ -26,7 +26,7 @@ from abcd_ns.engine.train.schedule import (
     visit_views,
 )
 from abcd_ns.engine.train.step.batch import Batch
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 
 LOOK_AGAIN = 4
@@ -71,8 +71,7 @@ class Planner:
     def __init__(self, run: TrainingRun) -> None:
         self._run = run
         self._config, self._budget, self._scene = run.config, run.budget, run.scene
-        self._views = run.views
-        self._culling: dict[int, tuple[Frusta, Optics]] = {}
+        self._culling: dict[int, tuple[dict[int, View], Frusta, Optics]] = {}
 
     def begin(self) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
@@ -110,7 +109,7 @@ class Planner:
 
     def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the scaffold of all blocks is trained."""
-        crops = {index: view.full for index, view in self._views.items()}
+        crops = {index: view.full for index, view in self._run.views.items()}
         geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
         views = views_per_warm_up_step(self._config.batch, self._config.limits.batch_limit)
@@ -166,7 +165,7 @@ class Planner:
         """The visit to a block that is the whole scene: all that is left of the run, on whole views, for the
         block may grow anywhere."""
         steps = UNLIMITED if self._budget.steps is None else self._budget.steps - state.step
-        geometry = VisitGeometry(block, {view: self._views[view].full for view in kept})
+        geometry = VisitGeometry(block, {view: self._run.views[view].full for view in kept})
         return ActiveVisit(state.visit, geometry, sh_degree, steps, geometry.views, began=began, sole=True)
 
     def _worth_training(self, state: RunState, geometry: VisitGeometry) -> tuple[int, ...]:
@@ -218,11 +217,13 @@ class Planner:
         bounds = self._scene.bounds(block)
         if bounds is None:
             return VisitGeometry(block, {})
-        views = list(self._run.views_at(reduction).values())
-        if reduction not in self._culling:
+        found = self._run.views_at(reduction)
+        views = list(found.values())
+        if reduction not in self._culling or self._culling[reduction][0] is not found:  # or poses moved
             side = self._run.rasterizer.window_side
-            self._culling[reduction] = Frusta(((v, v.full) for v in views), side), Optics(views, side)
-        frusta, optics = self._culling[reduction]
+            frusta = Frusta(((v, v.full) for v in views), side)
+            self._culling[reduction] = found, frusta, Optics(views, side)
+        _, frusta, optics = self._culling[reduction]
         (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
         seeing = [view for view, may in zip(views, shows, strict=True) if may]
         gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)

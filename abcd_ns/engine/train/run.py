@@ -1,5 +1,7 @@
 """What all parts of a training share: options, the scene at rest, live parameters, where the run stands."""
 
+from dataclasses import replace
+
 import torch
 
 from abcd_ns.engine.events import Announcer
@@ -12,6 +14,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl, for_blocks
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.light import Light
+from abcd_ns.engine.train.poses import Poses
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
 from abcd_ns.engine.types import View
@@ -49,6 +52,7 @@ class TrainingRun:
         self.stopwatch = Stopwatch()
         self.state = RunState()
         self.light = None if config.light == "none" else Light(config.light, list(self.views), self.device)
+        self.poses = Poses(views)
         may_act = config.heal and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
         self.fit_density(scene.tree.num_blocks)
@@ -59,6 +63,11 @@ class TrainingRun:
             views = {index: view.reduced(reduction) for index, view in self.views.items()}
             self._reduced[reduction] = views
         return self._reduced[reduction]
+
+    def take_poses(self) -> None:
+        """Views stand where `poses` has them from now on."""
+        self.views = {i: replace(view, viewmat=self.poses.of(i)) for i, view in self.views.items()}
+        self._reduced = {1: self.views}
 
     @property
     def reduction(self) -> int:
@@ -116,6 +125,7 @@ class TrainingRun:
         self.state.seconds = self.stopwatch.seconds
         if self.light is not None:
             self.state.light = self.light.to_json()
+        self.state.poses = self.poses.to_json()
         self.scene.rest(tree, updates, self.state.to_json(), within)
 
     def restore(self) -> None:
@@ -124,3 +134,6 @@ class TrainingRun:
         self.stopwatch = Stopwatch(self.state.seconds)
         if self.light is not None and self.state.light:
             self.light.restore(self.state.light)
+        if self.state.poses:
+            self.poses.restore(self.state.poses)
+            self.take_poses()

@@ -119,6 +119,12 @@ class RunState:
     """Gaussians that were drawn around them."""
     light: dict[str, str] = field(default_factory=dict)
     """See Light, at rest; empty where there is none."""
+    poses: dict[str, str] = field(default_factory=dict)
+    """See Poses, at rest; empty where all are as they were given."""
+    uses: float = 0.0
+    """Of each view by the whole scene, so far; counted where poses are refined. A block is its part of it."""
+    posed: float = 0.0
+    """Uses after which poses were last refined."""
     health: Ledger = field(default_factory=dict)
     """What had to be mended, by block."""
     active: ActiveVisit | None = None

@@ -14,6 +14,7 @@ from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import RunState, Stopwatch
 from abcd_ns.engine.train.step.batch import Batch, Rendered
+from abcd_ns.engine.types import View
 
 
 class Trainer(ABC):
@@ -21,7 +22,7 @@ class Trainer(ABC):
 
     def __init__(self, run: TrainingRun) -> None:
         self.run = run
-        self.config, self.scene, self.views = run.config, run.scene, run.views
+        self.config, self.scene = run.config, run.scene
         self.params, self.optimizers, self.device = run.params, run.optimizers, run.device
         self.announce, self.health = run.announce, run.health
 
@@ -85,6 +86,11 @@ class Trainer(ABC):
     def state(self) -> RunState:
         """All that is known of the run besides the blocks."""
         return self.run.state
+
+    @property
+    def views(self) -> dict[int, View]:
+        """The training views by index, as they stand by now."""
+        return self.run.views
 
     @property
     def stopwatch(self) -> Stopwatch:

@@ -76,6 +76,11 @@ class VisitTraining:
         self._pace.set(self.batch, means_decay=decay, damping=run.health.damping)
         return self.steps.next_batch()
 
+    def follow_poses(self) -> None:
+        """Views have moved: helpers, who saw them where they were, are gathered anew."""
+        if self.run.state.active is not None:
+            self.steps.gather_anew()
+
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
         return self.steps.render(batch)

@@ -74,6 +74,12 @@ class StepDrawing:
         self.crew = self._gather_crew(active)
         self.layers = self._source.draw(active, self._left_to_draw(active, self._order))
 
+    def gather_anew(self) -> None:
+        """Let go of helpers, and gather others, who see the run as it is now."""
+        if self.crew is not None:
+            self.crew.dismiss()
+            self.crew = self._gather_crew(self._run.active)
+
     def end_visit(self) -> None:
         """Let go of helpers and layers."""
         if self.crew is not None:
@@ -173,6 +179,8 @@ class StepDrawing:
         return replace(sample, share=crop.pixels / whole.pixels)
 
     def _sample_of(self, view: View, crop: Crop, place: int, step: int) -> Sample:
+        if self.layers and not self.layers.shows(view):
+            raise RuntimeError(f"View {view.index} has moved since its layers were drawn.")
         around = self.layers.around(view.index, crop) if self.layers else None
         return Sample(
             view=view,

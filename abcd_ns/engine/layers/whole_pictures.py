@@ -1,0 +1,149 @@
+"""Pictures of the whole scene, one unit of it on the device at a time, and their gradient by the pose.
+
+As exact joint training has them (peers/exact.py), but for the camera: every unit is drawn without gradients
+and all are folded to the picture; a loss gives G = dL/dC; every unit is drawn again, with gradients, and
+dL/dC_A = T_F G, dL/dT_A = T_F <G, C_B + T_B b>, where F and B are what is before and behind it. What the pose
+gets from each unit is added up. Layers are cut where the rays of the given pose cross from cell to cell: a
+fragment that moves over a border is the same in either layer, so that the gradient has no part of it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.layers.compositing import composite, empty_layer, fold
+from abcd_ns.engine.layers.painter import Loaded, Painter, PaintSettings
+from abcd_ns.engine.render import Raster, Shot
+from abcd_ns.engine.types import Layer, View
+
+LAYERS_BYTES = 256 << 20
+"""Of the layers that are held until a picture's gradient is known, unless a single view has more."""
+BYTES_PER_PIXEL = 32
+"""Of a layer with its depth, in float32."""
+
+
+@dataclass(frozen=True)
+class WholePicture:
+    """The scene as one view sees it, on black."""
+
+    color: Float[Tensor, "h w 3"]
+    """Not clamped."""
+    transmittance: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    """Sum of weight x camera z, world units."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A unit in one view."""
+
+    unit: int
+    layer: Layer
+    depth: Float[Tensor, "h w"]
+    raster: Raster | None
+    """With its graph, where there is but one unit: it need not be drawn again."""
+
+
+class WholePictures:
+    """Draws a scene for poses to be judged by.
+
+    Args:
+        views: all that will be drawn.
+    """
+
+    def __init__(self, painter: Painter, settings: PaintSettings) -> None:
+        self._painter, self._settings = painter, settings
+        self._units = painter.units()
+
+    def groups(self, views: Sequence[View]) -> list[list[View]]:
+        """Views whose layers have room at the same time: each group reads the scene twice."""
+        groups, room = [], 0
+        for view in views:
+            needed = len(self._units) * BYTES_PER_PIXEL * view.full.pixels
+            if not groups or needed > room:
+                groups.append([])
+                room = LAYERS_BYTES
+            groups[-1].append(view)
+            room -= needed
+        return groups
+
+    def differentiate(
+        self, views: Sequence[View], gradient: Callable[[View, WholePicture], Float[Tensor, "h w 3"]]
+    ) -> list[Float[Tensor, "4 4"]]:
+        """The gradient of a loss by each view's world-to-camera matrix, all of whose entries count as free.
+
+        Args:
+            gradient: gives dL/dC of a view's picture.
+        """
+        leaves = [replace(view, viewmat=view.viewmat.detach().clone().requires_grad_()) for view in views]
+        parts = self._draw(leaves)
+        pulls = []
+        for view, own in zip(leaves, parts, strict=True):
+            order = self._painter.order([part.unit for part in own], still(view))
+            own.sort(key=lambda part: order.index(part.unit))
+            pulls.append(gradient(view, self._picture(view, own)))
+        for unit in self._units:
+            loaded = self._load(unit, leaves) if len(self._units) > 1 else None
+            for view, own, pull in zip(leaves, parts, pulls, strict=True):
+                self._differentiate(unit, loaded, view, own, pull)
+        return [
+            torch.zeros_like(view.viewmat) if view.viewmat.grad is None else view.viewmat.grad
+            for view in leaves
+        ]
+
+    def _load(self, unit: int, views: Sequence[View]) -> Loaded:
+        return self._painter.load(unit, seen_by=self._painter.frusta((still(v), v.full) for v in views))
+
+    def _draw(self, views: Sequence[View]) -> list[list[_Part]]:
+        parts: list[list[_Part]] = [[] for _ in views]
+        only = len(self._units) == 1
+        for unit in self._units:
+            loaded = self._load(unit, views)
+            for view, own in zip(views, parts, strict=True):
+                if not loaded.shows_in(view):
+                    continue
+                with torch.set_grad_enabled(only):
+                    raster = self._raster(unit, loaded, view)
+                layer = Layer(raster.color.detach(), raster.transmittance.detach())
+                own.append(_Part(unit, layer, raster.depth.detach(), raster if only else None))
+        return parts
+
+    def _raster(self, unit: int, loaded: Loaded, view: View) -> Raster:
+        window = None
+        if self._painter.ownership == "fragments" and unit:
+            window = self._painter.span(unit, still(view), view.full)
+        return self._painter.rasterizer.draw(
+            loaded.gaussians,
+            [Shot(view, view.full, None, window)],
+            sh_degree=self._settings.sh_degree,
+            antialiased=self._settings.antialiased,
+        )[0]
+
+    def _picture(self, view: View, parts: Sequence[_Part]) -> WholePicture:
+        device, dtype = self._painter.device, view.viewmat.dtype
+        nothing = empty_layer(view.height, view.width, device, dtype)
+        whole = fold([part.layer for part in parts], like=nothing)
+        depths = [Layer(part.depth[..., None].expand(-1, -1, 3), part.layer.transmittance) for part in parts]
+        return WholePicture(whole.color, whole.transmittance, fold(depths, like=nothing).color[..., 0])
+
+    def _differentiate(
+        self, unit: int, loaded: Loaded | None, view: View, parts: Sequence[_Part], pull: Tensor
+    ) -> None:
+        at = next((place for place, part in enumerate(parts) if part.unit == unit), None)
+        if at is None:
+            return
+        layers, like = [part.layer for part in parts], parts[at].layer
+        raster = parts[at].raster or self._raster(unit, loaded, view)
+        front, back = fold(layers[:at], like=like), fold(layers[at + 1 :], like=like)
+        by_color = front.transmittance[..., None] * pull
+        behind = composite(back, pull.new_zeros(3))
+        outputs = (raster.color, raster.transmittance)
+        torch.autograd.backward(outputs, (by_color, (by_color * behind).sum(dim=-1)))
+
+
+def still(view: View) -> View:
+    """The view with a pose that takes no gradients."""
+    return replace(view, viewmat=view.viewmat.detach())

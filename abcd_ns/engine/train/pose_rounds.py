@@ -1,0 +1,105 @@
+"""When poses are refined, and how: by pictures of the whole scene, in the warm-up and between visits."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.whole_pictures import WholePicture, WholePictures
+from abcd_ns.engine.train.light import lit
+from abcd_ns.engine.train.poses import by_step, robust, step_for
+from abcd_ns.engine.train.run import TrainingRun
+from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.types import View
+
+FIRST = 8.0
+"""Uses of each view by the whole scene before its pose is refined: from blobs, poses only become worse."""
+EVERY, SHARE = 1.0, 0.1
+"""Uses of each view from round to round, at least, and as a share of all so far: a fifth of a run's time goes
+into rounds, and less in a long one."""
+
+
+class PoseRounds:
+    """Refines all poses of a run once in a while, each by a picture of the whole scene.
+
+    Never while a visit among others is under way: its layers are drawn from the poses with which it began.
+
+    Args:
+        target: gives what a sample should show.
+    """
+
+    def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
+        self._run, self._target = run, target
+
+    def count(self, pictures: int) -> None:
+        """A step of the visit that is under way has drawn so many pictures, of its block or of the scene."""
+        run = self._run
+        blocks = 1 if run.active.is_alone else run.scene.tree.num_blocks
+        run.state.uses += pictures / len(run.views) / blocks
+
+    @property
+    def is_due(self) -> bool:
+        """Whether poses should be refined now."""
+        state = self._run.state
+        if state.active is not None and not state.active.is_alone:
+            return False
+        return state.uses >= FIRST and state.uses - state.posed >= max(EVERY, SHARE * state.uses)
+
+    def take(self) -> None:
+        """Take a step for the pose of each view."""
+        run = self._run
+        views = list(run.views_at(self._reduction()).values())
+        steps: dict[int, Tensor] = {}
+        pictures = self._pictures(views)
+        for group in pictures.groups(views):
+            judged: dict[int, tuple[WholePicture, Tensor]] = {}
+
+            def gradient(view: View, picture: WholePicture, judged=judged) -> Tensor:
+                found, weight = self._judge(view, picture)
+                judged[view.index] = picture, weight
+                return found
+
+            found = pictures.differentiate(group, gradient)
+            for view, by_matrix in zip(group, found, strict=True):
+                picture, weight = judged[view.index]
+                steps[view.index] = step_for(view, picture, weight, by_step(by_matrix, view.viewmat))
+        run.poses.move(steps)
+        run.take_poses()
+        run.state.posed = run.state.uses
+
+    def _reduction(self) -> int:
+        """Of the pictures: as the run has it, and so that none is larger than a step may draw."""
+        run, reduction = self._run, self._run.reduction
+        most = run.config.limits.crop_pixels
+        while most and max(view.full.pixels for view in run.views_at(reduction).values()) > most:
+            reduction *= 2
+        return reduction
+
+    def _pictures(self, views: list[View]) -> WholePictures:
+        run, active = self._run, self._run.state.active
+        together = default_pass(run.scene) if active is None else run.count()
+        painter = Painter(
+            run.scene,
+            views,
+            run.rasterizer,
+            ownership=run.config.recipe.ownership,
+            pass_gaussians=run.config.limits.pass_gaussians or together,
+            device=run.device,
+        )
+        return WholePictures(painter, PaintSettings(run.sh_degree, run.config.antialiased))
+
+    def _judge(self, view: View, picture: WholePicture) -> tuple[Float[Tensor, "h w 3"], Tensor]:
+        """The gradient of the loss by the picture, and the weight of each pixel."""
+        nothing = torch.zeros(3, device=picture.color.device, dtype=picture.color.dtype)
+        sample = Sample(view, view.full, None, None, None, nothing)
+        photo, counts = self._target(sample)
+        shown = picture.color.detach().requires_grad_()
+        light = self._run.light
+        seen = shown if light is None else lit(shown, light.of(view.index).detach())
+        counted = 1.0 if counts is None else counts.to(seen)
+        loss, weight = robust((seen - photo.to(seen)) * counted)
+        (gradient,) = torch.autograd.grad(loss, shown)
+        return gradient, weight * counted

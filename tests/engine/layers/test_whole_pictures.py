@@ -1,0 +1,64 @@
+"""Whole pictures, drawn unit by unit, and their gradient by the pose."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from abcd_ns.engine.layers import whole_pictures
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.whole_pictures import WholePictures
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.train.poses import by_step, turned
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+SCENE = random_gaussians(60, size=0.15, dtype=torch.float64)
+VIEWS = ring_of_views(3, dtype=torch.float64)
+
+
+def whole_pictures_of(pass_gaussians: int) -> WholePictures:
+    scene = MemoryScene(build_kd(SCENE.means, 4), SCENE)
+    painter = Painter(scene, VIEWS, TorchRasterizer(), ownership="fragments", pass_gaussians=pass_gaussians)
+    return WholePictures(painter, PaintSettings(sh_degree=1))
+
+
+def weights_for(view):
+    generator = torch.Generator().manual_seed(view.index)
+    return torch.randn(view.height, view.width, 3, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("pass_gaussians", [0, 1000])
+def test_the_gradient_of_a_pose_is_that_of_the_merged_picture(pass_gaussians):
+    """By differences of the picture that is drawn at once, for each way in which a camera may move."""
+    draw, seen = TorchRasterizer(), []
+
+    def gradient(view, picture):
+        merged = draw(SCENE, replace(view, viewmat=view.viewmat.detach()), sh_degree=1)
+        for name in ("color", "transmittance", "depth"):
+            assert torch.allclose(getattr(picture, name), getattr(merged, name), atol=1e-3), name
+        seen.append(view.index)
+        return weights_for(view)
+
+    def loss(view, step):
+        moved = replace(view, viewmat=turned(view.viewmat, step))
+        return float((draw(SCENE, moved, sh_degree=1).color * weights_for(view)).sum())
+
+    found = whole_pictures_of(pass_gaussians).differentiate(VIEWS, gradient)
+    assert seen == [0, 1, 2]
+    for view, matrix in zip(VIEWS, found, strict=True):
+        steps = 1e-6 * torch.eye(6, dtype=torch.float64)
+        expected = torch.tensor([(loss(view, step) - loss(view, -step)) / 2e-6 for step in steps])
+        assert torch.allclose(by_step(matrix, view.viewmat).float(), expected, rtol=2e-3, atol=2e-2)
+        assert float(expected.abs().min()) > 0.1
+
+
+def test_views_are_drawn_together_as_far_as_their_layers_have_room(monkeypatch):
+    pictures = whole_pictures_of(0)
+    assert [len(group) for group in pictures.groups(VIEWS)] == [3]
+    one = 4 * whole_pictures.BYTES_PER_PIXEL * VIEWS[0].full.pixels
+    monkeypatch.setattr(whole_pictures, "LAYERS_BYTES", 2 * one)
+    assert [len(group) for group in pictures.groups(VIEWS)] == [2, 1]
+    monkeypatch.setattr(whole_pictures, "LAYERS_BYTES", 1)
+    assert [len(group) for group in pictures.groups(VIEWS)] == [1, 1, 1]

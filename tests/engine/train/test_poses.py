@@ -1,0 +1,169 @@
+"""Photos under poses that are off: they are refined by whole pictures, and nothing stale is drawn."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.train import pose_rounds
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.poses import laid_over, turned
+from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.types import PARAM_NAMES
+from abcd_ns.errors import UserError
+from tests.reference.scenes import (
+    Photos,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    training_config,
+    whole_scene,
+)
+
+STILL = DensityConfig(strategy="off")
+TRUTH = random_gaussians(150, seed=7, size=0.12)
+RING = ring_of_views(6)
+NOISE = 0.01
+"""Radians, and world units for each of the cameras' distance."""
+
+
+def shaken(views, seed=1):
+    draw = torch.Generator().manual_seed(seed)
+    steps = NOISE * torch.randn(len(views), 6, generator=draw, dtype=torch.float64)
+    steps[:, 3:] *= 3
+    return [
+        replace(v, viewmat=turned(v.viewmat.double(), s).float()) for v, s in zip(views, steps, strict=True)
+    ]
+
+
+def poses_of(run) -> torch.Tensor:
+    return torch.stack([view.viewmat for _, view in sorted(run.views.items())])
+
+
+@pytest.fixture(scope="module")
+def photos():
+    return Photos(TRUTH, RING)
+
+
+@pytest.fixture
+def make(tmp_path, photos, monkeypatch):
+    """Makes coordinators that begin with the truth, under noisy poses, which are refined soon."""
+    monkeypatch.setattr(pose_rounds, "FIRST", 0.0)
+
+    def target(sample):
+        return sample.reduced(photos(sample.view.index, sample.source)), None
+
+    def made(name: str = "run", views=None, **options):
+        (tmp_path / name).mkdir(exist_ok=True)
+        options = {"density": STILL, "poses": "SO3xR3", "background": "black", "processes": 1, **options}
+        views = shaken(RING) if views is None else views
+        return make_coordinator(tmp_path / name, TRUTH, views, target=target, **options)
+
+    return made
+
+
+def off_by(views, others) -> float:
+    """Root mean square of how far pixels of a point in the middle are apart, radians."""
+    middle = torch.tensor([[0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3], [0, 0, 0]]).T
+    slopes = []
+    for some in (views, others):
+        seen = torch.stack([view.viewmat[:3, :3] @ middle + view.viewmat[:3, 3:] for view in some])
+        slopes.append(seen[:, :2] / seen[:, 2:])
+    return float((slopes[0] - slopes[1]).square().mean().sqrt())
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=20, deadline=None)
+def test_poses_do_not_turn_move_or_grow_together(seed):
+    """What cameras did together is taken back, to first order, and what each did by itself stays."""
+    draw = torch.Generator().manual_seed(seed)
+    given_ = torch.stack([view.viewmat.double() for view in RING])
+    world = turned(torch.eye(4).double(), 1e-4 * torch.randn(6, generator=draw, dtype=torch.float64))
+    grown = given_ @ world
+    grown[:, :3, 3] *= 1.0001
+    assert float((grown - given_).abs().max()) > 1e-5
+    assert float((laid_over(grown, given_) - given_).abs().max()) < 1e-6
+    own = torch.stack([turned(v, 1e-4 * torch.randn(6, generator=draw, dtype=torch.float64)) for v in given_])
+    once = laid_over(own, given_)
+    assert float((once - given_).abs().max()) > 1e-5
+    assert float((laid_over(once, given_) - once).abs().max()) < 1e-7
+
+
+@pytest.mark.parametrize(("blocks", "together"), [(1, 0), (4, 0), (4, 1)])
+def test_where_the_scene_is_right_poses_become_right(make, blocks, together):
+    """But for what they are off by together; drawn block by block as well as at once."""
+    made = make(blocks=blocks, pass_gaussians=together)
+    before = off_by(shaken(RING), RING)
+    for _ in range(8):
+        made.poses.take()
+    assert off_by(made.views.values(), RING) < 0.15 * before
+    assert made.state.posed == made.state.uses
+
+
+def test_where_poses_are_not_refined_a_run_knows_nothing_of_them(make, photos):
+    scenes = []
+    for name in ("off", "never"):  # the second would refine them, and never has the time to
+        made = make(name, steps=12, poses="off" if name == "off" else "SO3xR3", views=RING)
+        made.poses = None
+        train(made, photos)
+        scenes.append(whole_scene(made))
+        assert made.state.poses == {}
+        assert poses_of(made.run).equal(torch.stack([view.viewmat for view in RING]))
+    assert all(torch.equal(getattr(scenes[0], name), getattr(scenes[1], name)) for name in PARAM_NAMES)
+
+
+@pytest.mark.parametrize(("blocks", "warmup"), [(1, 0.0), (4, 0.3)])
+def test_a_run_that_stops_goes_on_with_its_poses(make, photos, blocks, warmup):
+    options = {"blocks": blocks, "steps": 30, "warmup": warmup, "scaffold": 60}
+    whole, stopped = make("whole", **options), make("stopped", **options)
+    train(whole, photos)
+    train(stopped, photos, steps=14)
+    stopped.save()
+    stopped.scene.store.close()
+    went_on = make("stopped", resume=True, **options)
+    assert torch.equal(poses_of(went_on.run), poses_of(stopped.run))
+    train(went_on, photos)
+    assert torch.equal(poses_of(went_on.run), poses_of(whole.run))
+    assert not torch.equal(poses_of(whole.run), poses_of(stopped.run))
+    for name in PARAM_NAMES:
+        assert torch.equal(getattr(whole_scene(went_on), name), getattr(whole_scene(whole), name)), name
+
+
+def test_poses_stay_through_a_visit_and_its_layers_show_them(make, photos):
+    """They change between visits alone, and each visit's layers are drawn from where its views then are."""
+    made, seen = make(steps=60), []
+
+    def hear(event):
+        if isinstance(event, VisitBegan):
+            seen.append(poses_of(made.run))
+
+    made.announce.subscribe(hear)
+    while not made.finished:
+        train(made, photos, steps=1)
+        if made.state.active is not None:
+            assert torch.equal(poses_of(made.run), seen[-1])
+            layers, view = made.visit.steps.layers, made.state.active.views[0]
+            kept = layers.around(view).layers.front
+            fresh = made.source.draw(made.state.active, [view]).around(view).layers.front
+            assert torch.equal(kept.color, fresh.color)
+    assert sum(not torch.equal(a, b) for a, b in pairwise(seen)) > 1
+
+
+def test_a_view_that_moved_is_not_drawn_with_layers_from_where_it_was(make):
+    made = make()
+    made.next_batch()
+    view = made.state.active.views[0]
+    made.run.poses.move({view: torch.full((6,), 0.01, dtype=torch.float64)})
+    made.run.take_poses()
+    with pytest.raises(RuntimeError, match="moved"):
+        made.next_batch()
+
+
+@pytest.mark.parametrize("recipe", [{"exact": True}, {"overlap": 0.1, "layers": False, "migrate": False}])
+def test_methods_without_whole_pictures_refuse(recipe):
+    with pytest.raises(UserError, match=r"training\.poses"):
+        training_config(poses="SO3xR3", **recipe).check()
