@@ -1,4 +1,4 @@
-"""The one error that is the user's to mend; how full RAM and missing packages are told."""
+"""The one error that is the user's to mend, how full RAM looks, what is said where packages are missing."""
 
 
 class UserError(Exception):
