@@ -62,10 +62,15 @@ def factor_of(parser: DataParser) -> int:
 
 
 def _read(parser: DataParser, split: str) -> DataparserOutputs:
+    name, data = reader_name(parser.config), parser.config.data
     try:
         return parser.get_dataparser_outputs(split=split)
+    except EOFError as error:  # of input()
+        raise InputError(
+            f"{name} asks the question above, and there is no terminal to answer it: run the command in "
+            f"one, or change what it is about by an option of `ns-train abcd {name} --help`."
+        ) from error
     except TROUBLE as error:
-        name, data = reader_name(parser.config), parser.config.data
         raise InputError(
             f"{name} cannot read {data} ({type(error).__name__}: {error}); `ns-train abcd {name} --help` "
             "lists its options."

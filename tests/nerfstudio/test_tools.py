@@ -1,6 +1,7 @@
 """Nerfstudio's tools on a run of ours, and on data of other readers: in this process, on a tiny scene."""
 
 import copy
+import io
 import json
 import shlex
 from pathlib import Path
@@ -15,6 +16,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.scripts import render
 from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.exporter import ExportCameraPoses
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
@@ -22,8 +24,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from abcd_ns.cli.report.options import training_command
 from abcd_ns.cli.report.run_folder import load_pipeline, open_run
+from abcd_ns.data.input_errors import InputError
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.nerfstudio import metrics
+from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.model import AbcdModel
 from tests.data.test_layouts import write_blender
 from tests.nerfstudio.test_training import configure, run
@@ -164,6 +168,14 @@ def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
     for name in names:
         drawn, photo = (torch.from_numpy(found[f"test/{kind}/{name}"]) / 255 for kind in ("rgb", "gt-rgb"))
         assert float(psnr(drawn, photo)) > 12
+
+
+def test_the_cameras_are_exported(trained, tmp_path):
+    ExportCameraPoses(load_config=trained / "config.yml", output_dir=tmp_path).main()
+    for split, count in (("train", VIEWS - HELD_OUT), ("eval", HELD_OUT)):
+        frames = json.loads((tmp_path / f"transforms_{split}.json").read_text())
+        assert len(frames) == count
+        assert np.shape(frames[0]["transform"]) == (3, 4)
 
 
 # Scores
@@ -333,3 +345,10 @@ def test_faults_of_another_reader_end_a_command_before_anything_is_written(data,
     assert stopped.value.code == 2
     assert "colmap cannot read" in capsys.readouterr().out
     assert not any(tmp_path.iterdir())
+
+
+def test_a_question_of_another_reader_without_a_terminal_is_one_line(data, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    parser = ColmapDataParserConfig(data=data, colmap_path=Path("sparse/0"), downscale_factor=2)
+    with pytest.raises(InputError, match=r"colmap asks .* no terminal"):
+        inspect(parser)
