@@ -156,11 +156,11 @@ class AbcdPanel(ViewerControl):
     def _report(self, coordinator: Trainer) -> None:
         history, state, seconds = self._history, coordinator.state, self._seconds
         share, sweep = sweep_share(history, state), ""
+        where, left = self._where(state), seconds_left(seconds, coordinator.progress)
         if history.sweep is not None and not coordinator.finished:
             visits = history.sweep_visits + len(state.queue) + len(history.under_way)
-            left = seconds_left(seconds - history.sweep_began, share)
-            sweep = sweep_line(history.sweep, history.sweep_visits, visits, left)
-        where, left = self._where(state), seconds_left(seconds, coordinator.progress)
+            of_sweep = seconds_left(seconds - history.sweep_began, share, most=left)  # a run ends in a sweep
+            sweep = sweep_line(history.sweep, history.sweep_visits, visits, of_sweep)
         self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)
         self._controls.progress(coordinator.progress, share)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:

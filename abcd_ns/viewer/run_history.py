@@ -153,8 +153,9 @@ def sweep_share(history: RunHistory, state: RunState) -> float:
     return (history.sweep_visits + sum(parts)) / (history.sweep_visits + len(visits) + len(state.queue))
 
 
-def seconds_left(elapsed: float, share: float) -> float | None:
-    """How long the rest takes at the pace so far; None if nothing is done yet."""
+def seconds_left(elapsed: float, share: float, most: float | None = None) -> float | None:
+    """How long the rest takes at the pace so far, `most` seconds at most; None if nothing is done yet."""
     if not share > 0:
         return None
-    return elapsed * (1 - min(share, 1.0)) / min(share, 1.0)
+    left = elapsed * (1 - min(share, 1.0)) / min(share, 1.0)
+    return left if most is None else min(left, most)

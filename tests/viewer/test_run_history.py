@@ -186,6 +186,12 @@ def test_time_left(elapsed, share, left):
     assert seconds_left(elapsed, share) == (None if left is None else pytest.approx(left))
 
 
+def test_a_sweep_has_no_more_time_left_than_the_run():
+    assert seconds_left(50.0, 0.25, most=100.0) == 100.0
+    assert seconds_left(50.0, 0.5, most=100.0) == 50.0
+    assert seconds_left(50.0, 0.5, most=None) == 50.0
+
+
 def test_a_resumed_run_knows_which_blocks_had_their_visit():
     state = RunState(
         sweep=0, visit=3, queue=[VisitPlan(2, 10)], views={0: 9, 1: 9, 2: 9, 3: 0}, active=active(1, done=4)
