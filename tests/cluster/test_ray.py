@@ -180,7 +180,8 @@ def test_a_worker_that_runs_out_of_memory_takes_nothing_along(steady, lent, phot
 
 def test_a_full_object_store_changes_nothing(steady, lent, photos):
     """What has no room in memory waits on disk."""
-    held = [ray.put(torch.zeros(30 << 18).numpy()) for _ in range(5)]  # 150 MiB, and room for 100
+    held = [ray.put(torch.zeros(30 << 18).numpy()) for _ in range(5)]
+    assert ray.cluster_resources()["object_store_memory"] < 150 << 20
     train(lent, photos)
     assert equal(whole_scene(lent), steady[0])
     assert all(float(ray.get(ref).sum()) == 0 for ref in held)
