@@ -17,13 +17,13 @@ import torch
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.in_process import InProcessWorkers
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio import pipeline
 from abcd_ns.nerfstudio.workers import make_worker, setup_of
 from benchmarks import workers
+from tests.cluster.in_process import InProcessWorkers
 
 
 @dataclass

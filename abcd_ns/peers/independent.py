@@ -34,7 +34,7 @@ from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store.scaffold import blocks_at_rest, join
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.store.special_blocks import initial_of
+from abcd_ns.engine.store.special_blocks import BlockName, initial_of
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.planner import NothingSeenError
 from abcd_ns.engine.train.run import TrainingRun
@@ -53,7 +53,7 @@ BEYOND = 1e30
 
 def independent_at_rest(
     tree: BlockTree, gaussians: Gaussians
-) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
+) -> dict[BlockName, tuple[dict[str, Tensor], dict[str, Any]]]:
     """The first content of a store: every block, and once more every block as it began."""
     blocks = blocks_at_rest(tree, gaussians)
     return {**blocks, **{initial_of(block): content for block, content in blocks.items()}}
@@ -243,4 +243,4 @@ def independent_trainer(run: TrainingRun) -> Coordinator:
 
 def initial_gaussians(scene: StoredScene, block: int) -> Gaussians:
     """A block's Gaussians as they began."""
-    return scene.stored(initial_of(block))
+    return scene.stored(initial_of(block)).gaussians

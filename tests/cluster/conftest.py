@@ -3,12 +3,12 @@
 import pytest
 
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.in_process import InProcessWorkers
 from abcd_ns.cluster.visit_worker import AdamOptions, RunSetup, VisitWorker
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.run import TrainingRun
+from tests.cluster.in_process import InProcessWorkers
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 
 

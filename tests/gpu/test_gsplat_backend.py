@@ -10,7 +10,6 @@ import torch
 
 from abcd_ns.engine.layers.compositing import fold, sandwich
 from abcd_ns.engine.render import CutShot, Shot, TorchRasterizer, ZWindow
-from abcd_ns.engine.space.intervals import cell_windows
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
@@ -23,6 +22,7 @@ from tests.reference.rasterizer_scenes import (
     small_view,
     stacked,
 )
+from tests.reference.scenes import cell_windows
 
 pytestmark = pytest.mark.gpu
 WIDTH, HEIGHT = 150, 100

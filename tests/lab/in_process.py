@@ -2,7 +2,6 @@
 
 import runpy
 import subprocess
-import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from types import SimpleNamespace
 
@@ -12,7 +11,7 @@ from abcd_ns.lab.runs import runner
 
 
 class Done:
-    """As `subprocess.Popen` of a process that has ended."""
+    """As `subprocess.Popen` of a process that has ended; what goes wrong in it is raised here."""
 
     def __init__(self, command: list[str], stdout, **_) -> None:
         *_, module, job = command  # python -m MODULE JOB
@@ -24,9 +23,6 @@ class Done:
                 self.returncode = 0
             except SystemExit as end:
                 self.returncode = end.code or 0
-            except Exception:
-                traceback.print_exc()
-                self.returncode = 1
 
     def poll(self) -> int:
         return self.returncode

@@ -275,7 +275,7 @@ def test_no_result_depends_on_the_ram_budget_and_none_exceeds_it(data, undisturb
     def measure(trainer) -> None:
         coordinator = trainer.pipeline.coordinator
         scene = coordinator.scene
-        blocks = [gaussians.nbytes for gaussians in scene._memory._gaussians.values()]
+        blocks = [block.nbytes for block in scene._memory._rest.values()]
         photos = trainer.pipeline.datamanager.train_dataset.photos.cached_bytes
         peaks.append(photos + coordinator.layer_bytes + scene.cached_bytes)
         largest.append(max(blocks, default=0))

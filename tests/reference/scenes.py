@@ -9,8 +9,10 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES
-from abcd_ns.engine.render import Rasterizer
+from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -25,6 +27,11 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.stability.world import look_at
+
+
+def cell_windows(tree: BlockTree, view: View, grid: TileGrid, nodes, device="cpu") -> tuple[ZWindow, ...]:
+    """The intervals of camera z in which each tile's middle ray is in the boxes of these nodes."""
+    return tuple(ray_interval(tree.box(node), view, grid, device) for node in nodes)
 
 
 def random_gaussians(

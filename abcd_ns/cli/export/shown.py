@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from abcd_ns.engine.gaussians.block_state import WAITS
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.space.tree import BlockTree
@@ -66,8 +67,11 @@ class Shown:
         return found if self.to is None else self.to.gaussians(found)
 
     def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
-        """These parameters, the means among them, of the block and of those that wait for its next visit."""
-        found = self.store.load_names(block, names)
+        """These parameters, the means among them, of the block and of those that left others for it, but for
+        those that nobody sees yet."""
+        found = self.store.load_names(block, (*names, WAITS))
+        seen = ~found.pop(WAITS)
+        found = {name: value[seen] for name, value in found.items()}
         if INBOX not in self.store.blocks:
             return found
         inbox = self.store.load_names(INBOX, names)

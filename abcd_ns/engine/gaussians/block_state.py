@@ -10,6 +10,8 @@ from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Adam's running moments, under torch's names."""
+WAITS = "waits"
+"""The column of those who wait, in the store."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,14 @@ class BlockState:
     growth: dict[str, Tensor] = field(default_factory=dict)
     """Densification's running statistics, each [n]: gsplat's strategy state."""
     clocks: Clocks = field(default_factory=Clocks)
+    waits: Tensor | None = None
+    """Bool [n]: who is not to be seen before the block's next visit. None becomes nobody."""
 
     def __post_init__(self) -> None:
-        rows = {len(self.gaussians), len(self.exp_avg), len(self.exp_avg_sq)}
+        if self.waits is None:
+            nobody = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.device)
+            object.__setattr__(self, "waits", nobody)
+        rows = {len(self.gaussians), len(self.exp_avg), len(self.exp_avg_sq), len(self.waits)}
         rows |= {value.shape[0] for value in self.growth.values()}
         if len(rows) != 1:
             raise ValueError(f"a block's tensors must have equally many rows, not {sorted(rows)}")
@@ -54,7 +61,7 @@ class BlockState:
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        parts = (self.gaussians, self.exp_avg, self.exp_avg_sq, *self.growth.values())
+        parts = (self.gaussians, self.exp_avg, self.exp_avg_sq, self.waits, *self.growth.values())
         return sum(part.nbytes for part in parts)
 
     @property
@@ -76,6 +83,7 @@ class BlockState:
             self.exp_avg_sq[rows],
             {name: value[rows] for name, value in self.growth.items()},
             self.clocks,
+            self.waits[rows],
         )
 
     def joined_by(self, arrivals: "BlockState") -> "BlockState":
@@ -91,6 +99,7 @@ class BlockState:
             Gaussians.cat([self.exp_avg_sq, arrivals.exp_avg_sq]),
             growth,
             self.clocks,
+            torch.cat([self.waits, arrivals.waits]),
         )
 
     def forgetful(self) -> "BlockState":
@@ -105,11 +114,12 @@ class BlockState:
             self.exp_avg_sq.to(device),
             {name: value.to(device) for name, value in self.growth.items()},
             self.clocks,
+            self.waits.to(device),
         )
 
     def to_tensors(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """As flat tensors by name (parameters under their own names) and JSON-able clocks, for the store."""
-        tensors = dict(self.gaussians.items())
+        tensors = {**dict(self.gaussians.items()), WAITS: self.waits}
         for moment in MOMENTS:
             tensors |= {f"{moment}.{name}": value for name, value in getattr(self, moment).items()}
         tensors |= {f"growth.{name}": value for name, value in self.growth.items()}
@@ -121,7 +131,7 @@ class BlockState:
         growth = {k.removeprefix("growth."): v for k, v in tensors.items() if k.startswith("growth.")}
         moments = (Gaussians(**{n: tensors[f"{m}.{n}"] for n in PARAM_NAMES}) for m in MOMENTS)
         gaussians = Gaussians(**{name: tensors[name] for name in PARAM_NAMES})
-        return BlockState(gaussians, *moments, growth, BlockState.clocks_of(meta))
+        return BlockState(gaussians, *moments, growth, BlockState.clocks_of(meta), tensors[WAITS])
 
     @staticmethod
     def clocks_of(meta: dict[str, Any]) -> Clocks:

@@ -14,6 +14,7 @@ from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.visibility import footprint
+from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 PARTS_BYTES = 256 << 20
@@ -28,7 +29,7 @@ CROP_MARGIN = SSIM_WINDOW - 1
 class VisitGeometry:
     """What is decided once, when a visit begins, and must be the same after a resume."""
 
-    block: int
+    block: BlockName
     crops: dict[int, Crop]
     """By view index, the pixels to train on; views that do not see the block are missing."""
 

@@ -24,7 +24,6 @@ diagonal at most; tests of reach allow for that (see culling.py).
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -32,7 +31,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.z_window import ZWindow
-from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.types import View
 
 
@@ -57,25 +56,11 @@ def ray_interval(box: Box, view: View, grid: TileGrid, device: torch.device | st
     `near` is -inf where the camera itself is inside the box, so that nothing in front of it is lost.
     Rays that miss the box get the empty interval near = far = +inf, so [-inf, near) is then all of z.
     """
-    return _interval(box, view.center.tolist(), grid, ray_directions(view, grid, device))
-
-
-def cell_windows(
-    tree: BlockTree, view: View, grid: TileGrid, nodes: Sequence[int], device: torch.device | str = "cpu"
-) -> tuple[ZWindow, ...]:
-    """ray_interval of the boxes of some of the tree's nodes, in the order given.
-
-    The windows of nodes that tile space (all leaves; or a leaf and its siblings_to_root) tile z.
-    """
-    center, directions = view.center.tolist(), ray_directions(view, grid, device)
-    return tuple(_interval(tree.box(node), center, grid, directions) for node in nodes)
-
-
-def _interval(box: Box, center: list[float], grid: TileGrid, directions: Float[Tensor, "3 t"]) -> ZWindow:
+    directions = ray_directions(view, grid, device)
     near = torch.full_like(directions[0], -math.inf)
     far = torch.full_like(directions[0], math.inf)
     for direction, c, lower, upper in zip(
-        directions, center, box.lower.tolist(), box.upper.tolist(), strict=True
+        directions, view.center.tolist(), box.lower.tolist(), box.upper.tolist(), strict=True
     ):
         for plane, box_is_right in ((lower, True), (upper, False)):
             if math.isinf(plane):

@@ -30,10 +30,6 @@ class Box:
         inside = (exact >= self.lower.to(exact.device)) & (exact < self.upper.to(exact.device))
         return inside.all(dim=1).to(points.device)
 
-    def intersects(self, other: "Box") -> bool:
-        """Whether some point lies in both. Boxes that only touch share none."""
-        return bool((torch.maximum(self.lower, other.lower) < torch.minimum(self.upper, other.upper)).all())
-
     def grown(self, margin: float) -> "Box":
         """Moved outward by `margin` >= 0 (world units) on every face."""
         if not margin >= 0:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Gaussians
 
 
@@ -51,23 +52,23 @@ class LentScene:
             raise ValueError(f"block {self._block} was lent, not {block}")
         self._live = live
 
-    def state(self, number: int) -> BlockState:
+    def state(self, name: BlockName) -> BlockState:
         """The lent block as its visit found it.
 
         Raises:
             KeyError: another one: no more than its Gaussians is known.
         """
-        if number != self._block:
-            raise KeyError(f"block {self._block} was lent, not {number}")
+        if name != self._block:
+            raise KeyError(f"block {self._block} was lent, not {name}")
         return self._state
 
     def mail(self, block: int) -> BlockState | None:  # noqa: ARG002 - the lent block has had it
         """Nobody waits."""
         return None
 
-    def rows(self, number: int) -> int:
+    def rows(self, name: BlockName) -> int:
         """Gaussians of the lent block as its visit found it."""
-        return len(self.state(number))
+        return len(self.state(name))
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The lent block as its visit found it."""

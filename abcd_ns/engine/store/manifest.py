@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from abcd_ns.engine.store.special_blocks import BlockName, from_text, in_order
 from abcd_ns.errors import UserError
 
 FORMAT = "abcd-parameter-store"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 
 class StoreError(UserError):
@@ -40,7 +41,7 @@ class Manifest:
     generation: int
     header: dict[str, Any]
     state: dict[str, Any]
-    blocks: dict[int, Shard]
+    blocks: dict[BlockName, Shard]
 
     @property
     def files(self) -> set[str]:
@@ -52,7 +53,7 @@ class Manifest:
         Raises:
             TypeError, ValueError: something in it is not JSON.
         """
-        blocks = {str(block): vars(shard) for block, shard in sorted(self.blocks.items())}
+        blocks = {str(block): vars(self.blocks[block]) for block in in_order(self.blocks)}
         return _in_envelope(_compact({**vars(self), "blocks": blocks}))
 
     @staticmethod
@@ -87,7 +88,7 @@ class Manifest:
 
     @staticmethod
     def _of(body: dict[str, Any]) -> "Manifest":
-        blocks = {int(block): Shard(**shard) for block, shard in body["blocks"].items()}
+        blocks = {from_text(block): Shard(**shard) for block, shard in body["blocks"].items()}
         return Manifest(body["generation"], body["header"], body["state"], blocks)
 
 

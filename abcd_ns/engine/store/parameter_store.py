@@ -24,6 +24,7 @@ from abcd_ns.engine.store.manifest import (
 )
 from abcd_ns.engine.store.manifest import StoreError as StoreError
 from abcd_ns.engine.store.shard import data_nbytes, link_or_copy, read_shard, verify_shard, write_shard
+from abcd_ns.engine.store.special_blocks import BlockName, in_order
 
 
 class ParameterStore:
@@ -120,9 +121,9 @@ class ParameterStore:
         return copy.deepcopy(self._manifest.state)
 
     @property
-    def blocks(self) -> list[int]:
-        """The blocks that have a shard, ascending."""
-        return sorted(self._manifest.blocks)
+    def blocks(self) -> list[BlockName]:
+        """The blocks that have a shard, ascending, and then the names that have one."""
+        return in_order(self._manifest.blocks)
 
     @property
     def nbytes(self) -> int:
@@ -134,19 +135,19 @@ class ParameterStore:
         """The names of the pinned generations."""
         return pin_names(self.folder)
 
-    def version(self, block: int) -> int:
+    def version(self, block: BlockName) -> int:
         """The generation that last wrote `block`."""
         return self._shard(block).generation
 
-    def counts(self, block: int) -> int:
+    def counts(self, block: BlockName) -> int:
         """The rows of the block's tensor "means"; 0 if it has none."""
         return self._shard(block).rows
 
-    def meta(self, block: int) -> dict[str, Any]:
+    def meta(self, block: BlockName) -> dict[str, Any]:
         """A copy of the block's JSON; no file is read."""
         return copy.deepcopy(self._shard(block).meta)
 
-    def load(self, block: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def load(self, block: BlockName) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """All tensors of a block, on the CPU and owning their memory, and its JSON; checked each time.
 
         Raises:
@@ -156,7 +157,7 @@ class ParameterStore:
         tensors, shard = self._read(block, None)
         return tensors, copy.deepcopy(shard.meta)
 
-    def load_names(self, block: int, names: Iterable[str]) -> dict[str, Tensor]:
+    def load_names(self, block: BlockName, names: Iterable[str]) -> dict[str, Tensor]:
         """Only these tensors of a block; the rest of the shard is not read once it was checked.
 
         The checksum is verified once for each file in the life of this object, by whichever method is first.
@@ -169,7 +170,7 @@ class ParameterStore:
 
     def commit(
         self,
-        updates: Mapping[int, tuple[dict[str, Tensor], dict[str, Any]]],
+        updates: Mapping[BlockName, tuple[dict[str, Tensor], dict[str, Any]]],
         header: dict[str, Any] | None = None,
         state: dict[str, Any] | None = None,
     ) -> int:
@@ -186,7 +187,7 @@ class ParameterStore:
         """
         self._require_writable()
         for block in updates:
-            if block < 0:
+            if isinstance(block, int) and block < 0:
                 raise ValueError(f"A block's number must not be negative; got {block}.")
         old = self._manifest
         generation = old.generation + 1
@@ -298,13 +299,13 @@ class ParameterStore:
         finally:
             lock.release()
 
-    def _shard(self, block: int) -> Shard:
+    def _shard(self, block: BlockName) -> Shard:
         try:
             return self._manifest.blocks[block]
         except KeyError:
             raise KeyError(f"{self.folder} has no block {block}; it has {self.blocks}.") from None
 
-    def _read(self, block: int, names: list[str] | None) -> tuple[dict[str, Tensor], Shard]:
+    def _read(self, block: BlockName, names: list[str] | None) -> tuple[dict[str, Tensor], Shard]:
         while True:
             shard = self._shard(block)
             path = self.folder / shard.file

@@ -11,48 +11,27 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.initialize import split_off
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.special_blocks import RESERVE
+from abcd_ns.engine.store.special_blocks import RESERVE, BlockName
 from abcd_ns.engine.types import Gaussians
 
 REVEALED_OPACITY = 0.02
-"""Of a Gaussian from the reserve: enough to be drawn and to learn, too little to spoil what is there."""
+"""Of a Gaussian from the reserve, once it is seen: enough to be drawn and to learn, too little to spoil what
+is there."""
 REVEALED_SCALE = 0.5
 """Its size, as a share of the distance to its neighbours."""
-WAITING = -100.0
-"""Logit of the opacity of a Gaussian that waits in its block for the first visit."""
 
 
 def put_to_wait(reserve: BlockState) -> BlockState:
-    """The reserve as it joins a trained scaffold: small, and not to be seen before its block is visited."""
+    """The reserve as it joins a trained scaffold: small, faint, and unseen until its block is visited."""
     old = reserve.gaussians
-    unseen = torch.full_like(old.opacities, WAITING)
-    scales = old.scales + math.log(REVEALED_SCALE)
-    return replace(reserve, gaussians=replace(old, opacities=unseen, scales=scales))
-
-
-def drawn(gaussians: Gaussians) -> Gaussians:
-    """Without those that wait."""
-    waits = _waits(gaussians)
-    return gaussians[~waits] if bool(waits.any()) else gaussians
-
-
-def revealed(gaussians: Gaussians) -> Gaussians:
-    """Those that waited, faint; the others as they are."""
-    waits = _waits(gaussians)
-    if not bool(waits.any()):
-        return gaussians
-    faint = math.log(REVEALED_OPACITY / (1 - REVEALED_OPACITY))
-    return replace(gaussians, opacities=gaussians.opacities.masked_fill(waits[:, None], faint))
-
-
-def _waits(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    return gaussians.opacities[:, 0] == WAITING
+    faint = torch.full_like(old.opacities, math.log(REVEALED_OPACITY / (1 - REVEALED_OPACITY)))
+    small = replace(old, opacities=faint, scales=old.scales + math.log(REVEALED_SCALE))
+    return replace(reserve, gaussians=small, waits=torch.ones_like(reserve.waits))
 
 
 def split_by_block(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
@@ -70,7 +49,7 @@ def join(states: list[BlockState]) -> BlockState:
 
 def blocks_at_rest(
     tree: BlockTree, gaussians: Gaussians, keep: int | None = None, seed: int = 0
-) -> dict[int, tuple[dict[str, Tensor], dict[str, Any]]]:
+) -> dict[BlockName, tuple[dict[str, Tensor], dict[str, Any]]]:
     """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
 
     Args:

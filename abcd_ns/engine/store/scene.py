@@ -10,13 +10,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.block_state import WAITS, BlockState, Clocks
 from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.block_memory import BlockMemory
-from abcd_ns.engine.store.scaffold import drawn, revealed, split_by_block
-from abcd_ns.engine.store.special_blocks import INBOX, LIVE
+from abcd_ns.engine.store.block_memory import AtRest, BlockMemory
+from abcd_ns.engine.store.scaffold import split_by_block
+from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
@@ -48,7 +48,7 @@ class BlockScene(Protocol):
 class VisitScene(BlockScene, Protocol):
     """What a visit needs to know of the scene that its block belongs to."""
 
-    def state(self, number: int) -> BlockState:
+    def state(self, name: BlockName) -> BlockState:
         """A block at rest and whole, without its mail."""
         ...
 
@@ -56,8 +56,8 @@ class VisitScene(BlockScene, Protocol):
         """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
         ...
 
-    def rows(self, number: int) -> int:
-        """Gaussians at rest under a number, the mail of a block left out; nothing is read."""
+    def rows(self, name: BlockName) -> int:
+        """Gaussians at rest under a name, the mail of a block left out; nothing is read."""
         ...
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
@@ -110,9 +110,9 @@ class StoredScene:
         """What is durable; to be read and written by way of the scene alone while there is one."""
         self.ram_bytes = ram_bytes
         self._memory = BlockMemory(ram_bytes)
-        self._unsaved: dict[int, BlockState] = {}
+        self._unsaved: dict[BlockName, BlockState] = {}
         self._writer = WriteBehind(store, self._saved)
-        self._numbers, self._versions = itertools.count(1), dict[int, int]()
+        self._numbers, self._versions = itertools.count(1), dict[BlockName, int]()
         self._bounds: dict[int, tuple[int, Box | None]] = {}
         self._live: tuple[int | None, Callable[[], Gaussians]] | None = None
         self._rested = time.monotonic()
@@ -124,12 +124,16 @@ class StoredScene:
     # -- changes -------------------------------------------------------------------------------------
 
     def rest(
-        self, tree: BlockTree, blocks: Mapping[int, BlockState], state: dict[str, Any], within: float = 0.0
+        self,
+        tree: BlockTree,
+        blocks: Mapping[BlockName, BlockState],
+        state: dict[str, Any],
+        within: float = 0.0,
     ) -> None:
         """Take in the blocks that changed, under `tree`, and the run's state, as one moment of the run.
 
         Args:
-            blocks: on the CPU, by block or special number; they belong to the scene from now on, as `state`
+            blocks: on the CPU, by number or special name; they belong to the scene from now on, as `state`
                 does.
             within: this is written so many seconds after the last write began. With 0 all is durable when
                 this returns, and also where what waits to be written exceeds `ram_bytes`.
@@ -141,10 +145,10 @@ class StoredScene:
         with self._writer.lock:
             header = None if tree is self.tree else {**self.store.header, "tree": tree.to_json()}
             self.tree = tree
-            for number, block in blocks.items():
-                self._memory.forget(number)
-                self._unsaved[number] = block
-                self._versions[number] = next(self._numbers)
+            for name, block in blocks.items():
+                self._memory.forget(name)
+                self._unsaved[name] = block
+                self._versions[name] = next(self._numbers)
             if header is not None or INBOX in blocks:
                 self._sort(blocks.get(INBOX, self.inbox))
             self._memory.shrink(self.unsaved_bytes)
@@ -168,11 +172,11 @@ class StoredScene:
 
     def _saved(self, snapshot: Snapshot) -> None:
         with self._writer.lock:
-            for number, block in snapshot.blocks.items():
-                if self._unsaved.get(number) is block:
-                    del self._unsaved[number]
-                    if number not in (LIVE, INBOX):  # nobody reads them from here
-                        self._memory.put(number, block)
+            for name, block in snapshot.blocks.items():
+                if self._unsaved.get(name) is block:
+                    del self._unsaved[name]
+                    if name not in (LIVE, INBOX):  # nobody reads them from here
+                        self._memory.put(name, block)
             self._memory.shrink(self.unsaved_bytes)
 
     def is_due(self, within: float) -> bool:
@@ -213,33 +217,33 @@ class StoredScene:
         """Whether all blocks are live, and `count` is right in sum alone."""
         return self._live is not None and self._live[0] is None
 
-    def has(self, number: int) -> bool:
-        """Whether there is such a block, or anything under such a special number."""
-        return number in self._unsaved or number in self.store.blocks
+    def has(self, name: BlockName) -> bool:
+        """Whether there is such a block, or anything under such a special name."""
+        return name in self._unsaved or name in self.store.blocks
 
-    def rows(self, number: int) -> int:
-        """Gaussians at rest under a number, the mail of a block left out; nothing is read."""
-        block = self._unsaved.get(number)
-        return self.store.counts(number) if block is None else len(block)
+    def rows(self, name: BlockName) -> int:
+        """Gaussians at rest under a name, the mail of a block left out; nothing is read."""
+        block = self._unsaved.get(name)
+        return self.store.counts(name) if block is None else len(block)
 
-    def clocks(self, number: int) -> Clocks:
+    def clocks(self, name: BlockName) -> Clocks:
         """How far a block had come when it was put to rest; nothing is read."""
-        block = self._unsaved.get(number)
-        return BlockState.clocks_of(self.store.meta(number)) if block is None else block.clocks
+        block = self._unsaved.get(name)
+        return BlockState.clocks_of(self.store.meta(name)) if block is None else block.clocks
 
     def mail(self, block: int) -> BlockState | None:
         """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
         return self._mail.get(block)
 
-    def state(self, number: int) -> BlockState:
-        """A block, or what is kept under another number, at rest and whole, without its mail."""
+    def state(self, name: BlockName) -> BlockState:
+        """A block, or what is kept under a special name, at rest and whole, without its mail."""
         with self._writer.lock:
-            if number in self._unsaved:
-                return self._unsaved[number]
-            found = self._memory.state(number)
+            if name in self._unsaved:
+                return self._unsaved[name]
+            found = self._memory.state(name)
             if found is None:
-                found = BlockState.from_tensors(*self.store.load(number))
-                self._memory.put(number, found)
+                found = BlockState.from_tensors(*self.store.load(name))
+                self._memory.put(name, found)
                 self._memory.shrink(self.unsaved_bytes)
             return found
 
@@ -255,25 +259,27 @@ class StoredScene:
             return everything[self.tree.assign(everything.means) == block]
         if self._live is not None and self._live[0] == block:
             return self._live[1]().detach()
-        return drawn(self._with_mail(block))
+        return self._with_mail(block, self.stored(block).seen)
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
-        return revealed(self._with_mail(block))
+        return self._with_mail(block, self.stored(block).gaussians)
 
-    def _with_mail(self, block: int) -> Gaussians:
-        mail, stored = self.mail(block), self.stored(block)
+    def _with_mail(self, block: int, stored: Gaussians) -> Gaussians:
+        mail = self.mail(block)
         return stored if mail is None else Gaussians.cat([stored, mail.gaussians])
 
-    def stored(self, number: int) -> Gaussians:
-        """The Gaussians at rest under a number, without mail."""
+    def stored(self, name: BlockName) -> AtRest:
+        """What is drawn of what is at rest under a name, without mail."""
         with self._writer.lock:
-            if number in self._unsaved:
-                return self._unsaved[number].gaussians
-            found = self._memory.gaussians(number)
+            if name in self._unsaved:
+                return AtRest(self._unsaved[name].gaussians, self._unsaved[name].waits)
+            found = self._memory.at_rest(name)
             if found is None:
-                found = Gaussians(**self.store.load_names(number, PARAM_NAMES))
-                self._memory.put(number, found)
+                tensors = self.store.load_names(name, [*PARAM_NAMES, WAITS])
+                waits = tensors.pop(WAITS)
+                found = AtRest(Gaussians(**tensors), waits)
+                self._memory.put(name, found)
                 self._memory.shrink(self.unsaved_bytes)
             return found
 

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.store.scaffold import join, put_to_wait, revealed, split_by_block
+from abcd_ns.engine.store.scaffold import join, put_to_wait, split_by_block
 from abcd_ns.engine.store.scene import StoredScene, VisitScene
-from abcd_ns.engine.store.special_blocks import INBOX, LIVE, RESERVE, WHOLE
+from abcd_ns.engine.store.special_blocks import INBOX, LIVE, RESERVE, WHOLE, BlockName
 
 
-def state_for_visit(scene: VisitScene, block: int, saved: bool = False) -> BlockState:
+def state_for_visit(scene: VisitScene, block: BlockName, saved: bool = False) -> BlockState:
     """What is attached when a visit to `block`, or with WHOLE the warm-up, begins or goes on.
 
     Args:
@@ -21,17 +21,17 @@ def state_for_visit(scene: VisitScene, block: int, saved: bool = False) -> Block
     state = (
         scene.state(LIVE) if saved else join([with_mail(scene, number) for number in _blocks(scene, block)])
     )
-    return replace(state, gaussians=revealed(state.gaussians))
+    return replace(state, waits=None)
 
 
-def rows_for_visit(scene: VisitScene, block: int, saved: bool = False) -> int:
+def rows_for_visit(scene: VisitScene, block: BlockName, saved: bool = False) -> int:
     """Rows of `state_for_visit`, without reading them."""
     if saved:
         return scene.rows(LIVE)
     return sum(scene.rows(number) + len(scene.mail(number) or ()) for number in _blocks(scene, block))
 
 
-def _blocks(scene: VisitScene, block: int) -> range:
+def _blocks(scene: VisitScene, block: BlockName) -> range:
     return range(scene.tree.num_blocks) if block == WHOLE else range(block, block + 1)
 
 
@@ -42,8 +42,8 @@ def with_mail(scene: VisitScene, block: int) -> BlockState:
 
 
 def settle(
-    scene: StoredScene, block: int, state: BlockState, migrate: bool = True, taken: int | None = None
-) -> dict[int, BlockState]:
+    scene: StoredScene, block: BlockName, state: BlockState, migrate: bool = True, taken: int | None = None
+) -> dict[BlockName, BlockState]:
     """What changes when `block`, or with WHOLE the scaffold of all, has been trained.
 
     Args:
@@ -63,8 +63,8 @@ def settle(
 
 def inbox_without(
     scene: StoredScene, blocks: set[int], arrivals: BlockState | None = None
-) -> dict[int, BlockState]:
-    """The inbox, under its number, without what waited for these blocks and with arrivals; nothing where that
+) -> dict[BlockName, BlockState]:
+    """The inbox, under its name, without what waited for these blocks and with arrivals; nothing where that
     leaves it as it was."""
     inbox, taken = scene.inbox, any(scene.mail(block) is not None for block in blocks)
     come = [] if arrivals is None or not len(arrivals) else [arrivals]
@@ -80,7 +80,7 @@ def without(scene: StoredScene, state: BlockState, blocks: Iterable[int]) -> Blo
     return state[~torch.isin(_owner(scene, state), torch.tensor(sorted(blocks)))]
 
 
-def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[int, BlockState]:
+def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[BlockName, BlockState]:
     """Every block with its part of the scaffold and of the reserve, which is empty from then on.
 
     Raises:

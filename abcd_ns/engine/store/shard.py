@@ -15,19 +15,21 @@ from torch import Tensor
 
 from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.engine.store.manifest import Shard, StoreError
+from abcd_ns.engine.store.special_blocks import BlockName
 
 _CHUNK = 1 << 20
 
 
 def write_shard(
-    folder: Path, block: int, generation: int, tensors: Mapping[str, Tensor], meta: dict[str, Any]
+    folder: Path, block: BlockName, generation: int, tensors: Mapping[str, Tensor], meta: dict[str, Any]
 ) -> Shard:
     """Write a block and sync it; the folder is left for the caller to sync.
 
     Raises:
         OSError, safetensors.SafetensorError: the disk refused; nothing is left behind.
     """
-    path = folder / f"block-{block:06d}-{generation:08d}.safetensors"
+    name = block if isinstance(block, str) else f"{block:06d}"
+    path = folder / f"block-{name}-{generation:08d}.safetensors"
     with replacing(path) as temporary:
         save_file(_plain(tensors), temporary)
         with open(temporary, "rb") as file:

@@ -1,20 +1,34 @@
-"""Numbers that are no block's, under which a visit or the store names something else than a block.
+"""Names of what is no block, where a visit or the store holds it beside blocks, which have numbers from 0 on.
 
-No tree has so many blocks. In a store a shard is found under each, as under a block's number.
+In a store a shard is found under each name, as under a block's number.
 """
 
-WHOLE = -1
+from collections.abc import Iterable
+
+BlockName = int | str
+"""A block's number, or one of these names."""
+
+WHOLE = "whole"
 """All blocks at once, where a visit names its block; nothing is stored under it."""
-RESERVE = 1 << 20
+RESERVE = "reserve"
 """The Gaussians that wait for the end of the warm-up."""
-LIVE = RESERVE + 1
+LIVE = "live"
 """A block that was saved in the middle of its visit. Under its own number that block stays as the visit found
 it: its windows hang on that."""
-INBOX = RESERVE + 2
+INBOX = "inbox"
 """Gaussians that left their block and wait for the next visit to the one that holds them now."""
-_INITIAL = 1 << 21
 
 
-def initial_of(block: int) -> int:
+def initial_of(block: int) -> str:
     """A block as it began, where each is trained alone."""
-    return _INITIAL + block
+    return f"initial-{block}"
+
+
+def from_text(text: str) -> BlockName:
+    """What JSON has as a key: a number or a name."""
+    return int(text) if text.isdecimal() else text
+
+
+def in_order(names: Iterable[BlockName]) -> list[BlockName]:
+    """Numbers first."""
+    return sorted(names, key=lambda name: (isinstance(name, str), name))

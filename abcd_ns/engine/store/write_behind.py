@@ -23,13 +23,14 @@ from typing import Any
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.special_blocks import BlockName
 
 
 @dataclass(frozen=True)
 class Snapshot:
     """What a commit brings: everything as it was at one moment between two steps. Nobody changes it."""
 
-    blocks: dict[int, BlockState]
+    blocks: dict[BlockName, BlockState]
     """Those that have changed."""
     header: dict[str, Any] | None
     """None where it has not changed."""
@@ -137,7 +138,7 @@ class WriteBehind:
                 return job
 
     def _write(self, snapshot: Snapshot) -> None:
-        blocks = {number: state.to_tensors() for number, state in snapshot.blocks.items()}
+        blocks = {name: state.to_tensors() for name, state in snapshot.blocks.items()}
         try:
             self._store.commit(blocks, header=snapshot.header, state=snapshot.state)
         except BaseException as error:  # whatever it is, it is for the thread that trains

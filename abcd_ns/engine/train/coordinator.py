@@ -15,7 +15,7 @@ from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.space.influence import influence
 from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.settle import settle
-from abcd_ns.engine.store.special_blocks import LIVE
+from abcd_ns.engine.store.special_blocks import LIVE, BlockName
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.pose_rounds import PoseRounds
@@ -152,7 +152,7 @@ class Coordinator(Trainer):
         return layers.nbytes if layers else 0
 
     def rest(self, within: float) -> None:
-        """Put the live block to rest under a number of its own, and the run's state."""
+        """Put the live block to rest under a name of its own, and the run's state."""
         updates = {}
         if (active := self.state.active) is not None:
             self.health.look_over()
@@ -168,7 +168,7 @@ class Coordinator(Trainer):
             self._read_ahead()
 
 
-def put_to_rest(run: TrainingRun, updates: dict[int, BlockState]) -> dict[int, BlockState]:
+def put_to_rest(run: TrainingRun, updates: dict[BlockName, BlockState]) -> dict[BlockName, BlockState]:
     """Put what a visit changed to rest, blocks that have outgrown their limit in parts; gives all of it."""
     limits = run.config.limits.block_limit, run.config.limits.sole_limit
     tree, updates = cut_full(run.scene, updates, run.state, *limits, run.announce)
@@ -180,7 +180,7 @@ def put_to_rest(run: TrainingRun, updates: dict[int, BlockState]) -> dict[int, B
 
 
 def tell_of_end(
-    run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[int, BlockState], sweep: int
+    run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], sweep: int
 ) -> None:
     """Tell listeners that a visit has ended.
 

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from abcd_ns.engine.store.special_blocks import BlockName
+
 FEW_VIEWS = 2
 """A block that no more views see has surfaces that nothing but the first Gaussians hold in place."""
 
@@ -35,8 +37,8 @@ class BlockHealth:
     """In the last visit no picture showed the block."""
 
 
-Ledger = dict[int, BlockHealth]
-"""By block; scaffold.WHOLE for the warm-up. A block that was never visited is missing."""
+Ledger = dict[BlockName, BlockHealth]
+"""By block; special_blocks.WHOLE for the warm-up. A block that was never visited is missing."""
 
 
 def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -> str:

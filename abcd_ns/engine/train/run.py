@@ -10,6 +10,7 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import VisitScene
+from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl, for_blocks
 from abcd_ns.engine.train.health.health import Health
@@ -120,7 +121,7 @@ class TrainingRun:
         """Gaussians in the whole scene, the live block included."""
         return sum(self.scene.count(block) for block in range(self.scene.tree.num_blocks))
 
-    def rest(self, tree: BlockTree, updates: dict[int, BlockState], within: float) -> None:
+    def rest(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
         """Put blocks and the run's state to rest, as one moment; on disk within so many seconds."""
         self.state.seconds = self.stopwatch.seconds
         if self.light is not None:

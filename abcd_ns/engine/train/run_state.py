@@ -7,7 +7,7 @@ from typing import Any
 
 from abcd_ns.engine.layers.visit_layers import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
-from abcd_ns.engine.store.special_blocks import WHOLE
+from abcd_ns.engine.store.special_blocks import WHOLE, from_text
 from abcd_ns.engine.train.health_record import BlockHealth, Ledger
 from abcd_ns.engine.train.schedule import VisitPlan
 
@@ -183,7 +183,7 @@ class RunState:
         queue = [VisitPlan(*plan) for plan in data["queue"]]
         views = {int(block): count for block, count in data["views"].items()}
         known = {int(b): {int(v): value for v, value in row.items()} for b, row in data["influence"].items()}
-        health = {int(block): BlockHealth(**record) for block, record in data.get("health", {}).items()}
+        health = {from_text(block): BlockHealth(**record) for block, record in data.get("health", {}).items()}
         changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
         return RunState(**{**data, **changed})
 

@@ -7,7 +7,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail, without
-from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.store.special_blocks import INBOX, BlockName
 from abcd_ns.engine.train.run_state import RunState
 
 FULL = 0.75
@@ -15,14 +15,14 @@ FULL = 0.75
 
 
 def split_full(
-    tree: BlockTree, settled: dict[int, BlockState], limit: int, sole: int = 0
-) -> tuple[BlockTree, dict[int, BlockState], dict[int, int]]:
+    tree: BlockTree, settled: dict[BlockName, BlockState], limit: int, sole: int = 0
+) -> tuple[BlockTree, dict[BlockName, BlockState], dict[int, int]]:
     """Cut each block with more than FULL of `limit` Gaussians in equal halves, and those again if need be.
 
     Both parts keep the block's clocks. Gaussians that coincide stay together, however many they are.
 
     Args:
-        settled: blocks that are about to be put to rest; special numbers are left alone.
+        settled: blocks that are about to be put to rest; what has a special name is left alone.
         limit: 0 is none.
         sole: the limit of a block that is the whole scene; 0 is `limit`.
 
@@ -31,7 +31,7 @@ def split_full(
         of.
     """
     parents: dict[int, int] = {}
-    waiting = sorted(block for block in settled if block < tree.num_blocks)
+    waiting = sorted(block for block in settled if isinstance(block, int))
     settled = dict(settled)
     while waiting:
         block = waiting.pop(0)
@@ -55,8 +55,8 @@ def is_full(gaussians: int, blocks: int, limit: int, sole: int) -> bool:
 
 
 def with_full(
-    scene: StoredScene, settled: dict[int, BlockState], limit: int, busy: set[int]
-) -> dict[int, BlockState]:
+    scene: StoredScene, settled: dict[BlockName, BlockState], limit: int, busy: set[int]
+) -> dict[BlockName, BlockState]:
     """What is about to be put to rest, and the blocks that are full with those that wait for their visit: for
     these there might be no room in it.
 
@@ -75,12 +75,12 @@ def with_full(
 
 def cut_full(
     scene: StoredScene,
-    settled: dict[int, BlockState],
+    settled: dict[BlockName, BlockState],
     state: RunState,
     limit: int,
     sole: int,
     announce: Announcer,
-) -> tuple[BlockTree, dict[int, BlockState]]:
+) -> tuple[BlockTree, dict[BlockName, BlockState]]:
     """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole.
 
     Args:

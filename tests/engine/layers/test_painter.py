@@ -9,14 +9,14 @@ from abcd_ns.engine.layers.compositing import fold
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.space.intervals import cell_windows, ray_interval
+from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, Layer, View
 from tests.reference.rasterizer_scenes import as_leaves, probe, relative_error
-from tests.reference.scenes import random_gaussians, ring_of_views
+from tests.reference.scenes import cell_windows, random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer()
 BY_SIDE = {side: TorchRasterizer(tile_side=side) for side in (1, 4, 16)}

@@ -192,17 +192,18 @@ def test_a_fork_waits_for_the_write_and_the_child_can_read(scene):
 
 def test_what_only_its_own_visit_needs_goes_first(scene):
     states = [scene.state(number) for number in range(3)]
-    memory = BlockMemory(3 * states[0].gaussians.nbytes)
+    rests = [scene.stored(number) for number in range(4)]
+    memory = BlockMemory(3 * rests[0].nbytes)
     for number, state in enumerate(states):
         memory.put(number, state)
         memory.shrink()
     assert [memory.state(number) for number in range(3)] == [None] * 3
-    assert all(memory.gaussians(number) is state.gaussians for number, state in enumerate(states))
-    memory.gaussians(0)
-    memory.put(3, scene.state(3).gaussians)
+    assert all(memory.at_rest(number).gaussians is state.gaussians for number, state in enumerate(states))
+    memory.at_rest(0)
+    memory.put(3, rests[3])
     memory.shrink()
-    assert [memory.gaussians(number) is None for number in range(4)] == [False, True, False, False]
-    assert memory.nbytes == sum(scene.state(number).gaussians.nbytes for number in (0, 2, 3))
+    assert [memory.at_rest(number) is None for number in range(4)] == [False, True, False, False]
+    assert memory.nbytes == sum(rests[number].nbytes for number in (0, 2, 3))
 
 
 def test_what_is_not_on_disk_is_never_let_go(scene):

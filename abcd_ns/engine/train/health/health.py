@@ -20,6 +20,7 @@ from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.settle import state_for_visit
+from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health.health_rules import (
     GIANT_ANGLE,
     HIDDEN,
@@ -279,7 +280,7 @@ class Health:
 
     @property
     def _record(self) -> BlockHealth:
-        block = -1 if self._active is None else self._active.geometry.block
+        block = WHOLE if self._active is None else self._active.geometry.block
         return self._ledger.setdefault(block, BlockHealth())
 
     def _count(self, what: str, count: int) -> None:
@@ -287,8 +288,8 @@ class Health:
 
     def _tell(self, active: ActiveVisit | None, what: str, count: int) -> None:
         if count:
-            block = -1 if active is None else active.geometry.block
+            block = WHOLE if active is None else active.geometry.block
             record = self._ledger.setdefault(block, BlockHealth())
             setattr(record, what, getattr(record, what) + count)
             number = 0 if active is None else active.number
-            self._announce(Mended(number, None if block < 0 else block, what, count))
+            self._announce(Mended(number, None if block == WHOLE else block, what, count))

@@ -1,4 +1,4 @@
-"""A worker in the driver's own process: for tests, and to see what training at once does to a scene."""
+"""Workers in the driver's own process."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
