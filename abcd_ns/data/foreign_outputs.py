@@ -71,6 +71,7 @@ def pinhole_cameras(lenses: Sequence[Lens], poses: Float[Tensor, "n 3 4"]) -> Ca
         **{name: column(name, torch.float32) for name in ("fx", "fy", "cx", "cy")},
         **{name: column(name, torch.int64) for name in ("width", "height")},
         camera_type=CameraType.PERSPECTIVE,
+        metadata={},  # `ns-export cameras` wants one
     )
 
 

@@ -24,6 +24,7 @@ SAME = {
         "sh_degree": "sh-degree",
         "ssim_lambda": "ssim-lambda",
         "background": "background-color",
+        "poses": "camera-optimizer.mode",
     },
     DensityConfig: {
         "refine_every": "refine-every",
@@ -34,6 +35,7 @@ SAME = {
 }
 """By class and field, the flag of splatfacto's under --pipeline.model that means the same; taken too."""
 INSTEAD = {
+    "camera_optimizer": "training.poses SO3xR3",
     "warmup_length": "training.density.refine-start, a share of the run",
     "stop_split_at": "training.density.refine-stop, a share of the run",
     "reset_alpha_every": "training.density.reset-every, in steps",
