@@ -189,6 +189,7 @@ class Dispatcher(Trainer):
             views=state.views.get(block, len(active.geometry.views)),
             health=state.health.get(block, BlockHealth()),
             light={} if self.run.light is None else self.run.light.to_json(),
+            poses=self.run.poses.to_json(),
             allowance=self._allowance(),
         )
         state.active = None

@@ -39,6 +39,8 @@ class VisitTask:
     health: BlockHealth
     light: dict[str, str]
     """As in RunState; the worker applies it, and leaves it as it is."""
+    poses: dict[str, str]
+    """The same."""
     allowance: int | None
     """Gaussians by which the block may grow, for the sake of a limit on the scene; None for any number."""
 

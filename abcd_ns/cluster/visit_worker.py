@@ -179,6 +179,8 @@ class VisitWorker:
         if run.light is not None:  # two workers may show one photo: whose transform should stay?
             run.light.restore(task.light)
             run.light.learns = False
+        run.poses.restore(task.poses)
+        run.take_poses()
         run.stopwatch = Stopwatch(task.seconds)
         return run
 

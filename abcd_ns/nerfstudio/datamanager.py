@@ -1,7 +1,7 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.flags import hidden
+from abcd_ns.nerfstudio.views import place_cameras
 
 BATCH = "abcd_batch"
 """The key of a camera's metadata under which what to train on travels from here to the model."""
@@ -137,6 +138,17 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def follow(self, coordinator: Trainer) -> None:
         """Serve what this coordinator asks for from now on."""
         self._coordinator = coordinator
+
+    def take_poses(self, poses: Mapping[int, torch.Tensor]) -> None:
+        """Put training cameras where they were refined to, and held-out ones of the same photos with them.
+
+        Args:
+            poses: world to camera, by row of the training photos.
+        """
+        rows = {path: row for row, path in enumerate(self.train_dataset.image_filenames)}
+        for dataset in (self.train_dataset, self.eval_dataset):
+            known = ((row, rows.get(path, -1)) for row, path in enumerate(dataset.image_filenames))
+            place_cameras(dataset.cameras, {row: poses[own] for row, own in known if own in poses})
 
     def photo(self, row: int, crop: Crop) -> torch.Tensor:
         """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""

@@ -78,7 +78,7 @@ class AbcdModel(SplatfactoModel):
         self.camera_optimizer = self.config.camera_optimizer.setup(
             num_cameras=self.num_train_data, device="cpu"
         )
-        self._tree = build_kd(torch.zeros(0, 3), 1)
+        self._tree, self._poses = build_kd(torch.zeros(0, 3), 1), {}
         self.near = NEAR_PLANE
         self.step = 0
         # For classes derived from this one, as splatfacto has them; here images are measured by `metrics`.
@@ -111,6 +111,11 @@ class AbcdModel(SplatfactoModel):
     def tree(self) -> BlockTree:
         """How space is cut; while training, as it is now."""
         return self._tree if self._coordinator is None else self._coordinator.scene.tree
+
+    @property
+    def poses(self) -> dict[int, Tensor]:
+        """World to camera, by row of the training photos, of those that were refined."""
+        return self._poses if self._coordinator is None else self._coordinator.run.poses.refined
 
     def scene(self) -> BlockScene:
         """The whole scene by blocks, the live one included."""
@@ -176,13 +181,14 @@ class AbcdModel(SplatfactoModel):
             )
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What the Gaussians do not tell: how space is cut, and the near plane."""
-        return {"tree": self.tree.to_json(), "near": self.near}
+        """What the Gaussians do not tell: how space is cut, the near plane, and refined poses."""
+        return {"tree": self.tree.to_json(), "near": self.near, "poses": self.poses}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take over the cut of space and the near plane from a checkpoint."""
+        """Take over the cut of space, the near plane and refined poses from a checkpoint."""
         self._tree = BlockTree.from_json(state["tree"])
         self.near = state.get("near", NEAR_PLANE)
+        self._poses = state.get("poses", {})
 
     # -- pictures ------------------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ SAME = {
         "sh_degree": "sh-degree",
         "ssim_lambda": "ssim-lambda",
         "background": "background-color",
+        "poses": "camera-optimizer.mode",
     },
     DensityConfig: {
         "refine_every": "refine-every",
@@ -51,7 +52,7 @@ UNUSED_OF_MODEL = {
     **dict.fromkeys(("cull_screen_size", "split_screen_size", "stop_screen_size_at"), _GIANTS),
     **dict.fromkeys(("use_scale_regularization", "max_gauss_ratio"), _GIANTS),
     **dict.fromkeys(("use_bilateral_grid", "grid_shape"), _LIGHT),
-    "camera_optimizer": "cameras stay where the data has them",
+    "camera_optimizer": "set --pipeline.training.poses SO3xR3 instead",
     "output_depth_during_training": "no loss here needs depth; trained scenes have it",
     **dict.fromkeys(("enable_collider", "collider_params", "eval_num_rays_per_chunk"), _RAYS),
     "loss_coefficients": "set --pipeline.training.ssim-lambda instead",
@@ -68,7 +69,7 @@ UNUSED = {
 """Options of nerfstudio's trainer that ABCD has no use for, and why."""
 NOT_CLIPPED = "steps whose gradients are no numbers are skipped, and others are not clipped"
 UNUSED_OF_OPTIMIZERS = {
-    "camera_opt": "cameras stay where the data has them",
+    "camera_opt": "poses are refined by steps of their own, see --pipeline.training.poses",
     "bilateral_grid": _LIGHT,
     "*.scheduler.*": "--pipeline.training.means-lr-decay is the means' rate at the end, and other rates stay",
     "*.optimizer.max_norm": NOT_CLIPPED,

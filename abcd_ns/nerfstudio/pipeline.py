@@ -159,6 +159,7 @@ class AbcdPipeline(VanillaPipeline):
         """As VanillaPipeline's; while training, it is no training time."""
         if self._coordinator is not None:
             self._coordinator.pause()
+        self.datamanager.take_poses(self.model.poses)
         return super().get_eval_image_metrics_and_images(step)
 
     def get_average_eval_image_metrics(
@@ -167,12 +168,18 @@ class AbcdPipeline(VanillaPipeline):
         """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
         if self._coordinator is not None:
             self._coordinator.pause()
+        self.datamanager.take_poses(self.model.poses)
         found = super().get_average_eval_image_metrics(step, output_path, get_std)
         if self._coordinator is not None:
             self._coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
             found |= {"lpips": None, "lpips_missing": lpips_missing()}
         return found
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """As VanillaPipeline's; cameras stand where their poses were refined to."""
+        super().load_pipeline(loaded_state, step)
+        self.datamanager.take_poses(self.model.poses)
 
     def _after_step(self) -> None:
         if self._coordinator is None:

@@ -1,7 +1,11 @@
 """nerfstudio's cameras as the engine's views."""
 
+from collections.abc import Mapping
+
 import torch
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.engine.types import View
@@ -25,6 +29,14 @@ def view_of(cameras: Cameras, row: int = 0) -> View:
     K[0, 0], K[1, 1] = cameras.fx[row].item(), cameras.fy[row].item()
     K[0, 2], K[1, 2] = cameras.cx[row].item(), cameras.cy[row].item()
     return View(viewmat, K, int(cameras.width[row]), int(cameras.height[row]), row)
+
+
+def place_cameras(cameras: Cameras, poses: Mapping[int, Float[Tensor, "4 4"]]) -> None:
+    """Put cameras where the engine has them: the inverse of `view_of`, by row, in place."""
+    for row, viewmat in poses.items():
+        rotation = viewmat[:3, :3].T
+        cameras.camera_to_worlds[row, :, :3] = rotation * viewmat.new_tensor([1.0, -1.0, -1.0])
+        cameras.camera_to_worlds[row, :, 3] = -rotation @ viewmat[:3, 3]
 
 
 def views_of(cameras: Cameras) -> list[View]:

@@ -38,12 +38,12 @@ def in_process(run: TrainingRun, photos: Photos, count: int) -> InProcessWorkers
 def make(tmp_path, views, photos):
     """Makes runs: by a coordinator alone, or with `workers` by a dispatcher."""
 
-    def made(name: str = "run", workers=None, lag: int | None = None, **options):
+    def made(name: str = "run", workers=None, lag: int | None = None, target=None, **options):
         (tmp_path / name).mkdir(exist_ok=True)
         options = {"blocks": 6, "steps": 60, **options}
 
         def kind(run: TrainingRun):
-            local = Coordinator(run)
+            local = Coordinator(run, target=target)
             if workers is None:
                 return local
             return Dispatcher(

@@ -8,8 +8,10 @@ import torch
 
 from abcd_ns.cluster.dispatcher import LOSSES, Dispatcher
 from abcd_ns.cluster.lease import Finished, Lost, StepsSeen, WorkersError
+from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded, WorkerLost
 from abcd_ns.engine.store.settle import with_mail
+from abcd_ns.engine.train import pose_rounds
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.light import Light
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -275,3 +277,33 @@ def test_workers_apply_the_light_of_the_moment_and_leave_it(make, photos):
     assert lent
     assert all(light == before for light in lent)
     assert run.run.light.to_json() == before
+
+
+def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, monkeypatch):
+    monkeypatch.setattr(pose_rounds, "FIRST", 0.0)
+    drawn_from, run_of = [], VisitWorker._run_of
+
+    def watched(worker, task, scene):
+        run = run_of(worker, task, scene)
+        drawn_from.append({view: found.viewmat for view, found in run.views.items()})
+        return run
+
+    monkeypatch.setattr(VisitWorker, "_run_of", watched)
+    run = make(
+        workers=2,
+        density=STILL,
+        scaffold=40,
+        warmup=0.3,
+        poses="SO3xR3",
+        processes=1,
+        target=lambda sample: (photos(sample.view.index, sample.crop), None),
+    )
+    given = {index: view.viewmat for index, view in run.views.items()}
+    while not run.trains_elsewhere:
+        train(run, photos, steps=1)
+    found = dict(run.run.poses.refined)
+    assert not any(torch.equal(pose, given[view]) for view, pose in found.items())
+    train(run, photos)
+    assert drawn_from
+    assert all(torch.equal(seen[view], pose) for seen in drawn_from for view, pose in found.items())
+    assert run.run.poses.refined == found

@@ -15,11 +15,10 @@ from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.types import View
 
-FIRST = 8.0
+FIRST = 16.0
 """Uses of each view by the whole scene before its pose is refined: from blobs, poses only become worse."""
-EVERY, SHARE = 1.0, 0.1
-"""Uses of each view from round to round, at least, and as a share of all so far: a fifth of a run's time goes
-into rounds, and less in a long one."""
+EVERY, SHARE = 1.0, 0.04
+"""Uses of each view from round to round, at least, and as a share of all so far."""
 
 
 class PoseRounds:

@@ -38,9 +38,10 @@ class Poses:
         self._given = {view.index: view.viewmat for view in views}
         self._refined: dict[int, Tensor] = {}
 
-    def __bool__(self) -> bool:
-        """Whether any is not as it was given."""
-        return bool(self._refined)
+    @property
+    def refined(self) -> dict[int, Float[Tensor, "4 4"]]:
+        """By view; empty where all are as they were given."""
+        return self._refined
 
     def of(self, view: int) -> Float[Tensor, "4 4"]:
         """The pose of a view by now."""

@@ -30,6 +30,8 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step, views_per_warm_up_step
+from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.stability.world import TABLE, World, ring
@@ -67,6 +69,10 @@ class Stage:
     def __call__(self, index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
         """The training loop's photo reader."""
         return self.photos[index][crop.slices]
+
+    def target(self, sample: Sample) -> Target:
+        """What a sample is trained on."""
+        return sample.reduced(self(sample.view.index, sample.source)), None
 
     def start(self) -> Gaussians:
         """The first Gaussians."""

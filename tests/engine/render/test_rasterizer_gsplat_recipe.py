@@ -48,6 +48,18 @@ def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_de
         assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_gradient_of_a_pose_equals_the_torch_backends(backend, antialiased):
+    gaussians, found = random_gaussians(40), []
+    for draw in (backend, TorchRasterizer("never")):
+        seen = replace(VIEW, viewmat=VIEW.viewmat.clone().requires_grad_())
+        for _ in range(2):  # the second time, nothing is taken from what was kept
+            picture = stacked(draw(gaussians, seen, sh_degree=3, antialiased=antialiased))
+            (picture * probe(*picture.shape[:2])).sum().backward()
+        found.append(seen.viewmat.grad)
+    assert relative_error(*found) < 1e-8
+
+
 def test_the_near_plane_is_the_views(backend):
     gaussians = random_gaussians(40)
     near = 1.001 * float(backend.project(gaussians, VIEW).depths.median())

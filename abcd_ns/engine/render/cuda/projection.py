@@ -43,21 +43,22 @@ class Cameras:
     def poses(
         self, views: Sequence[View], like: Tensor
     ) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c 3 3"], Float[Tensor, "c 3"]]:
-        """World to camera, intrinsics, and centres in world space; all new ones in one copy."""
+        """World to camera, intrinsics, and centres in world space; all new ones in one copy. Those that take
+        gradients are not kept."""
 
         def make(new: list[int]) -> Sequence[Tensor]:
             for k in new:  # holds on to tensors by whose identity views are known
                 self._views[id(views[k].viewmat), id(views[k].K)] = views[k]
-            rows = (
-                torch.cat((v.viewmat.flatten(), v.K.flatten(), v.center)) for v in (views[k] for k in new)
-            )
-            return torch.stack(list(rows)).to(like, non_blocking=True).unbind()
+            return _rows([views[k] for k in new]).to(like, non_blocking=True).unbind()
 
         place = like.device, like.dtype
         if len(self._views) > MOST_KEPT:
             self._views, self._poses = {}, Kept()
-        found = self._poses.get([(id(view.viewmat), id(view.K), *place) for view in views], make)
-        packed = torch.stack(found)
+        if any(view.viewmat.requires_grad for view in views):
+            packed = _rows(views).to(like)
+        else:
+            keys = [(id(view.viewmat), id(view.K), *place) for view in views]
+            packed = torch.stack(self._poses.get(keys, make))
         return packed[:, :16].view(-1, 4, 4), packed[:, 16:25].view(-1, 3, 3), packed[:, 25:]
 
     def corners(self, crops: Sequence[Crop], like: Tensor) -> Float[Tensor, "c 2"]:
@@ -72,6 +73,11 @@ class Cameras:
 
         keys = [(crop.x, crop.y, like.device, like.dtype) for crop in crops]
         return torch.stack(self._corners.get(keys, make))
+
+
+def _rows(views: Sequence[View]) -> Float[Tensor, "c 28"]:
+    """Both matrices of each view, and its centre."""
+    return torch.stack([torch.cat((v.viewmat.flatten(), v.K.flatten(), v.center)) for v in views])
 
 
 @dataclass(frozen=True)

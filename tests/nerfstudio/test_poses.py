@@ -1,0 +1,66 @@
+"""Refined poses in nerfstudio's tools: saved, seen by ns-eval and the viewer, and exported."""
+
+import json
+
+import pytest
+import torch
+from nerfstudio.scripts.exporter import ExportCameraPoses
+from nerfstudio.utils.eval_utils import eval_setup
+
+from abcd_ns.engine.train import pose_rounds
+from abcd_ns.nerfstudio.views import place_cameras, view_of, views_of
+from tests.nerfstudio.test_training import configure, run
+from tests.reference.colmap_scene import HELD_OUT, VIEWS, write_scene
+
+
+@pytest.fixture(scope="module", params=["all", "interval"])
+def trained(request, tmp_path_factory):
+    """A run whose held-out photos are those of the training, or others; and the poses that it was given."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pose_rounds, "FIRST", 0.5)
+        data, out = (tmp_path_factory.mktemp(name) for name in ("data", "out"))
+        config = configure(write_scene(data / "wall"), out)
+        config.pipeline.training.poses = "SO3xR3"
+        config.pipeline.datamanager.dataparser.eval_mode = request.param
+        given = config.pipeline.setup(device="cpu", test_mode="val").datamanager
+        return run(config), given
+
+
+def matrices(cameras) -> torch.Tensor:
+    return torch.stack([view.viewmat for view in views_of(cameras)])
+
+
+def test_cameras_are_put_where_the_engine_has_them(trained):
+    cameras = trained[1].train_dataset.cameras[:3]
+    pose = view_of(cameras, 2).viewmat
+    place_cameras(cameras, {1: pose})
+    found = matrices(cameras)
+    assert torch.allclose(found[1], pose, atol=1e-6)
+    assert not torch.allclose(found[0], pose, atol=1e-2)
+
+
+def test_a_checkpoint_holds_refined_poses_and_ns_eval_draws_from_them(trained):
+    trainer, given = trained
+    _, pipeline, path, _ = eval_setup(trainer.base_dir / "config.yml")
+    refined = torch.stack([view.viewmat for view in trainer.pipeline.coordinator.views.values()])
+    seen = matrices(pipeline.datamanager.train_dataset.cameras)
+    assert torch.allclose(seen, refined, atol=1e-6)
+    assert float((seen - matrices(given.train_dataset.cameras)).abs().max()) > 1e-4
+    held, before = (matrices(d.eval_dataset.cameras) for d in (pipeline.datamanager, given))
+    if len(held) == VIEWS:
+        assert torch.allclose(held, refined, atol=1e-6)
+    else:
+        assert len(held) == HELD_OUT
+        assert torch.equal(held, before)
+    assert torch.load(path, weights_only=True)["pipeline"]["_model._extra_state"]["poses"].keys() == {
+        *range(len(refined))
+    }
+
+
+def test_ns_export_cameras_writes_refined_poses(trained, tmp_path):
+    trainer, _ = trained
+    ExportCameraPoses(load_config=trainer.base_dir / "config.yml", output_dir=tmp_path / "out").main()
+    frames = json.loads((tmp_path / "out" / "transforms_train.json").read_text())
+    cameras = eval_setup(trainer.base_dir / "config.yml")[1].datamanager.train_dataset.cameras
+    assert torch.equal(torch.tensor([frame["transform"] for frame in frames]), cameras.camera_to_worlds)
+    assert len(json.loads((tmp_path / "out" / "transforms_eval.json").read_text())) > 0
