@@ -10,6 +10,7 @@ from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
+from abcd_ns.engine.train import pose_rounds
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
@@ -64,6 +65,21 @@ def test_blocks_are_trained(tmp_path, start, views, photos, blocks, density, lay
     assert coordinator.state.step == steps
     assert len(scene) != len(start)
     assert all(bool(value.isfinite().all()) for _, value in scene.items())
+
+
+@pytest.mark.parametrize("together", [0, 1])
+def test_poses_are_refined_by_pictures_of_one_unit_and_of_several(
+    tmp_path, start, views, photos, together, monkeypatch
+):
+    monkeypatch.setattr(pose_rounds, "FIRST", 0.0)
+    target = lambda sample: (photos(sample.view.index, sample.crop).to(DEVICE), None)  # noqa: E731
+    options = {"blocks": 2, "steps": 6, "poses": "SO3xR3", "pass_gaussians": together, "target": target}
+    coordinator = on_device(tmp_path, start, views, **options, light="exposure")
+    coordinator.poses.take()
+    train(coordinator, photos)
+    moved = [view for view in views if not torch.equal(coordinator.views[view.index].viewmat, view.viewmat)]
+    assert len(moved) == len(views)
+    assert all(bool(view.viewmat.isfinite().all()) for view in coordinator.views.values())
 
 
 @pytest.mark.parametrize("ownership", ["means", "fragments"])
