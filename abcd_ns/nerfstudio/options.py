@@ -133,17 +133,17 @@ def refuse_flags(words: Sequence[str]) -> None:
         UserError: one is.
     """
     taken = {flag.replace("-", "_") for flags in SAME.values() for flag in flags.values()} | HONOURED
-    of_model = {name: why for name, why in UNUSED_OF_MODEL.items() if name not in taken}
     found = {
         **UNUSED,
-        **{f"pipeline.model.{name}": why for name, why in of_model.items()},
+        **{f"pipeline.model.{name}": why for name, why in UNUSED_OF_MODEL.items()},
         **{f"pipeline.datamanager.{name}": why for name, why in UNUSED_OF_DATA.items()},
         **{f"optimizers.{name}": why for name, why in UNUSED_OF_OPTIMIZERS.items()},
     }
-    flags = [word.partition("=")[0] for word in words if word.startswith("--")]
-    for flag, (pattern, why) in product(flags, found.items()):
-        if fnmatchcase(f"{flag[2:].replace('-', '_')}.", f"{pattern}.*"):
-            raise UserError(_no_effect(flag[2:], why))
+    flags = (word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--"))
+    refused = [flag for flag in flags if flag.removeprefix("pipeline.model.") not in taken]
+    for flag, (pattern, why) in product(refused, found.items()):
+        if fnmatchcase(f"{flag}.", f"{pattern}.*"):
+            raise UserError(_no_effect(flag, why))
 
 
 def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:

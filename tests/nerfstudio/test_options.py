@@ -151,7 +151,7 @@ def test_what_has_no_effect_is_refused_from_files_too(change, says):
     [
         ("--pipeline.model.stop-split-at", "training.density.refine-stop"),
         ("--pipeline.model.num_downscales=2", "training.coarse"),
-        ("--pipeline.model.camera-optimizer.mode", "cameras stay"),
+        ("--pipeline.model.camera-optimizer.trans-l2-penalty", "training.poses SO3xR3"),
         ("--pipeline.model.use-bilateral-grid", "training.light"),
         ("--pipeline.datamanager.cache-images", "device-budget-gb"),
         ("--gradient-accumulation-steps", "training.batch"),

@@ -9,6 +9,7 @@ import threading
 import pytest
 
 from abcd_ns.engine.store import FolderLockedError, ParameterStore, StoreError, atomic, shard
+from abcd_ns.engine.store.manifest import FORMAT_VERSION
 from tests.reference.store_helpers import FailAt, assert_block, block, names_in
 
 
@@ -139,8 +140,10 @@ def test_opening_what_is_no_store_says_so(tmp_path, store):
     with pytest.raises(StoreError, match="already holds a store"):
         ParameterStore.create(store.folder, {})
     manifest = store.folder / "manifest.json"
-    manifest.write_bytes(manifest.read_bytes().replace(b'"version":3', b'"version":4'))
-    with pytest.raises(StoreError, match=r"format version 4.*version 3"):
+    newer = FORMAT_VERSION + 1
+    head = b'"version":%d'
+    manifest.write_bytes(manifest.read_bytes().replace(head % FORMAT_VERSION, head % newer))
+    with pytest.raises(StoreError, match=rf"format version {newer}.*version {FORMAT_VERSION}"):
         ParameterStore.open(store.folder)
 
 
