@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,6 +66,17 @@ def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, tmp_path)
     assert export(run, out=tmp_path / "after.ply") == 0
     before, after = by_position(read(tmp_path / "before.ply")), by_position(read(tmp_path / "after.ply"))
     assert np.array_equal(before, after)
+
+
+def test_those_that_nobody_sees_yet_are_left_out(run, tmp_path):
+    with ParameterStore.open(run / "abcd/store") as store:
+        state = BlockState.from_tensors(*store.load(0))
+        store.commit({0: state[3:].to_tensors()})
+    assert export(run, out=tmp_path / "without.ply") == 0
+    with ParameterStore.open(run / "abcd/store") as store:
+        store.commit({0: replace(state, waits=torch.arange(len(state)) < 3).to_tensors()})
+    assert export(run, out=tmp_path / "waiting.ply") == 0
+    assert (tmp_path / "waiting.ply").read_bytes() == (tmp_path / "without.ply").read_bytes()
 
 
 def test_in_the_runs_own_frame_every_value_is_what_is_stored(run, scene, tmp_path):

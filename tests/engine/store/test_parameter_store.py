@@ -258,3 +258,12 @@ def test_the_store_is_a_dictionary(tmp_path_factory):
     case = StoreMachine.TestCase
     case.settings = settings(max_examples=15, stateful_step_count=15, deadline=None, derandomize=True)
     case().runTest()
+
+
+def test_names_stand_beside_numbers_and_are_read_back_as_such(tmp_path):
+    with ParameterStore.create(tmp_path / "s", {}) as store:
+        store.commit({"inbox": block(2, 7.0), 10: block(1), 2: block(3)})
+    again = ParameterStore.open(tmp_path / "s", read_only=True)
+    assert again.blocks == [2, 10, "inbox"]
+    assert_block(again, "inbox", 2, 7.0)
+    assert "block-inbox-00000001.safetensors" in names_in(tmp_path / "s")
