@@ -15,15 +15,19 @@ from tests.reference.colmap_scene import write_scene
 BIN = Path(sys.executable).parent
 
 
+def shell(command: str, *args: object) -> subprocess.CompletedProcess[str]:
+    words = [str(BIN / command), *map(str, args)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+
+
 @pytest.mark.cli
 def test_train_then_evaluate(tmp_path):
     data = write_scene(tmp_path / "wall")
-    words = [
-        BIN / "ns-train", "abcd", "--data", data, "--output-dir", tmp_path / "out", "--timestamp", "run",
+    train = shell(
+        "ns-train", "abcd", "--data", data, "--output-dir", tmp_path / "out", "--timestamp", "run",
         "--max-num-iterations", 30, "--pipeline.blocks", 2, "--vis", "tensorboard",
         "colmap", "--colmap-path", "sparse/0",
-    ]  # fmt: skip
-    train = subprocess.run([*map(str, words)], capture_output=True, text=True, timeout=300, check=False)
+    )  # fmt: skip
     assert train.returncode == 0, train.stdout[-3000:] + train.stderr[-3000:]
     assert "Warning" not in train.stdout + train.stderr
     assert "training on the CPU" in train.stdout or "GPU" in train.stdout

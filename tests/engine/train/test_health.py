@@ -8,6 +8,7 @@ import torch
 from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
 from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.store.settle import with_mail
+from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
@@ -260,7 +261,7 @@ def test_every_parameter_is_looked_at(name):
 
 def test_the_record_survives_json():
     state = RunState(
-        health={-1: BlockHealth(gradients=3), 4: BlockHealth(visits=2, damping=0.25, hidden=True)}
+        health={WHOLE: BlockHealth(gradients=3), 4: BlockHealth(visits=2, damping=0.25, hidden=True)}
     )
     again = RunState.from_json(state.to_json())
     assert again.health == state.health
