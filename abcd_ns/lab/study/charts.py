@@ -214,7 +214,7 @@ def _write_columns(axes: Axes, row: float, texts: Sequence[str], color: str) -> 
 def _title(results: Results, method: str | None = None) -> str:
     s = results.settings
     parts = [s.scene, f"1/{s.downscale} size", *([method] if method else [])]
-    if results.kind != "study of blocks":
+    if results.kind != "study of blocks" and set(results.methods) != {"abcd-monolithic"}:
         parts.append(f"{s.blocks} blocks")
     parts.append(f"{s.steps:,} steps" if s.seconds is None else f"{s.seconds:g} s")
     if len(results.seeds) > 1:
