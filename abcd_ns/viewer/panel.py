@@ -158,7 +158,7 @@ class AbcdPanel(ViewerControl):
         share, sweep = sweep_share(history, state), ""
         where, left = self._where(state), seconds_left(seconds, coordinator.progress)
         if history.sweep is not None and not coordinator.finished:
-            visits = history.sweep_visits + len(state.queue) + len(history.under_way)
+            visits = history.sweep_visits + len(state.queue) + len(history.of_sweep)
             of_sweep = seconds_left(seconds - history.sweep_began, share, most=left)  # a run ends in a sweep
             sweep = sweep_line(history.sweep, history.sweep_visits, visits, of_sweep)
         self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)

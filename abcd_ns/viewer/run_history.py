@@ -116,7 +116,7 @@ class RunHistory:
         if visit.block is None:
             return
         self.visits[visit.block] = self.visits.get(visit.block, 0) + 1
-        self.sweep_visits += 1
+        self.sweep_visits += visit.sweep == self.sweep  # workers may still be at the last one
         if crops:
             self.psnr[visit.block] = sum(crops) / len(crops)
 
@@ -125,6 +125,11 @@ class RunHistory:
         self._recent = []
         if len(self.curve) > MOST_POINTS:
             del self.curve[-2::-2]
+
+    @property
+    def of_sweep(self) -> list[VisitBegan]:
+        """Visits to blocks that are under way in this sweep."""
+        return [v for v in self.under_way.values() if v.block is not None and v.sweep == self.sweep]
 
     def status(self, block: int, views: int | None) -> Status:
         """Of one block, on which so many views are worth training, if that is known."""
@@ -146,7 +151,7 @@ class RunHistory:
 
 def sweep_share(history: RunHistory, state: RunState) -> float:
     """Share of the sweep's visits that is done, 0..1; visits whose steps are planned count in part."""
-    visits = [visit for visit in history.under_way.values() if visit.block is not None]
+    visits = history.of_sweep
     if not visits:
         return 0.0
     parts = (history.steps[v.visit] / v.steps for v in visits if 0 < v.steps < UNLIMITED)

@@ -170,6 +170,19 @@ def test_visits_of_workers_are_under_way_together():
     assert history.psnr == {0: 0.0, 2: 20.0}
 
 
+def test_a_visit_of_the_last_sweep_does_not_count_in_this_one():
+    history = RunHistory()
+    for event in (began(0, 0), began(1, 1), ended(0, 0), began(2, 0, sweep=1)):
+        history.note(event, 0.0)
+    assert (history.sweep, history.sweep_visits) == (1, 0)
+    assert [visit.visit for visit in history.of_sweep] == [2]
+    history.note(ended(1, 1), 1.0)
+    assert history.sweep_visits == 0
+    assert history.visits == {0: 1, 1: 1}
+    history.note(ended(2, 0, sweep=1), 2.0)
+    assert history.sweep_visits == 1
+
+
 def test_what_workers_do_in_words():
     seen = [WorkerSeen(0, 2, 7, 40, 3, 1, 0.1), WorkerSeen(1, None, 0, 0, 0, 0, 0.0)]
     assert workers_line(seen).splitlines() == [
