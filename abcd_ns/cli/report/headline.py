@@ -24,7 +24,8 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
     story, limit = run.story, run.story.trainings[-1].limit
     visits, sweeps = len(story.visits), len(story.sweeps)
     rounds = f"{_count(visits, 'visit')}, {_count(sweeps, 'full sweep')}" if story.blocks > 1 else ""
-    share = story.layer_seconds / story.seconds if story.seconds else 0.0
+    seconds = story.seconds * max(len(story.workers), 1)  # layers' are summed over workers
+    share = story.layer_seconds / seconds if seconds else 0.0
     return [
         *_quality(story, held_out),
         Fact("Gaussians", f"{story.gaussians:,}", more="" if limit is None else f"limit {limit:,}"),

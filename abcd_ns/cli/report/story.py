@@ -61,9 +61,9 @@ class Story:
     visits: tuple[Visit, ...]
     sweeps: tuple[SweepEndLine, ...]
     held_out: tuple[HeldOutLine, ...]
+    """Those with a PSNR."""
     workers: tuple[WorkerLine, ...]
     """At the end; none where one process trained."""
-    """Those with a PSNR."""
     end: EndLine | None
     """None where the run is still going on, or was killed."""
     moments: tuple[tuple[int, float], ...]

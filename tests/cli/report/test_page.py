@@ -99,6 +99,7 @@ def test_the_headline_counts_workers_where_there_were_any(tmp_path):
     lines = [*log_lines(), *(line("worker", 40, 16.0, visits=2, **end) for end in ends)]
     story = read_story(write_log(tmp_path / "workers.jsonl", lines))
     facts = {fact.name: fact for fact in headline(dataclasses.replace(run, story=story), None)}
+    assert facts["training time"].more == "9% for layers"  # of two workers' time: half of one process's 19%
     assert (facts["workers"].value, facts["workers"].more) == ("2", "waited 15% of the time, 1 lost")
     assert "workers" not in {fact.name for fact in headline(run, None)}
 
