@@ -10,7 +10,7 @@ thread, so that neither the machine nor how busy it is has a part in the result.
 import json
 import multiprocessing
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -19,10 +19,10 @@ import tyro
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded
 from abcd_ns.lab.runs.evaluate import mean_psnr
-from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio import pipeline
 from abcd_ns.nerfstudio.workers import make_worker, setup_of
 from benchmarks import workers
+from benchmarks.records import write_runs
 from tests.cluster.in_process import InProcessWorkers
 
 
@@ -108,10 +108,7 @@ def main(args: Args) -> None:
             with multiprocessing.get_context("spawn").Pool(1) as process:
                 rows.append(process.apply(run, (args, at_once, seed)))
             print(rows[-1], flush=True)
-            if args.out is not None:
-                told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
-                found = {**told, **asked, "runs": [asdict(row) for row in rows]}
-                args.out.write_text(json.dumps(found, indent=1) + "\n")
+            write_runs(args.out, asked, rows)
     print("| visits at once |" + "".join(f" seed {seed} |" for seed in args.seeds) + " mean |")
     print("| ---: " * (2 + len(args.seeds)) + "|")
     for at_once in args.visits:

@@ -11,10 +11,9 @@ Trains the same scene with windows of each side, by the torch rasterizer and for
 - milliseconds for each view drawn to train, layers left out.
 """
 
-import json
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -30,7 +29,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.machine import describe_machine, describe_versions
+from benchmarks.records import write_runs
 from benchmarks.visit import Capture, begin, read
 
 COUNTED = 10
@@ -160,11 +159,8 @@ def main(args: Args) -> None:
             f"| {row.side} | {row.seed} | {row.psnr:.2f} | {row.gap:.1f} | {row.frozen_share:.1%} "
             f"| {row.ms_per_view:.1f} | {row.gaussians:,} |"
         )
-    if args.out is not None:
-        told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
-        asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks}
-        found = {**told, **asked, "steps": args.steps, "runs": [asdict(row) for row in rows]}
-        args.out.write_text(json.dumps(found, indent=1) + "\n")
+    asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks}
+    write_runs(args.out, {**asked, "steps": args.steps}, rows)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ what each cost. Of a run with a budget of steps nobody can tell from its scene t
 """
 
 import copy
-import json
 import multiprocessing
 import os
 import platform
@@ -32,8 +31,8 @@ from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.lease import Lease
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded, WorkerLost, WorkersSeen
 from abcd_ns.lab.runs.evaluate import mean_psnr
-from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio.run import STATE
+from benchmarks.records import write_runs
 from tests.reference.crash_runs import digest
 
 
@@ -241,11 +240,7 @@ def main(args: Args) -> None:
             )
             if kills:
                 print(table_of_kills(row, rows[-2]))
-    if args.out is not None:
-        told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
-        asked = {**asdict(args), "data": args.data.name, "out": None}
-        found = {**told, "asked": asked, "runs": [asdict(row) for row in rows]}
-        args.out.write_text(json.dumps(found, indent=1) + "\n")
+    write_runs(args.out, {"asked": {**asdict(args), "data": args.data.name, "out": None}}, rows)
 
 
 def table_of_kills(row: Row, undisturbed: Row) -> str:

@@ -6,9 +6,8 @@ Trains on photos of one size, plainly and antialiased, and draws the held-out vi
 cameras: at twice the size pixels are half as large, as if the camera stood at half the distance.
 """
 
-import json
 import tempfile
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,7 +16,7 @@ import tyro
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.machine import describe_machine, describe_versions
+from benchmarks.records import write_runs
 from benchmarks.visit import Capture, begin, read
 
 
@@ -90,11 +89,8 @@ def main(args: Args) -> None:
             rows.append(row := run(captures, antialiased, seed, args))
             scores = "".join(f" {row.psnr[size]:.2f} |" for size in args.drawn)
             print(f"| {'yes' if antialiased else 'no'} | {seed} | {row.gaussians:,} |{scores}", flush=True)
-    if args.out is not None:
-        told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
-        asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks}
-        found = {**told, **asked, "steps": args.steps, "runs": [asdict(row) for row in rows]}
-        args.out.write_text(json.dumps(found, indent=1) + "\n")
+    asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks}
+    write_runs(args.out, {**asked, "steps": args.steps}, rows)
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ import torch
 
 from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
-from abcd_ns.engine.train.splitting import FULL
 from abcd_ns.errors import UserError
 
 GB = 2**30

@@ -23,12 +23,12 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.splitting import cut_at_rest
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
-from abcd_ns.engine.train.splitting import cut_at_rest
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View

@@ -11,9 +11,9 @@ from abcd_ns.cluster.lease import Finished, Lost, StepsSeen, WorkersError
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded, WorkerLost
 from abcd_ns.engine.store.settle import with_mail
-from abcd_ns.engine.train import pose_rounds
+from abcd_ns.engine.train.capture.light import Light
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.light import Light
+from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.cluster.conftest import in_process

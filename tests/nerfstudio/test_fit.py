@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
 from abcd_ns.engine.train.schedule import WARM_UP_BATCH
-from abcd_ns.engine.train.splitting import FULL
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import (
     FITTED,

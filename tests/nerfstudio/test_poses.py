@@ -7,7 +7,7 @@ import torch
 from nerfstudio.scripts.exporter import ExportCameraPoses
 from nerfstudio.utils.eval_utils import eval_setup
 
-from abcd_ns.engine.train import pose_rounds
+from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.nerfstudio.views import place_cameras, view_of, views_of
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HELD_OUT, VIEWS, write_scene

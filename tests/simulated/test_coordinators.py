@@ -10,8 +10,8 @@ from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
-from abcd_ns.engine.train import pose_rounds
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.peers.exact import ExactTrainer

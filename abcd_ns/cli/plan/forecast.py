@@ -23,8 +23,8 @@ GENERATIONS = 2
 FROZEN_BYTES = 2 << 30
 """RAM for blocks that were read, at most."""
 TIMED_STEPS = 3
-LAYER_SHARE = 0.35
-"""Time for layers by the time of steps: layers took 22 to 27% of the runs in docs/results, on a CPU."""
+LAYER_SHARE = 0.15
+"""Time for layers by the time of steps: they took 11 to 15% of runs on a CPU (docs/results, 2026-11-23)."""
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from abcd_ns.engine.train.capture.light import Kind as LightKind
+from abcd_ns.engine.train.capture.poses import Kind as PosesKind
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.light import Kind as LightKind
-from abcd_ns.engine.train.poses import Kind as PosesKind
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 

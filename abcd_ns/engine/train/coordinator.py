@@ -16,14 +16,14 @@ from abcd_ns.engine.space.influence import influence
 from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.settle import settle
 from abcd_ns.engine.store.special_blocks import LIVE, BlockName
+from abcd_ns.engine.train.density.splitting import cut_full
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
-from abcd_ns.engine.train.pose_rounds import PoseRounds
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.splitting import cut_full
 from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample
 from abcd_ns.engine.train.step.live_block import LiveBlock
+from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining

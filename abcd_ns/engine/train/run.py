@@ -11,11 +11,11 @@ from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.special_blocks import BlockName
+from abcd_ns.engine.train.capture.light import Light
+from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl, for_blocks
 from abcd_ns.engine.train.health.health import Health
-from abcd_ns.engine.train.light import Light
-from abcd_ns.engine.train.poses import Poses
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
 from abcd_ns.engine.types import View

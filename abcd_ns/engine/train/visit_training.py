@@ -8,8 +8,8 @@ from torch import Tensor
 from abcd_ns.engine.events import StepTaken, VisitBegan
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Pace
+from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST, gradients_of
 from abcd_ns.engine.train.layer_source import LayerSource
-from abcd_ns.engine.train.light import AMONG_OTHERS, LAST, gradients_of
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit

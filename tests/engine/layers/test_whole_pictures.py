@@ -11,7 +11,7 @@ from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scene import MemoryScene
-from abcd_ns.engine.train.poses import by_step, turned
+from abcd_ns.engine.train.capture.poses import by_step, turned
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 SCENE = random_gaussians(60, size=0.15, dtype=torch.float64)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.train.capture.light import Light, lit
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.light import Light, lit
 from abcd_ns.engine.train.step.workers.helper_process import can_fork
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import PARAM_NAMES

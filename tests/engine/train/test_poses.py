@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from abcd_ns.engine.events import VisitBegan
-from abcd_ns.engine.train import pose_rounds
+from abcd_ns.engine.train.capture.poses import laid_over, turned
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.poses import laid_over, turned
+from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import PARAM_NAMES
 from abcd_ns.errors import UserError

@@ -8,9 +8,9 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.density.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.schedule import VisitPlan
-from abcd_ns.engine.train.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
 

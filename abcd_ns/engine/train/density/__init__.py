@@ -1,1 +1,1 @@
-"""Density control: which Gaussians are added, moved and removed, within a budget."""
+"""Density control: Gaussians are added, moved and removed, within a budget; full blocks are cut in two."""

@@ -15,8 +15,8 @@ from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.train.capture.light import Uses, lit
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.light import Uses, lit
 from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, View

@@ -11,10 +11,10 @@ from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos, added
 from abcd_ns.engine.train.density.shedding import PASSES
+from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.splitting import is_full
 from abcd_ns.engine.train.step.workers.share import Contribution
 
 

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.train.capture.light import Uses, gradients_of
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.health.health_rules import share_of_picture
-from abcd_ns.engine.train.light import Uses, gradients_of
 from abcd_ns.engine.train.step.batch import Rendered, Sample
 from abcd_ns.engine.types import Gaussians
 

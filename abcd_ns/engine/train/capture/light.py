@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.train import per_view
+from abcd_ns.engine.train.capture import per_view
 
 Kind = Literal["none", "exposure", "affine"]
 Uses = Sequence[tuple[int, Tensor]]

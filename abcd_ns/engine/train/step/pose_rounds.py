@@ -8,8 +8,8 @@ from torch import Tensor
 
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.whole_pictures import WholePicture, WholePictures
-from abcd_ns.engine.train.light import lit
-from abcd_ns.engine.train.poses import by_step, robust, step_for
+from abcd_ns.engine.train.capture.light import lit
+from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.step.workers.share import Target

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from abcd_ns.engine.layers.whole_pictures import WholePicture
-from abcd_ns.engine.train import per_view
+from abcd_ns.engine.train.capture import per_view
 from abcd_ns.engine.types import View
 
 Kind = Literal["off", "SO3xR3"]
