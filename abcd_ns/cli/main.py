@@ -47,6 +47,7 @@ COMMANDS = (
         "show all about a training run on one HTML page",
     ),
     Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
+    Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as a mesh of triangles"),
     Command(
         "compare",
         "abcd_ns.lab.compare.command:compare",

@@ -15,7 +15,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import thin_out
-from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -44,7 +43,7 @@ from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import MadeFor, RunRequest, new_store, take_over
 from abcd_ns.nerfstudio.run.run_log import keep_log
-from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import BLOCKS_EACH, dispatcher_for
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
@@ -294,10 +293,10 @@ class AbcdPipeline(VanillaPipeline):
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""
-        views, points = views_of(self.datamanager.train_dataset.cameras), self.model.seed_points
-        known = torch.zeros(0, 3) if points is None else points[0].cpu()
-        self.model.near = self.config.near_plane or near_plane(known, views)
-        return [replace(view, near=self.model.near) for view in views]
+        points = None if self.model.seed_points is None else self.model.seed_points[0]
+        views = training_views(self.datamanager.train_dataset.cameras, points, self.config.near_plane)
+        self.model.near = views[0].near
+        return views
 
     def _open_store(self, asked: RunRequest, views: list[View]) -> tuple[ParameterStore, bool]:
         """The run's own store: a copy of the one it goes on from, or a new one."""

@@ -1,6 +1,7 @@
 """nerfstudio's cameras as the engine's views."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -8,6 +9,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError
+from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.types import View
 
 
@@ -42,3 +44,15 @@ def place_cameras(cameras: Cameras, poses: Mapping[int, Float[Tensor, "4 4"]]) -
 def views_of(cameras: Cameras) -> list[View]:
     """All cameras, each under its row as index."""
     return [view_of(cameras, row) for row in range(cameras.shape[0])]
+
+
+def training_views(cameras: Cameras, points: Float[Tensor, "n 3"] | None, near: float = 0.0) -> list[View]:
+    """All cameras, as a scene is trained with them.
+
+    Args:
+        points: what the capture knows of its scene.
+        near: from where on they see; 0 finds that by the points.
+    """
+    views = views_of(cameras)
+    near = near or near_plane(torch.zeros(0, 3) if points is None else points.cpu(), views)
+    return [replace(view, near=near) for view in views]

@@ -61,11 +61,11 @@ def export(
     Raises:
         UserError: there is no run, it has nothing to show yet, or `out` exists or cannot be written.
     """
-    _check(out, box)
+    check_request(out, box)
     suffix = suffix_of(out, ".ply" if by_block else None)
-    to = _to_data(run) if frame == "data" else None
+    to = to_data(run) if frame == "data" else None
     try:
-        with _open(run / STATE / STORE) as store:
+        with open_store(run / STATE / STORE) as store:
             scene = Shown(store, to, box)
             counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
             if not sum(counts.values()):
@@ -81,7 +81,8 @@ def export(
     return 0
 
 
-def _check(out: Path, box: Box | None) -> None:
+def check_request(out: Path, box: Box | None) -> None:
+    """Raises UserError where `out` cannot be made, or `box` holds nothing."""
     if out.exists():
         raise UserError(f"--out {out} exists already; choose another name.")
     if not out.absolute().parent.is_dir():
@@ -90,8 +91,12 @@ def _check(out: Path, box: Box | None) -> None:
         raise UserError("--box needs X0 < X1, Y0 < Y1 and Z0 < Z1.")
 
 
-def _to_data(run: Path) -> Frame:
-    """From the run's frame back to that of the data."""
+def to_data(run: Path) -> Frame:
+    """From the run's frame back to that of the data.
+
+    Raises:
+        UserError: the file that tells is not there, or is none.
+    """
     path = run / TRANSFORMS
     try:
         found = json.loads(path.read_text())
@@ -105,7 +110,8 @@ def _to_data(run: Path) -> Frame:
         raise UserError(f"{path} cannot be read ({error}); use --frame nerfstudio.") from None
 
 
-def _open(folder: Path) -> ParameterStore:
+def open_store(folder: Path) -> ParameterStore:
+    """The blocks of a run, to be read; UserError where there is none."""
     if not folder.is_dir():
         raise UserError(f"There is no run of ABCD in {folder.parent.parent}: it has no {folder}.")
     return ParameterStore.open(folder, read_only=True)
@@ -153,7 +159,17 @@ def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffi
     size, count = sum(path.stat().st_size for path in written), sum(counts.values())
     where = written[0] if len(written) == 1 else f"{written[0].parent} ({len(written)} files)"
     print(f"{where}: {count:,} Gaussians, {size / 2**20:.1f} MiB, {size / count:.0f} bytes each")
-    off = rounding(suffix, scene.largest)
-    if off > LOST_DIGITS * scene.size:
+    tell_rounding(suffix, scene.largest, scene.size)
+
+
+def tell_rounding(suffix: str, largest: float, size: float) -> None:
+    """Say by how much positions are off, where it is worth a word.
+
+    Args:
+        largest: of all coordinates.
+        size: of the scene.
+    """
+    off = rounding(suffix, largest)
+    if off > LOST_DIGITS * size:
         remedy = "; .sog and .ply are finer." if suffix == ".spz" else FAR_AWAY
-        print(f"{suffix} rounds positions to {off:.1g}, {off / scene.size:.1g} of the scene's size{remedy}")
+        print(f"{suffix} rounds positions to {off:.1g}, {off / size:.1g} of the scene's size{remedy}")

@@ -24,7 +24,7 @@ from abcd_ns.lab.runs.configs import registered
 from abcd_ns.lab.runs.options import set_options
 from abcd_ns.nerfstudio.datamanager import OUR_READER, READERS
 from abcd_ns.nerfstudio.options import mirror
-from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Plain, Settings
@@ -85,10 +85,15 @@ def open_run(path: Path) -> RunFolder:
     Raises:
         UserError: something in the folder is missing, damaged or of another version.
     """
-    settings = read_record(path / "abcd" / SETTINGS_FILE, Settings, SCHEMA)
+    settings = read_settings(path)
     story = read_story(path / "abcd" / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
     return RunFolder(path, settings, story, checkpoint, *_read_store(path / "abcd" / STORE, checkpoint))
+
+
+def read_settings(path: Path) -> Settings:
+    """What a run was trained with; UserError where that cannot be read."""
+    return read_record(path / "abcd" / SETTINGS_FILE, Settings, SCHEMA)
 
 
 def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPipeline:
@@ -102,22 +107,34 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPip
         UserError: the data is gone, an option leads out of it, or the run's options or checkpoint do not fit
             this version.
     """
-    versions, config = run.settings.versions, _registered(run.settings.method, run.settings.reader)
-    wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
-    where = f"{run.path / 'abcd' / SETTINGS_FILE} (written by {wrote})"
-    prefix = "pipeline."
-    options = {n: v for n, v in run.settings.options.items() if n.startswith(prefix)}
-    set_options(config.pipeline, {n.removeprefix(prefix): v for n, v in options.items()}, where)
-    _check_paths(options, data, where)
-    config.pipeline.datamanager.data = data
+    config = pipeline_config(run.path, run.settings, data)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    pipeline = config.pipeline.setup(device=device, test_mode="test")
+    pipeline = config.setup(device=device, test_mode="test")
     pipeline.eval()
     try:
         pipeline.load_pipeline(checkpoint.pipeline, checkpoint.step - 1)
     except (KeyError, RuntimeError) as error:
+        where = _settings_file(run.path, run.settings)
         raise UserError(f"{checkpoint.path} does not fit the options in {where}: {error}.") from None
     return pipeline
+
+
+def pipeline_config(run: Path, settings: Settings, data: Path) -> AbcdPipelineConfig:
+    """The options that a run was trained with, for the photos in `data`; see `load_pipeline`."""
+    config, where = _registered(settings.method, settings.reader).pipeline, _settings_file(run, settings)
+    prefix = "pipeline."
+    options = {n: v for n, v in settings.options.items() if n.startswith(prefix)}
+    set_options(config, {n.removeprefix(prefix): v for n, v in options.items()}, where)
+    _check_paths(options, data, where)
+    config.datamanager.data = data
+    return config
+
+
+def _settings_file(run: Path, settings: Settings) -> str:
+    """In words."""
+    versions = settings.versions
+    wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
+    return f"{run / 'abcd' / SETTINGS_FILE} (written by {wrote})"
 
 
 def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:

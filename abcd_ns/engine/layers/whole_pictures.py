@@ -7,7 +7,7 @@ gets from each unit is added up. Layers are cut where the rays of the given pose
 fragment that moves over a border is the same in either layer, so that the gradient has no part of it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -70,6 +70,13 @@ class WholePictures:
             room -= needed
         return groups
 
+    @torch.no_grad()
+    def draw(self, views: Sequence[View]) -> Iterator[WholePicture]:
+        """What each view sees, in order; the scene is read once for each of `groups`."""
+        for group in self.groups(views):
+            for view, own in zip(group, self._draw(group), strict=True):
+                yield self._picture(view, self._in_order(view, own))
+
     def differentiate(
         self, views: Sequence[View], gradient: Callable[[View, WholePicture], Float[Tensor, "h w 3"]]
     ) -> list[Float[Tensor, "4 4"]]:
@@ -82,8 +89,7 @@ class WholePictures:
         parts = self._draw(leaves)
         pulls = []
         for view, own in zip(leaves, parts, strict=True):
-            order = self._painter.order([part.unit for part in own], still(view))
-            own.sort(key=lambda part: order.index(part.unit))
+            own[:] = self._in_order(view, own)
             pulls.append(gradient(view, self._picture(view, own)))
         for unit in self._units:
             loaded = self._load(unit, leaves) if len(self._units) > 1 else None
@@ -121,6 +127,10 @@ class WholePictures:
             sh_degree=self._settings.sh_degree,
             antialiased=self._settings.antialiased,
         )[0]
+
+    def _in_order(self, view: View, parts: Sequence[_Part]) -> list[_Part]:
+        order = self._painter.order([part.unit for part in parts], still(view))
+        return sorted(parts, key=lambda part: order.index(part.unit))
 
     def _picture(self, view: View, parts: Sequence[_Part]) -> WholePicture:
         device, dtype = self._painter.device, view.viewmat.dtype

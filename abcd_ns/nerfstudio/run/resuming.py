@@ -71,16 +71,22 @@ class MadeFor:
         Raises:
             UserError: it was not; both are shown.
         """
-        theirs, mine = store.header.get(MADE_FOR), _plain(self)
-        if theirs is None:  # made before this was written down
-            return
-        different = [name for name in mine if not _agree(theirs.get(name), mine[name])]
+        different = self.differences(store)
         if different:
-            pairs = (f"{name.replace('_', ' ')} {theirs.get(name)}, not {mine[name]}" for name in different)
             raise UserError(
-                f"{store.folder} cannot be gone on with: it was made for {'; '.join(pairs)}. Give the same "
+                f"{store.folder} cannot be gone on with: it was made for {different}. Give the same "
                 "data and options as before, or leave out --load-dir."
             )
+
+    def differences(self, store: ParameterStore) -> str:
+        """What `store` was made for that is otherwise here, in words; empty where nothing is."""
+        theirs, mine = store.header.get(MADE_FOR), _plain(self)
+        if theirs is None:  # made before this was written down
+            return ""
+        different = [name for name in mine if not _agree(theirs.get(name), mine[name])]
+        return "; ".join(
+            f"{name.replace('_', ' ')} {theirs.get(name)}, not {mine[name]}" for name in different
+        )
 
     def header(self) -> dict[str, Any]:
         """The entry of a new store's header."""

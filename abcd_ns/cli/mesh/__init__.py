@@ -1,0 +1,1 @@
+"""`abcd mesh`: the surface of a trained scene, from the depths that its training views see."""

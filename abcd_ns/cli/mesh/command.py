@@ -1,0 +1,190 @@
+"""`abcd mesh`: a trained scene's surface as a mesh of triangles."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+
+from abcd_ns.cli.export.command import check_request, open_store, tell_rounding, to_data
+from abcd_ns.cli.export.formats import GENERATOR
+from abcd_ns.cli.export.shown import Box, trained_state
+from abcd_ns.cli.mesh.depth_maps import draw
+from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
+from abcd_ns.cli.report.run_folder import find_run, pipeline_config, read_settings
+from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.whole_pictures import WholePictures
+from abcd_ns.engine.render import make_rasterizer
+from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.store import ParameterStore, StoreError
+from abcd_ns.engine.store.scene import StoredScene
+from abcd_ns.engine.train.capture.poses import Poses
+from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
+from abcd_ns.engine.types import View
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.fit import FREE_SHARE, ram_budget, share_out
+from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
+from abcd_ns.nerfstudio.run import STATE, STORE
+from abcd_ns.nerfstudio.run.resuming import MadeFor
+from abcd_ns.nerfstudio.views import training_views
+from abcd_ns.progress_bar import ProgressBar
+
+VOXEL_PIXELS = 2.0
+"""The side of a voxel by default, in pixels as wide as most are where they meet the surface."""
+STAY = Frame(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), 1.0)
+MANY = 0.01
+"""Share of the pixels that may be left out without a word."""
+
+
+def mesh(
+    run: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    data: Annotated[Path, tyro.conf.arg(metavar="DIR")],
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")],
+    voxel: Annotated[float | None, tyro.conf.arg(metavar="SIDE", help_behavior_hint="")] = None,
+    box: Annotated[Box | None, tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="")] = None,
+    frame: Literal["data", "nerfstudio"] = "data",
+) -> int:
+    """Write a trained scene's surface as a mesh: a .ply of triangles with a colour at each corner.
+
+    abcd mesh outputs/garden/abcd/TIME --data garden --out garden.ply
+
+    Draws the depth of every training view from the blocks at rest, and fuses them on a grid of voxels, one
+    part of space after the other: RAM holds a part, and the mesh.
+
+    Args:
+        run: A run's folder, outputs/SCENE/METHOD/TIME.
+        data: The run's photos, as given to `ns-train`: cameras are read from there.
+        out: A new file that ends in .ply. While it is made, 7 bytes for each pixel of all training views lie
+            beside it.
+        voxel: Side of the voxels, in the units of `frame`: smaller ones show more, noise too. Left out, twice
+            what a pixel covers where it meets the surface, the median.
+        box: Only what lies in this box, in the coordinates of `frame`.
+        frame: "data" is that of the photos' poses, as COLMAP or transforms.json have them, with its scale;
+            "nerfstudio" is that of the run, its viewer and `ns-export`.
+
+    Raises:
+        UserError: there is no run, it has nothing to show yet, the data is not the run's, there is no
+            surface, or `out` exists or cannot be written.
+    """
+    _check(out, voxel, box)
+    run = find_run(run)
+    to = to_data(run) if frame == "data" else STAY
+    wanted = Wanted(out, voxel and voxel / to.scale, box, to)
+    try:
+        with open_store(run / STATE / STORE) as store:
+            pictures, views = _pictures(store, pipeline_config(run, read_settings(run), data))
+            fused, side = _surface(pictures, views, wanted)
+        partial = out.with_name(out.name + ".part")
+        try:
+            write_ply(partial, fused, GENERATOR)
+            partial.replace(out)
+        finally:
+            partial.unlink(missing_ok=True)
+    except StoreError as error:
+        raise UserError(f"{error} If the run is training, wait until it has ended.") from None
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
+    size, (vertices, faces) = out.stat().st_size / 2**20, (len(fused.vertices), len(fused.faces))
+    print(f"{out}: {vertices:,} vertices, {faces:,} faces, {size:.1f} MiB, voxels of {side:.3g}")
+    tell_rounding(".ply", float(np.abs(fused.vertices).max()), float(np.ptp(fused.vertices, axis=0).max()))
+    return 0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What `mesh` is asked for."""
+
+    out: Path
+    voxel: float | None
+    """World units of the run."""
+    box: Box | None
+    to: Frame
+
+    def within(self, piece: Piece) -> Piece:
+        """The faces whose middles are in the box."""
+        if self.box is None:
+            return piece
+        middles = self.to.points(torch.from_numpy(piece.vertices[piece.faces].mean(axis=1, dtype=np.float64)))
+        low, high = middles.new_tensor(self.box[:3]), middles.new_tensor(self.box[3:])
+        return with_faces(piece, ((middles >= low) & (middles < high)).all(dim=1).numpy())
+
+
+def _check(out: Path, voxel: float | None, box: Box | None) -> None:
+    check_request(out, box)
+    if out.suffix.lower() != ".ply":
+        raise UserError(f"--out {out} must end in .ply.")
+    if voxel is not None and not 0 < voxel < float("inf"):
+        raise UserError(f"--voxel is {voxel}; it must be above 0.")
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError) as error:
+        raise UserError(
+            f"open3d, which fuses the depths, is not there ({error}); see `abcd doctor`."
+        ) from None
+
+
+def _surface(pictures: WholePictures, views: list[View], wanted: Wanted) -> tuple[Piece, float]:
+    """The mesh in the frame that is asked for, and the side of its voxels there."""
+    from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
+
+    with tempfile.TemporaryDirectory(prefix=".abcd-mesh-", dir=wanted.out.absolute().parent) as folder:
+        with _bar("drawing", len(views)) as advance:
+            maps = draw(pictures, views, Path(folder), advance)
+        footprints = maps.footprints()
+        if not len(footprints):
+            raise UserError("There is no surface: what the training views show is too transparent.")
+        side = wanted.voxel or VOXEL_PIXELS * float(np.median(footprints))
+        fusion = Fusion(maps, side)
+        with _bar("looking for surfaces", len(views)) as advance:
+            fusion.find_boxes(advance)
+        with _bar("fusing", fusion.parts * len(views)) as advance:
+            welded = weld([wanted.within(piece) for piece in fusion.pieces(advance)])
+    if (far := float((footprints > FAR * side).mean())) > MANY:
+        print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
+    if not len(welded.faces):
+        raise UserError("There is no surface" + (" in this box." if wanted.box else " that three views see."))
+    found = without_specks(welded)
+    vertices = wanted.to.points(torch.from_numpy(found.vertices)).numpy()
+    return replace(found, vertices=vertices), side * wanted.to.scale
+
+
+def _pictures(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[WholePictures, list[View]]:
+    """What draws the scene, and its training views, where their poses were refined to."""
+    state = trained_state(store)
+    mirror(config.training, config.model)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    capture = config.datamanager.setup(device=device, test_mode="test").train_dataset
+    views = training_views(capture.cameras, capture.metadata.get("points3D_xyz"), config.near_plane)
+    if different := MadeFor.of(capture.image_filenames, views, config.training).differences(store):
+        raise UserError(f"--data {config.datamanager.data} is not what the run was made for: {different}.")
+    poses = Poses(views)
+    poses.restore(state.poses)
+    views = [replace(view, viewmat=poses.of(view.index)) for view in views]
+    ram = share_out(ram_budget(config.ram_budget_gb))
+    scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, ram.blocks)
+    room = int(FREE_SHARE * free_bytes(device)) // drawing_bytes(config.training.sh_degree)
+    painter = Painter(
+        scene,
+        views,
+        make_rasterizer(config.model.rasterizer, device),
+        ownership="fragments",
+        pass_gaussians=min(default_pass(scene), room),
+        device=device,
+    )
+    settings = PaintSettings(config.training.sh_degree, config.training.antialiased)
+    return WholePictures(painter, settings), views
+
+
+@contextmanager
+def _bar(what: str, total: int) -> Iterator[Callable[[], None]]:
+    with ProgressBar(what, total) as bar:
+        yield bar.advance

@@ -1,0 +1,71 @@
+"""What each training view sees of a scene, depth and colour, drawn once and kept on disk."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.layers.whole_pictures import WholePicture, WholePictures
+from abcd_ns.engine.types import View
+
+LEAST_OPACITY = 0.5
+"""Of a pixel whose depth counts."""
+SAMPLES = 1000
+"""Pixels of a view by which footprints are known."""
+
+
+def depth_of(picture: WholePicture) -> Float[Tensor, "h w"]:
+    """Camera z of what each pixel shows, world units: the expected one. 0 where it shows too little."""
+    opacity = 1 - picture.transmittance
+    return torch.where(opacity >= LEAST_OPACITY, picture.depth / opacity.clamp_min(1e-6), 0.0)
+
+
+@dataclass
+class DepthMaps:
+    """Of some views, in files of `folder`: 7 bytes a pixel."""
+
+    folder: Path
+    views: list[View] = field(default_factory=list)
+
+    def add(self, view: View, picture: WholePicture) -> None:
+        """Keep what a view sees."""
+        color = picture.color / (1 - picture.transmittance).clamp_min(LEAST_OPACITY)[..., None]
+        number = len(self.views)
+        np.save(self._file("depth", number), depth_of(picture).float().cpu().numpy())
+        np.save(self._file("color", number), (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+        self.views.append(view)
+
+    def depth(self, number: int) -> np.ndarray:
+        """float32 [h, w] of the view at this place of `views`."""
+        return np.load(self._file("depth", number))
+
+    def color(self, number: int) -> np.ndarray:
+        """uint8 [h, w, 3]."""
+        return np.load(self._file("color", number))
+
+    def footprints(self) -> np.ndarray:
+        """How wide a pixel is where it meets the surface, world units, of a sample of all pixels."""
+        found = [np.zeros(0, np.float32)]
+        for number, view in enumerate(self.views):
+            depth = self.depth(number).ravel()
+            depth = depth[:: -(-len(depth) // SAMPLES)]
+            found.append(depth[depth > 0] / float(view.K[0, 0]))
+        return np.concatenate(found)
+
+    def _file(self, what: str, number: int) -> Path:
+        return self.folder / f"{what}-{number:06d}.npy"
+
+
+def draw(
+    pictures: WholePictures, views: Sequence[View], folder: Path, advance: Callable[[], None]
+) -> DepthMaps:
+    """Draw the views, as many at a time as there is room for, into files of `folder`."""
+    maps = DepthMaps(folder)
+    for view, picture in zip(views, pictures.draw(views), strict=True):
+        maps.add(view, picture)
+        advance()
+    return maps

@@ -1,0 +1,129 @@
+"""Depth maps to a surface: a truncated signed distance function on sparse voxels, one part of space at once.
+
+Voxels come in boxes of BOX^3, and only boxes that a surface passes are there. The boxes are parted by a k-d
+tree, and a part is fused with the boxes around it. A voxel's value depends on the views alone, so that it is
+the same in each part that has it, and so are the vertices between voxels. Each face is kept by the one part
+whose box it begins in: together the parts are, bit for bit, the surface that is fused at once.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import open3d
+import torch
+from jaxtyping import Float64
+from open3d import core
+from torch import Tensor
+
+from abcd_ns.cli.mesh.depth_maps import DepthMaps
+from abcd_ns.cli.mesh.surface import Piece
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.types import View
+
+BOX = 16
+"""Side of a box, voxels."""
+PART_BOXES = 4096
+"""Boxes of a part, those around it left out: 0.3 GB, and 0.3 GB more while open3d finds the vertices."""
+TRUNCATION = 8.0
+"""How far from what a view sees it has a say, voxels; open3d's own. Views that disagree by more than twice
+that leave a hole."""
+LEAST_VIEWS = 3
+"""That must see a place for it to be a part of the surface."""
+STRIDE = 4
+"""open3d looks at every fourth pixel, each way, to see where boxes are needed."""
+FAR = BOX / STRIDE
+"""Voxels that a pixel may cover: with more, boxes would be missed."""
+
+
+class Fusion:
+    """Fuses depth maps.
+
+    Args:
+        voxel: their side, world units.
+        part_boxes: most boxes of a part.
+    """
+
+    def __init__(self, maps: DepthMaps, voxel: float, part_boxes: int = PART_BOXES) -> None:
+        self._maps, self._voxel, self._part_boxes = maps, voxel, part_boxes
+        self._seen, self._boxes = list[np.ndarray](), np.zeros((0, 3), np.int32)
+        self.most_boxes = 0
+        """In RAM at the same time, so far."""
+
+        self._tree = build_kd(torch.zeros(0, 3), 1)
+
+    @property
+    def parts(self) -> int:
+        """In how many parts space is fused."""
+        return self._tree.num_blocks
+
+    def find_boxes(self, advance: Callable[[], None]) -> None:
+        """Find the boxes in which views see a surface, and part them; the first thing to do."""
+        grid = self._grid(1)
+        for number, view in enumerate(self._maps.views):
+            depth, found = self._maps.depth(number), np.zeros((0, 3), np.int32)
+            sampled = depth[::STRIDE, ::STRIDE]
+            if ((sampled > 0) & (sampled < self._farthest(view))).any():
+                boxes = grid.compute_unique_block_coordinates(_image(depth), *self._optics(view))
+                found = np.unique(boxes.numpy(), axis=0)
+            self._seen.append(found)
+            advance()
+        self._boxes = np.unique(np.concatenate([np.zeros((0, 3), np.int32), *self._seen]), axis=0)
+        parts = max(1, -(-len(self._boxes) // self._part_boxes))
+        self._tree = build_kd(self._centers(self._boxes), parts)
+
+    def pieces(self, advance: Callable[[], None]) -> Iterator[Piece]:
+        """The surface, part by part; `advance` is called for each view of each part."""
+        for part in range(self.parts):
+            # A quarter of a box more, so that no rounding leaves out a neighbour.
+            around = self._tree.cell(part).grown(1.25 * BOX * self._voxel)
+            count = int(around.contains(self._centers(self._boxes)).sum())
+            grid = self._grid(max(count, 1))
+            self.most_boxes = max(self.most_boxes, count)
+            for number, view in enumerate(self._maps.views):
+                boxes = self._seen[number][around.contains(self._centers(self._seen[number])).numpy()]
+                if len(boxes):
+                    self._integrate(grid, number, view, boxes)
+                advance()
+            if count:
+                yield self._own(part, grid.extract_triangle_mesh(LEAST_VIEWS - 0.5))
+
+    def _integrate(self, grid: Any, number: int, view: View, boxes: np.ndarray) -> None:
+        color = self._maps.color(number).astype(np.float32) / 255
+        intrinsic, *others = self._optics(view)
+        images = _image(self._maps.depth(number)), _image(color)
+        grid.integrate(core.Tensor(boxes), *images, intrinsic, intrinsic, *others)
+
+    def _own(self, part: int, mesh: Any) -> Piece:
+        """The faces that begin in a box of the part, with their vertices."""
+        vertices, faces = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int64)
+        middles = vertices[faces].mean(axis=1, dtype=np.float64)
+        boxes = np.floor(np.floor(middles / self._voxel) / BOX)
+        faces = faces[(self._tree.assign(self._centers(boxes)) == part).numpy()]
+        used, faces = np.unique(faces, return_inverse=True)
+        return Piece(vertices[used], mesh.vertex.colors.numpy()[used], faces.reshape(-1, 3))
+
+    def _centers(self, boxes: np.ndarray) -> Float64[Tensor, "n 3"]:
+        return torch.from_numpy((boxes.astype(np.float64) + 0.5) * (BOX * self._voxel))
+
+    def _farthest(self, view: View) -> float:
+        return FAR * self._voxel * float(view.K[0, 0])
+
+    def _optics(self, view: View) -> tuple[Any, Any, float, float, float]:
+        """Intrinsics, extrinsics, what a unit of depth is, the largest that counts, and the truncation."""
+        matrices = (core.Tensor(matrix.double().cpu().numpy()) for matrix in (view.K, view.viewmat))
+        return *matrices, 1.0, self._farthest(view), TRUNCATION
+
+    def _grid(self, boxes: int) -> Any:
+        return open3d.t.geometry.VoxelBlockGrid(
+            attr_names=("tsdf", "weight", "color"),
+            attr_dtypes=(core.float32,) * 3,
+            attr_channels=((1), (1), (3)),
+            voxel_size=self._voxel,
+            block_resolution=BOX,
+            block_count=boxes,
+        )
+
+
+def _image(values: np.ndarray) -> Any:
+    return open3d.t.geometry.Image(core.Tensor(values))
