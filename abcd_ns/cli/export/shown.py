@@ -21,19 +21,14 @@ Box = tuple[float, float, float, float, float, float]
 """x, y and z of its lower and then of its upper corner."""
 
 
-def trained_state(store: ParameterStore) -> RunState:
-    """Where a run stands whose blocks can be shown.
-
-    Raises:
-        UserError: there are none yet.
-    """
+def check_trained(store: ParameterStore) -> None:
+    """Raises UserError where no block of a run can be shown yet."""
     state = RunState.from_json(store.state) if store.state else None
     if state is None or (state.active is not None and state.active.is_whole):
         raise UserError(
             f"{store.folder}: no block has been trained yet. Wait until the warm-up is over, or use "
             "`ns-export gaussian-splat` on a checkpoint."
         )
-    return state
 
 
 @dataclass
@@ -50,7 +45,7 @@ class Shown:
     box: Box | None
 
     def __post_init__(self) -> None:
-        trained_state(self.store)
+        check_trained(self.store)
         self._tree = BlockTree.from_json(self.store.header["tree"])
         self.blocks = range(self._tree.num_blocks)
         self.largest, self.size = 0.0, 0.0

@@ -13,7 +13,7 @@ import tyro
 
 from abcd_ns.cli.export.command import check_request, open_store, tell_rounding, to_data
 from abcd_ns.cli.export.formats import GENERATOR
-from abcd_ns.cli.export.shown import Box, trained_state
+from abcd_ns.cli.export.shown import Box, check_trained
 from abcd_ns.cli.mesh.depth_maps import draw
 from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
 from abcd_ns.cli.report.run_folder import find_run, pipeline_config, read_settings
@@ -24,7 +24,6 @@ from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -158,17 +157,15 @@ def _surface(pictures: WholePictures, views: list[View], wanted: Wanted) -> tupl
 
 
 def _pictures(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[WholePictures, list[View]]:
-    """What draws the scene, and its training views, where their poses were refined to."""
-    state = trained_state(store)
+    """What draws the scene, and its training views. Where these were refined is of no account: the depth
+    that they see is the scene's, wherever they stand."""
+    check_trained(store)
     mirror(config.training, config.model)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     capture = config.datamanager.setup(device=device, test_mode="test").train_dataset
     views = training_views(capture.cameras, capture.metadata.get("points3D_xyz"), config.near_plane)
     if different := MadeFor.of(capture.image_filenames, views, config.training).differences(store):
         raise UserError(f"--data {config.datamanager.data} is not what the run was made for: {different}.")
-    poses = Poses(views)
-    poses.restore(state.poses)
-    views = [replace(view, viewmat=poses.of(view.index)) for view in views]
     ram = share_out(ram_budget(config.ram_budget_gb))
     scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, ram.blocks)
     room = int(FREE_SHARE * free_bytes(device)) // drawing_bytes(config.training.sh_degree)

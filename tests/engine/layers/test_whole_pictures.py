@@ -54,6 +54,15 @@ def test_the_gradient_of_a_pose_is_that_of_the_merged_picture(pass_gaussians):
         assert float(expected.abs().min()) > 0.1
 
 
+@pytest.mark.parametrize("pass_gaussians", [0, 1000])
+def test_pictures_are_those_of_all_at_once(pass_gaussians):
+    drawn = list(whole_pictures_of(pass_gaussians).draw(VIEWS))
+    for view, picture in zip(VIEWS, drawn, strict=True):
+        merged = TorchRasterizer()(SCENE, view, sh_degree=1)
+        for name in ("color", "transmittance", "depth"):
+            assert torch.allclose(getattr(picture, name), getattr(merged, name), atol=1e-3), name
+
+
 def test_views_are_drawn_together_as_far_as_their_layers_have_room(monkeypatch):
     pictures = whole_pictures_of(0)
     assert [len(group) for group in pictures.groups(VIEWS)] == [3]

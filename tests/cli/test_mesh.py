@@ -1,0 +1,225 @@
+"""`abcd mesh`: the surface of a scene whose surface is known, with no seam between the parts of space."""
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+from torch import Tensor
+
+from abcd_ns.cli import main as cli
+from abcd_ns.cli.export.command import TRANSFORMS
+from abcd_ns.cli.mesh.command import mesh
+from abcd_ns.cli.mesh.depth_maps import DepthMaps, draw
+from abcd_ns.cli.mesh.fusion import Fusion
+from abcd_ns.cli.mesh.surface import Piece, weld, without_specks
+from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.whole_pictures import WholePictures
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.store import ParameterStore
+from abcd_ns.engine.store.scaffold import blocks_at_rest
+from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.run.resuming import MadeFor
+from abcd_ns.nerfstudio.run.settings import write_settings
+from tests.nerfstudio.test_training import configure
+from tests.reference.colmap_scene import LEFT, RIGHT, write_scene
+from tests.reference.scenes import ring_of_views
+
+VOXEL = 0.03
+
+
+def surface_of(means: Tensor, size: float, colors: Tensor) -> Gaussians:
+    """Opaque balls on a surface."""
+    count = len(means)
+    return Gaussians(
+        means=means.float(),
+        scales=torch.full((count, 3), math.log(size)),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4).clone(),
+        features_dc=(colors.float() - 0.5) / SH_C0,
+        features_rest=torch.zeros(count, 15, 3),
+        opacities=torch.full((count, 1), 6.0),
+    )
+
+
+def sphere(count: int = 20_000) -> Gaussians:
+    """Of radius 1, red above z = 0 and blue below: points along a spiral."""
+    z = 1 - 2 * (torch.arange(count) + 0.5) / count
+    angle = torch.arange(count) * math.pi * (3 - math.sqrt(5))
+    across = (1 - z.square()).sqrt()
+    colors = torch.where(z[:, None] > 0, torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, 1.0]))
+    return surface_of(torch.stack((across * angle.cos(), across * angle.sin(), z), dim=1), 0.015, colors)
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory) -> DepthMaps:
+    """The sphere from around it, drawn from two blocks, one after the other."""
+    scene, views = sphere(), ring_of_views(8, width=96, height=72)
+    parted = MemoryScene(build_kd(scene.means, 2), scene)
+    painter = Painter(parted, views, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
+    assert len(painter.units()) == 2
+    pictures = WholePictures(painter, PaintSettings(sh_degree=3))
+    return draw(pictures, views, tmp_path_factory.mktemp("maps"), lambda: None)
+
+
+def fused(maps: DepthMaps, part_boxes: int) -> tuple[Fusion, Piece]:
+    fusion = Fusion(maps, VOXEL, part_boxes)
+    fusion.find_boxes(lambda: None)
+    return fusion, weld(list(fusion.pieces(lambda: None)))
+
+
+def triangles(surface: Piece) -> np.ndarray:
+    """Float32 [m, 9], the faces in an order that is theirs alone."""
+    corners = surface.vertices[surface.faces].reshape(-1, 9)
+    return corners[np.lexsort(corners.T)]
+
+
+def test_a_sphere_is_found_where_it_is_and_in_its_colours(maps):
+    _, surface = fused(maps, 4096)
+    off = np.linalg.norm(surface.vertices, axis=1) - 1
+    # The balls are half a voxel thick; views that graze the sphere see it a little before it is there.
+    assert np.abs(off).mean() < 1.5 * VOXEL
+    assert np.abs(off).max() < 4 * VOXEL
+    above, below = (surface.colors[sign * surface.vertices[:, 2] > 0.1] for sign in (1, -1))
+    assert np.abs(above - [1, 0, 0]).mean() < 0.05
+    assert np.abs(below - [0, 0, 1]).mean() < 0.05
+
+
+def test_parts_make_the_same_surface_bit_for_bit_and_a_part_at_a_time_is_in_ram(maps):
+    whole, at_once = fused(maps, 4096)
+    parted, welded = fused(maps, 8)
+    assert whole.parts == 1
+    assert parted.parts > 4
+    assert np.array_equal(triangles(at_once), triangles(welded))
+    assert len(at_once.vertices) == len(welded.vertices)
+    # A part, and what is around it.
+    assert parted.most_boxes < whole.most_boxes / 2
+    edges = np.sort(welded.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() == 2
+
+
+def test_what_is_transparent_or_far_away_leaves_no_surface(maps, tmp_path):
+    far = Fusion(maps, VOXEL / 100)
+    far.find_boxes(lambda: None)
+    assert list(far.pieces(lambda: None)) == []
+    scene, views = sphere(), maps.views[:2]
+    scene.opacities[:] = -5.0
+    painter = Painter(
+        MemoryScene(build_kd(scene.means, 1), scene),
+        views,
+        TorchRasterizer(),
+        ownership="fragments",
+        pass_gaussians=0,
+    )
+    faint = draw(WholePictures(painter, PaintSettings(sh_degree=3)), views, tmp_path, lambda: None)
+    assert not len(faint.footprints())
+
+
+def test_specks_are_left_out():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    grid = [
+        Piece(corners + np.array([k, 0, 0], np.float32), corners, np.array([[0, 1, 2]])) for k in range(2000)
+    ]
+    speck = Piece(corners + np.float32(5000), corners, np.array([[0, 1, 2]]))
+    assert len(without_specks(weld([*grid, speck])).faces) == 2000
+
+
+# -- the command -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    return write_run(tmp_path_factory.mktemp("place"))
+
+
+def write_run(place: Path, **header: Any) -> Path:
+    """A run's folder, as far as meshes go, beside its data: the wall of the photos, at z = 0 in the data's
+    frame."""
+    config, folder = configure(write_scene(place / "wall"), place / "out"), place / "run"
+    (folder / "abcd").mkdir(parents=True)
+    write_settings(config, folder / "abcd")
+    outputs = config.pipeline.datamanager.reader().setup().get_dataparser_outputs("train")
+    outputs.save_dataparser_transform(folder / TRANSFORMS)
+    known = json.loads((folder / TRANSFORMS).read_text())
+    matrix = torch.tensor(known["transform"], dtype=torch.float64)
+    x, y = torch.meshgrid(torch.arange(-3, 3, 0.08), torch.arange(-2, 2, 0.08), indexing="xy")
+    means = torch.stack((x.flatten(), y.flatten(), torch.zeros(x.numel())), dim=1)
+    colors = torch.where(means[:, :1] > 0, torch.tensor(RIGHT) / 255, torch.tensor(LEFT) / 255)
+    wall = Frame(matrix[:, :3], matrix[:, 3], known["scale"]).gaussians(surface_of(means, 0.05, colors))
+    tree = build_kd(wall.means, 2)
+    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json(), **header}) as store:
+        store.commit(blocks_at_rest(tree, wall), state=RunState().to_json())
+    return folder
+
+
+def photos_of(run: Path) -> Path:
+    return run.parent / "wall"
+
+
+def read(path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    found = PlyData.read(str(path))
+    vertices = found["vertex"].data
+    position, color = (
+        np.stack([vertices[name] for name in names], axis=1) for names in ("xyz", ("red", "green", "blue"))
+    )
+    return position, color, np.stack(found["face"].data["vertex_indices"])
+
+
+def test_the_wall_is_in_the_datas_frame_and_another_reader_finds_it(run, tmp_path, capsys):
+    assert mesh(run, data=photos_of(run), out=tmp_path / "wall.ply") == 0
+    position, color, faces = read(tmp_path / "wall.ply")
+    assert np.abs(position[:, 2]).max() < 0.1
+    assert np.ptp(position[:, 0]) > 4
+    assert faces.max() == len(position) - 1
+    right = position[:, 0] > 0.3
+    assert np.abs(color[right].mean(axis=0) - RIGHT).max() < 12
+    said = capsys.readouterr().out
+    assert f"{len(position):,} vertices, {len(faces):,} faces" in said
+    assert "voxels of 0.2" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["wall.ply"]
+
+
+def test_voxel_and_box_are_in_the_units_of_the_frame(run, tmp_path, capsys):
+    options = {"data": photos_of(run), "voxel": 0.15, "box": (0.0, -1.0, -1.0, 1.0, 1.0, 1.0)}
+    assert mesh(run, out=tmp_path / "box.ply", **options) == 0
+    assert "voxels of 0.15" in capsys.readouterr().out
+    position, _, _ = read(tmp_path / "box.ply")
+    assert position[:, :2].min(axis=0) == pytest.approx([0, -1], abs=0.15)
+    assert position[:, :2].max(axis=0) == pytest.approx([1, 1], abs=0.15)
+
+
+def test_wrong_requests_are_one_line_and_leave_nothing(run, tmp_path, capsys, monkeypatch):
+    out, photos = tmp_path / "new.ply", photos_of(run)
+    for words, options in {
+        "must end in .ply": {"out": tmp_path / "new.obj"},
+        "it must be above 0": {"voxel": -1.0},
+        "Y0 < Y1": {"box": (0.0, 0.0, 0.0, 1.0, -1.0, 1.0)},
+        "no surface in this box": {"box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)},
+        "no surface that three views see": {"voxel": 1e-3},
+        "exists already": {"out": run},
+    }.items():
+        with pytest.raises(UserError, match=words):
+            mesh(run, **{"data": photos, "out": out, **options})
+    words = ["mesh", str(tmp_path), "--data", str(photos), "--out", str(out)]
+    assert cli.main(words) == 2
+    assert "is no run with a log" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(UserError, match="open3d, which fuses the depths, is not there"):
+        mesh(run, data=photos, out=out)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_photos_of_another_run_are_refused(tmp_path):
+    run = write_run(tmp_path, **MadeFor("0", (0.0, 0.0, 0.0), "in turn", 3).header())
+    with pytest.raises(UserError, match="is not what the run was made for: photos 0, not "):
+        mesh(run, data=photos_of(run), out=tmp_path / "new.ply")
