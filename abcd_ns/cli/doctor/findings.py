@@ -36,7 +36,7 @@ def broken_packages(facts: Facts) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 "broken-export",
-                f"ns-export cannot start, as {module} does not: {error}",
+                f"ns-export and abcd mesh cannot start, as {module} does not: {error}",
                 f"On Debian and Ubuntu: {SYSTEM_LIBRARIES}",
             )
         elif "torchvision::nms" in error:
