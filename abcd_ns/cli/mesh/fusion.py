@@ -24,7 +24,7 @@ from abcd_ns.engine.types import View
 BOX = 16
 """Side of a box, voxels."""
 PART_BOXES = 4096
-"""Boxes of a part, those around it left out: 0.3 GB, and 0.3 GB more while open3d finds the vertices."""
+"""About as many as a part has, those around it left out: 0.3 GB, and 0.3 GB more while vertices are found."""
 TRUNCATION = 8.0
 """How far from what a view sees it has a say, voxels; open3d's own. Views that disagree by more than twice
 that leave a hole."""
@@ -41,7 +41,7 @@ class Fusion:
 
     Args:
         voxel: their side, world units.
-        part_boxes: most boxes of a part.
+        part_boxes: of a part, about, those around it left out.
     """
 
     def __init__(self, maps: DepthMaps, voxel: float, part_boxes: int = PART_BOXES) -> None:
@@ -49,7 +49,6 @@ class Fusion:
         self._seen, self._boxes = list[np.ndarray](), np.zeros((0, 3), np.int32)
         self.most_boxes = 0
         """In RAM at the same time, so far."""
-
         self._tree = build_kd(torch.zeros(0, 3), 1)
 
     @property
