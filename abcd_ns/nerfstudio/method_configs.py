@@ -19,6 +19,7 @@ PAPER = TrainingConfig(
         sh_restart=True,
         migrate=False,
         pixel_loss="l2",
+        fast_start=False,
     ),
     warmup=0.0,
     batch=1,

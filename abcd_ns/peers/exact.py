@@ -83,7 +83,7 @@ class ExactTrainer(Trainer):
         super().__init__(run)
         run.fit_density(1)  # every block sees every step
         self._optics = Optics(list(self.views.values()), run.rasterizer.window_side)
-        self._pace = Pace(run.optimizers, run.config.recipe.batch_power)
+        self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []
@@ -98,7 +98,8 @@ class ExactTrainer(Trainer):
     def next_batch(self) -> Batch:
         """Set the learning rate and say what to train on next: whole views, or random parts."""
         self.stopwatch.start()
-        self._pace.set(self.batch, exponential_decay(self.progress, 1.0, self.config.means_lr_decay))
+        decay = exponential_decay(self.progress, 1.0, self.config.means_lr_decay)
+        self._pace.set(self.batch, self.state.step * self.batch, decay)
         step, views = self.state.step, self.run.views_at(self.run.reduction)
         rows, samples = tuple(sorted(views)), []
         for place in range(self.batch):

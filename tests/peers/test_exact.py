@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from abcd_ns.engine.gaussians.param_swap import rates_of_young
 from abcd_ns.engine.layers.compositing import composite
 from abcd_ns.engine.store.special_blocks import LIVE
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -81,14 +82,16 @@ def test_what_density_control_judges_by_adds_up_over_cells(tmp_path, views, phot
 
 def test_several_steps_are_those_of_a_plain_loop_over_everything(tmp_path, views, photos):
     start = scene(torch.float32)
-    blocks = exact(tmp_path / "blocks", start, views, blocks=5, steps=12)
+    blocks = exact(tmp_path / "blocks", start, views, blocks=5, steps=12, fast_start=True)
     params = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
     rates = {name: adam.param_groups[0]["lr"] for name, adam in blocks.optimizers.items()}
     adam = {n: torch.optim.Adam([p], lr=rates[n], eps=1e-15, fused=True) for n, p in params.items()}
     for step in range(12):
         batch = blocks.next_batch()
         (sample,) = batch.samples
-        adam["means"].param_groups[0]["lr"] = rates["means"] * blocks.config.means_lr_decay ** (step / 12)
+        for name, rate in rates.items():
+            decay = blocks.config.means_lr_decay ** (step / 12) if name == "means" else 1.0
+            adam[name].param_groups[0]["lr"] = rate * decay * rates_of_young(step, 1)
         raster = blocks.run.rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.sh_degree)
         picture = composite(raster.layer, sample.background).clamp(0, 1)
         for optimizer in adam.values():

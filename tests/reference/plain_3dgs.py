@@ -4,7 +4,7 @@ import random
 
 import torch
 
-from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
+from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES, rates_of_young
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
@@ -26,9 +26,9 @@ def train_plain(
     draw, density, growth = TorchRasterizer(), DensityControl(config.density), {}
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
-        adam["means"].param_groups[0]["lr"] = exponential_decay(
-            taken / steps, LEARNING_RATES["means"], LEARNING_RATES["means"] * config.means_lr_decay
-        )
+        for name, rate in LEARNING_RATES.items():
+            decay = exponential_decay(taken / steps, 1.0, config.means_lr_decay) if name == "means" else 1.0
+            adam[name].param_groups[0]["lr"] = rate * decay * rates_of_young(taken, 1)
         raster = draw(
             Gaussians(**{name: params[name] for name in PARAM_NAMES}),
             view,

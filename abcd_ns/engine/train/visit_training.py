@@ -41,7 +41,7 @@ class VisitTraining:
         self.run, self._visits = run, visits
         self.steps = StepDrawing(run, source, target)
         self.live = live or LiveBlock(run)
-        self._pace = Pace(run.optimizers, run.config.recipe.batch_power)
+        self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
 
     @property
     def batch(self) -> int:
@@ -73,7 +73,7 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next."""
         run = self.run
         decay = exponential_decay(run.share, 1.0, run.config.means_lr_decay)
-        self._pace.set(self.batch, means_decay=decay, damping=run.health.damping)
+        self._pace.set(self.batch, self.live.clocks.adam_views, decay, run.health.damping)
         return self.steps.next_batch()
 
     def follow_poses(self) -> None:

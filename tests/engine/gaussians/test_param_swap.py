@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import Pace, adam_step, attach, detach, nothing_live
+from abcd_ns.engine.gaussians.param_swap import (
+    YOUNG_RATES,
+    Pace,
+    adam_step,
+    attach,
+    detach,
+    nothing_live,
+    rates_of_young,
+)
 from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import random_gaussians
 
@@ -19,9 +27,12 @@ def travelled(power: float, views: int, steps: int) -> dict[str, float]:
     """How far each parameter comes where all views ask for the same."""
     params, adam = nothing_live(sh_degree=1)
     attach(BlockState.fresh(random_gaussians(1)), params, adam)
-    pace, before = Pace(adam, power), {name: params[name].detach().clone() for name in PARAM_NAMES}
+    pace, before = (
+        Pace(adam, power, fast_start=False),
+        {name: params[name].detach().clone() for name in PARAM_NAMES},
+    )
     for _ in range(steps):
-        pace.set(views, means_decay=1.0)
+        pace.set(views, 0, means_decay=1.0)
         for name in PARAM_NAMES:
             params[name].grad = torch.ones_like(params[name])
             adam[name].step()
@@ -41,6 +52,24 @@ def test_a_step_grows_with_the_power_of_its_views(views, power):
     assert travelled(power, views, steps=1) == pytest.approx(expected, rel=1e-2)
 
 
+@given(views=st.integers(0, 10**6), more=st.integers(0, 10**6), batch=st.integers(1, 8))
+def test_rates_fall_from_four_times_to_what_was_given(views, more, batch):
+    assert rates_of_young(0, batch) == YOUNG_RATES
+    assert 1.0 <= rates_of_young(views + more, batch) <= rates_of_young(views, batch)
+    assert rates_of_young(10**6, batch) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("views", "batch", "times"), [(0, 1, 4), (2_500, 1, 2), (625, 4, 2 * 4), (10_000, 1, 1)]
+)
+def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times):
+    _, adam = nothing_live(sh_degree=0)
+    given = {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES}
+    Pace(adam, 1.0, fast_start=True).set(batch, views, means_decay=0.5)
+    expected = {name: times * rate * (0.5 if name == "means" else 1.0) for name, rate in given.items()}
+    assert {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES} == pytest.approx(expected)
+
+
 def corrected_moments(adam, parameter) -> tuple[float, float]:
     """Adam's estimates of the gradient and its square, bias-corrected as torch's Adam does."""
     state, (first, second) = adam.state[parameter], adam.param_groups[0]["betas"]
@@ -58,12 +87,12 @@ def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:
         batches: (views in a step, steps); the block is taken out and put back in between.
     """
     params, adam = nothing_live(sh_degree=0)
-    pace, rest = Pace(adam, 0.5), BlockState.fresh(random_gaussians(2))
+    pace, rest = Pace(adam, 0.5, fast_start=False), BlockState.fresh(random_gaussians(2))
     for batch, steps in batches:
         attach(rest, params, adam, batch=batch)
         clocks = rest.clocks
         for _ in range(steps):
-            pace.set(batch, means_decay=1.0)
+            pace.set(batch, 0, means_decay=1.0)
             params["scales"].grad = torch.ones_like(params["scales"])
             adam["scales"].step()
             clocks = replace(clocks, adam_views=clocks.adam_views + batch)

@@ -47,7 +47,8 @@ def test_training_improves_every_photo(tmp_path, views, photos, start):
 @pytest.mark.parametrize("growing", [False, True])
 def test_one_block_is_plain_3dgs_bit_for_bit(tmp_path, views, photos, start, growing):
     density = dataclasses.replace(GROWING, price=0.0) if growing else DensityConfig(strategy="off")
-    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=40, density=density)
+    options = {"blocks": 1, "steps": 40, "density": density, "fast_start": True}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
     train(coordinator, photos)
     expected = train_plain(start, views, photos, steps=40, config=coordinator.config)
     assert len(expected) != len(start) or not growing
