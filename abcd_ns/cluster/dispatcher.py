@@ -197,7 +197,7 @@ class Dispatcher(Trainer):
         state.active = None
         state.in_flight.append(active)
         own = self.workers.share(state_for_visit(scene, block))
-        lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks if b != block}))
+        lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks}))
         return Lent(active, lease, len(mail or ()))
 
     def _as_drawn(self, block: int) -> Callable[[], Gaussians]:

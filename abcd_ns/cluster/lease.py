@@ -78,8 +78,8 @@ class Lease:
     task: VisitTask
     state: Callable[[], BlockState]
     """Reads what the visit begins with, wherever the worker is."""
-    others: Mapping[int, Callable[[], Gaussians]]
-    """Likewise all other blocks as they are drawn."""
+    drawn: Mapping[int, Callable[[], Gaussians]]
+    """Likewise all blocks, this one too, as others draw them."""
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ others that is out at the same time. The shares of blocks that are out together 
 photo.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, rounded
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.space.influence import Influence, weights_by_pixel
@@ -25,6 +24,7 @@ from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.step.drawing import StepDrawing
+from abcd_ns.engine.types import Gaussians
 
 FAINT = 0.01
 """Weight that a block is given in every pixel: where nobody shows, nobody else needs to be waited for."""
@@ -73,22 +73,25 @@ class SharedResidual:
     """The pictures that a visit begins with, and what its block is to add to them.
 
     Args:
+        own: gives the block as others draw it, who do not see what joins it in this visit.
         beside: by view, which part of the other blocks' weight is out at the same time.
         room: for pictures. What has none is drawn again when it is asked for.
     """
 
     def __init__(
-        self, run: TrainingRun, steps: StepDrawing, beside: Mapping[int, float], room: LayerRoom
+        self,
+        run: TrainingRun,
+        steps: StepDrawing,
+        own: Callable[[], Gaussians],
+        beside: Mapping[int, float],
+        room: LayerRoom,
     ) -> None:
-        self._run, self._steps, self._beside = run, steps, beside
+        self._run, self._steps, self._own, self._beside = run, steps, own, beside
         self._degree, self._store = steps.degree, LayerStore(run.device, room.device, room.ram)
-        self._own = live_gaussians(run.params).detach()
-        for view in beside:
-            self._store.put(view, Kept(self._draw(view)))
-        if any(self._store.get(view) is None for view in beside):
-            self._own = self._own.to(run.device, copy=True)  # training changes what is live
-        else:
-            del self._own
+        if beside:
+            gaussians = own().to(run.device)
+            for view in beside:
+                self._store.put(view, Kept(self._draw(gaussians, view)))
 
     def target(self, sample: Sample, photo: Float[Tensor, "_h _w 3"]) -> Float[Tensor, "_h _w 3"]:
         """What a sample is trained on in its photo's place."""
@@ -96,7 +99,7 @@ class SharedResidual:
         if view not in self._beside:
             return photo
         kept = self._store.get(view)
-        found = self._draw(view) if kept is None else kept.layers
+        found = self._draw(self._own().to(self._run.device), view) if kept is None else kept.layers
         part = sample.crop.within(self._run.active.geometry.crops[view])
         (found,) = found[(slice(None), *part.slices)].to(sample.background.dtype)
         light = self._run.light
@@ -105,12 +108,12 @@ class SharedResidual:
         return began.lerp(photo.to(began), found[..., 4:])
 
     @torch.no_grad()
-    def _draw(self, view: int) -> Float[Tensor, "1 h w 5"]:
+    def _draw(self, own: Gaussians, view: int) -> Float[Tensor, "1 h w 5"]:
         """What the rasterizer drew of a view, and the block's shares of it."""
         run, sample = self._run, self._steps.whole(view)
         options = {"antialiased": run.config.antialiased}
-        (raster,) = run.rasterizer.draw(self._own, [sample.shot], sh_degree=self._degree, **options)
-        weights = weights_by_pixel(self._own, run.rasterizer, sample.shot, **options)
+        (raster,) = run.rasterizer.draw(own, [sample.shot], sh_degree=self._degree, **options)
+        weights = weights_by_pixel(own, run.rasterizer, sample.shot, **options)
         left = raster.transmittance
         if sample.layers is not None:
             front, back = sample.layers.front.transmittance, sample.layers.back.transmittance

@@ -105,19 +105,18 @@ class VisitWorker:
         self,
         task: VisitTask,
         state: BlockState,
-        others: Mapping[int, Callable[[], Gaussians]],
+        drawn: Mapping[int, Callable[[], Gaussians]],
         listen: Callable[[StepTaken], None] | None = None,
     ) -> VisitOutcome:
         """Train a block between the others.
 
         Args:
             state: what it begins with.
-            others: what reads them; only those are read that some picture shows.
+            drawn: by block, what reads it as others draw it; only those are read that some picture shows.
             listen: is told of each step.
         """
-        run = self._run_of(
-            task, LentScene(task.tree, task.outlines, task.active.geometry.block, state, others)
-        )
+        scene = LentScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
+        run = self._run_of(task, scene)
         heard: list[float] = []
 
         def hear(event: Event) -> None:
@@ -133,7 +132,7 @@ class VisitWorker:
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
         training = VisitTraining(run, OnLease(run, task, len(state)), LayerSource(run, layers))
         training.begin(run.active)
-        shared = SharedResidual(run, training.steps, task.beside, pictures)
+        shared = SharedResidual(run, training.steps, scene.as_drawn, task.beside, pictures)
         while not training.is_over:
             self._take_step(training, shared)
         active, block = run.active, run.active.geometry.block
