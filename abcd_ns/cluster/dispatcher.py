@@ -5,8 +5,8 @@ done sooner or later, and they are taken in one after the other. So what a run c
 not on timing, nor on who was lost: whoever is given a visit again makes the same of it. With a lag of 1 a
 run is the same as one by a coordinator alone.
 
-Two blocks that are trained at once both answer for what neither shows alone. What that costs was measured
-(docs/cluster.md).
+Blocks that are trained at once each make good their share of what is missing (`shared_residual`), in shorter
+visits. What it still costs was measured (docs/cluster.md).
 """
 
 from collections import deque
