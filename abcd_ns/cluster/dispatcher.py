@@ -5,8 +5,8 @@ done sooner or later, and they are taken in one after the other. So what a run c
 not on timing, nor on who was lost: whoever is given a visit again makes the same of it. With a lag of 1 a
 run is the same as one by a coordinator alone.
 
-Two blocks that are trained at once both answer for what neither shows alone. What that costs was measured
-(docs/cluster.md).
+Blocks that are trained at once each make good their share of what is missing (`shared_residual`), in shorter
+visits. What it still costs was measured (docs/cluster.md).
 """
 
 from collections import deque
@@ -28,6 +28,7 @@ from abcd_ns.cluster.lease import (
     Workers,
     WorkersError,
 )
+from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, WorkerLost, WorkersSeen
 from abcd_ns.engine.store.lent_scene import Outlines
 from abcd_ns.engine.store.settle import has_scaffold, settle, state_for_visit
@@ -157,7 +158,7 @@ class Dispatcher(Trainer):
                 return
             else:
                 try:
-                    active = self._local.visits.begin()
+                    active = self._local.visits.begin(self._lag)
                 except BlocksBusyError:
                     if not self._take_in_first():
                         return
@@ -190,12 +191,13 @@ class Dispatcher(Trainer):
             health=state.health.get(block, BlockHealth()),
             light={} if self.run.light is None else self.run.light.to_json(),
             poses=self.run.poses.to_json(),
+            beside=self._beside(active),
             allowance=self._allowance(),
         )
         state.active = None
         state.in_flight.append(active)
         own = self.workers.share(state_for_visit(scene, block))
-        lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks if b != block}))
+        lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks}))
         return Lent(active, lease, len(mail or ()))
 
     def _as_drawn(self, block: int) -> Callable[[], Gaussians]:
@@ -209,6 +211,14 @@ class Dispatcher(Trainer):
         """The same under a new number."""
         self._leases += 1
         return replace(lease, number=self._leases)
+
+    def _beside(self, active: ActiveVisit) -> dict[int, float]:
+        """By view, which part of the other blocks' weight is out at the same time: begun before, or next."""
+        state, block = self.state, active.geometry.block
+        others = {lent.active.geometry.block for lent in self._lent}
+        others |= {plan.block for plan in state.queue[: self._lag - 1]}
+        blocks = self.scene.tree.num_blocks
+        return shown_beside(state.influence, block, others - {block}, blocks, active.views)
 
     def _allowance(self) -> int | None:
         """The visit's part of what the scene's limit leaves: all that are out at once may grow."""

@@ -41,6 +41,9 @@ class VisitTask:
     """As in RunState; the worker applies it, and leaves it as it is."""
     poses: dict[str, str]
     """The same."""
+    beside: dict[int, float]
+    """By view that shows them, which part of the other blocks' weight is out at the same time; see
+    shared_residual."""
     allowance: int | None
     """Gaussians by which the block may grow, for the sake of a limit on the scene; None for any number."""
 
@@ -75,8 +78,8 @@ class Lease:
     task: VisitTask
     state: Callable[[], BlockState]
     """Reads what the visit begins with, wherever the worker is."""
-    others: Mapping[int, Callable[[], Gaussians]]
-    """Likewise all other blocks as they are drawn."""
+    drawn: Mapping[int, Callable[[], Gaussians]]
+    """Likewise all blocks, this one too, as others draw them."""
 
 
 @dataclass(frozen=True)

@@ -90,11 +90,11 @@ class Actor:
         return os.getpid()
 
     def visit(
-        self, task: VisitTask, state: Shared, others: dict[int, Shared]
+        self, task: VisitTask, state: Shared, drawn: dict[int, Shared]
     ) -> tuple[VisitOutcome, Any, Any]:
         """Train a block; gives what became of it, its Gaussians apart."""
         self._done, self._psnrs = 0, []
-        outcome = self._worker.visit(task, state(), others, self._hear)
+        outcome = self._worker.visit(task, state(), drawn, self._hear)
         tensors, meta = outcome.state.to_tensors()
         arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
         return replace(outcome, state=outcome.state.nobody), arrays, meta
@@ -174,7 +174,7 @@ class RayWorkers:
         now = time.monotonic()
         member.waited += now - member.free_since
         member.lease, member.asked_at, member.steps = lease, now, 0
-        member.asked = member.actor.visit.remote(lease.task, lease.state, dict(lease.others))
+        member.asked = member.actor.visit.remote(lease.task, lease.state, dict(lease.drawn))
 
     def wait(self, seconds: float) -> list[Report]:
         """What has happened; asks those that are at work how far they are."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from abcd_ns.cluster.lease import VisitOutcome, VisitTask
+from abcd_ns.cluster.shared_residual import ROOM, SharedResidual
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
@@ -59,7 +60,7 @@ class OnLease:
     def __init__(self, run: TrainingRun, task: VisitTask, begun: int) -> None:
         self._run, self._task, self._begun = run, task, begun
 
-    def begin(self) -> ActiveVisit:
+    def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - there is but one
         """The one visit that there is."""
         return self._run.active
 
@@ -104,19 +105,18 @@ class VisitWorker:
         self,
         task: VisitTask,
         state: BlockState,
-        others: Mapping[int, Callable[[], Gaussians]],
+        drawn: Mapping[int, Callable[[], Gaussians]],
         listen: Callable[[StepTaken], None] | None = None,
     ) -> VisitOutcome:
         """Train a block between the others.
 
         Args:
             state: what it begins with.
-            others: what reads them; only those are read that some picture shows.
+            drawn: by block, what reads it as others draw it; only those are read that some picture shows.
             listen: is told of each step.
         """
-        run = self._run_of(
-            task, LentScene(task.tree, task.outlines, task.active.geometry.block, state, others)
-        )
+        scene = LentScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
+        run = self._run_of(task, scene)
         heard: list[float] = []
 
         def hear(event: Event) -> None:
@@ -129,12 +129,12 @@ class VisitWorker:
         run.announce.subscribe(hear)
         began = run.stopwatch.seconds
         run.stopwatch.start()
-        training = VisitTraining(
-            run, OnLease(run, task, len(state)), LayerSource(run, self._setup.layer_room)
-        )
+        pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
+        training = VisitTraining(run, OnLease(run, task, len(state)), LayerSource(run, layers))
         training.begin(run.active)
+        shared = SharedResidual(run, training.steps, scene.as_drawn, task.beside, pictures)
         while not training.is_over:
-            self._take_step(training)
+            self._take_step(training, shared)
         active, block = run.active, run.active.geometry.block
         return VisitOutcome(
             training.finish(),
@@ -184,16 +184,18 @@ class VisitWorker:
         run.stopwatch = Stopwatch(task.seconds)
         return run
 
-    def _take_step(self, training: VisitTraining) -> None:
+    def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
         batch, optimizers = training.next_batch(), training.run.optimizers.values()
         targets = [self._target(sample) for sample in batch.samples]
         rendered = training.render(batch)
-        pictures, photos = [], []
-        for picture, (photo, counts) in zip(rendered.pictures, targets, strict=True):
-            weight = None if counts is None else counts.to(picture.device)
-            pictures.append(picture if weight is None else picture * weight)
-            photos.append(photo if weight is None else photo * weight)
-        loss = training.loss(batch, pictures, photos)
+        pictures, photos, wanted = [], [], []
+        for sample, picture, (photo, counts) in zip(batch.samples, rendered.pictures, targets, strict=True):
+            found = (picture, photo, shared.target(sample, photo))
+            if counts is not None:
+                found = tuple(pixels * counts.to(picture.device) for pixels in found)
+            for pixels, into in zip(found, (pictures, photos, wanted), strict=True):
+                into.append(pixels)
+        loss = training.loss(batch, pictures, wanted)
         for optimizer in optimizers:
             optimizer.zero_grad(set_to_none=True)
         if loss.requires_grad:

@@ -139,7 +139,7 @@ class BlocksAlone:
         self._crops: dict[int, Crop] = {}
         self._part = 1.0
 
-    def begin(self) -> ActiveVisit:
+    def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - by itself
         """The next block's one visit; the block is put to rest as it begins, with what lies around it."""
         run, state = self._run, self._run.state
         began, since = run.stopwatch.seconds, run.progress

@@ -46,7 +46,7 @@ class InProcessWorkers:
             return []
         lease = self._leases.popleft()
         self._visits += 1
-        return [Finished(lease.number, self._worker.visit(lease.task, lease.state(), lease.others))]
+        return [Finished(lease.number, self._worker.visit(lease.task, lease.state(), lease.drawn))]
 
     def seen(self) -> Sequence[WorkerSeen]:
         """One, who is between two visits."""

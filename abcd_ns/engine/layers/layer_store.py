@@ -23,9 +23,9 @@ LARGEST_HALF = torch.finfo(torch.float16).max
 class Kept:
     """What is kept of one view."""
 
-    layers: Float[Tensor, "2 h w 4"]
-    """F and B, rounded: premultiplied colour, then transmittance."""
-    interleaved: Splats | None
+    layers: Float[Tensor, "k h w c"]
+    """F and B, rounded: premultiplied colour, then transmittance. Or what else is kept by pixel."""
+    interleaved: Splats | None = None
     """Frozen Gaussians inside the window."""
 
     @property
@@ -53,7 +53,7 @@ def unpacked(layers: Float[Tensor, "2 h w 4"]) -> FrozenLayers:
     return FrozenLayers(front, back)
 
 
-def rounded(layers: Float[Tensor, "2 h w 4"]) -> Float[Tensor, "2 h w 4"]:
+def rounded(layers: Float[Tensor, "k h w c"]) -> Float[Tensor, "k h w c"]:
     """Half floats of float32, within their range; float64 as it is."""
     if layers.dtype == torch.float64:
         return layers

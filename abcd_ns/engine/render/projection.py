@@ -54,6 +54,13 @@ class Splats:
         """3 sigma along the longer axis, rounded up; 0 for what no pixel sees."""
         return self.planes[rows.RADIUS].detach().int()
 
+    @property
+    def black(self) -> "Splats":
+        """The same, which hide what they hid, and show nothing."""
+        planes = self.planes.clone()
+        planes[rows.RED : rows.GRADED] = 0
+        return Splats(planes)
+
     def __getitem__(self, index: Int[Tensor, "m"]) -> "Splats":
         """Those at `index`."""
         return Splats(self.planes.index_select(1, index))

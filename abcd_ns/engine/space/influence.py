@@ -52,6 +52,18 @@ def weights(
     return found.flatten(1)[:, 0] / SH_C0
 
 
+@torch.no_grad()
+def weights_by_pixel(
+    gaussians: Gaussians, rasterizer: Rasterizer, shot: Shot, *, antialiased: bool = False
+) -> Float[Tensor, "h w"]:
+    """The sum of the Gaussians' weights in each pixel of a shot, among what is frozen there: a picture of
+    them in white, and of nothing else."""
+    white = replace(gaussians.detach(), features_dc=torch.full_like(gaussians.features_dc, 0.5 / SH_C0))
+    shot = replace(shot, frozen=shot.frozen and shot.frozen.black)
+    (raster,) = rasterizer.draw(white, [shot], sh_degree=0, antialiased=antialiased)
+    return raster.color[..., 0]
+
+
 def share_shown(
     gaussians: Gaussians,
     rasterizer: Rasterizer,

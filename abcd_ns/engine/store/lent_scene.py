@@ -26,7 +26,7 @@ class LentScene:
     Args:
         block: the one to be trained.
         state: what its visit begins with.
-        others: by block, what gives its Gaussians; asked when they are drawn, once.
+        drawn: by block, what gives its Gaussians as others draw them; asked once, and when they are drawn.
     """
 
     def __init__(
@@ -35,11 +35,11 @@ class LentScene:
         outlines: Outlines,
         block: int,
         state: BlockState,
-        others: Mapping[int, Callable[[], Gaussians]],
+        drawn: Mapping[int, Callable[[], Gaussians]],
     ) -> None:
         self.tree = tree
         self._outlines, self._block, self._state = outlines, block, state
-        self._others, self._read = others, dict[int, Gaussians]()
+        self._drawn, self._read = drawn, dict[int, Gaussians]()
         self._live: Callable[[], Gaussians] | None = None
 
     def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
@@ -77,8 +77,15 @@ class LentScene:
     def gaussians(self, block: int) -> Gaussians:
         if block == self._block:
             return self._state.gaussians if self._live is None else self._live().detach()
+        return self._read_as_drawn(block)
+
+    def as_drawn(self) -> Gaussians:
+        """The lent block as others draw it: without Gaussians that join in this visit."""
+        return self._read_as_drawn(self._block)
+
+    def _read_as_drawn(self, block: int) -> Gaussians:
         if block not in self._read:
-            self._read[block] = self._others[block]()
+            self._read[block] = self._drawn[block]()
         return self._read[block]
 
     def version(self, block: int) -> int:

@@ -25,6 +25,11 @@ class LayerRoom:
         """Both."""
         return self.device + self.ram
 
+    def parted(self, share: float) -> tuple["LayerRoom", "LayerRoom"]:
+        """A share of it, and the rest."""
+        first = LayerRoom(int(share * self.device), int(share * self.ram))
+        return first, LayerRoom(self.device - first.device, self.ram - first.ram)
+
 
 class LayerSource:
     """Draws what is frozen around a block.

@@ -17,6 +17,7 @@ from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
     SCAFFOLD_PASSES,
     VisitPlan,
+    passes_at_once,
     passes_for_layers,
     passes_of_sweep,
     plan_sweep,
@@ -45,8 +46,11 @@ class BlocksBusyError(Exception):
 class Visits(Protocol):
     """Decides which block is trained when, and on what terms."""
 
-    def begin(self) -> ActiveVisit:
+    def begin(self, at_once: int = 1) -> ActiveVisit:
         """The next visit, which from now on is the run's active one.
+
+        Args:
+            at_once: visits that are out at once, this one included.
 
         Raises:
             NothingSeenError: no view sees any block.
@@ -73,7 +77,7 @@ class Planner:
         self._config, self._budget, self._scene = run.config, run.budget, run.scene
         self._culling: dict[int, tuple[dict[int, View], Frusta, Optics]] = {}
 
-    def begin(self) -> ActiveVisit:
+    def begin(self, at_once: int = 1) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
         passed over, and most of the time those that no picture showed when they were last visited.
 
@@ -85,7 +89,7 @@ class Planner:
         if state.visit == 0 and has_scaffold(self._scene) and run.progress < self._config.warmup:
             state.active = self._warm_up(run.sh_degree, began)
         else:
-            state.active = self._next_visit(state, run.sh_degree, began)
+            state.active = self._next_visit(state, run.sh_degree, began, at_once)
         state.visit += 1
         return state.active
 
@@ -116,9 +120,9 @@ class Planner:
         taken = min(taken, math.ceil(SCAFFOLD_PASSES * len(crops) / views))
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
-    def _next_visit(self, state: RunState, sh_degree: int, began: float) -> ActiveVisit:
+    def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:
         while True:
-            plan = self._next_plan(state)
+            plan = self._next_plan(state, at_once)
             if self._is_hidden(state, plan.block) and state.sweep % LOOK_AGAIN:
                 continue
             reduction = self._run.reduction
@@ -177,7 +181,7 @@ class Planner:
         # What a block has got since, Gaussians from the reserve say, may be seen where it was not before.
         return worth_training(seen, self._config.influence_share) or geometry.views
 
-    def _next_plan(self, state: RunState) -> VisitPlan:
+    def _next_plan(self, state: RunState, at_once: int) -> VisitPlan:
         config = self._config
         if not state.queue:
             if not state.views:
@@ -189,7 +193,9 @@ class Planner:
             state.trained = state.frozen = 0
             passes = passes_of_sweep(state.sweep, config.first_passes, last)
             used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
-            batch = views_per_step(config.batch, self._scene.tree.num_blocks, config.limits.batch_limit)
+            blocks = self._scene.tree.num_blocks
+            passes = passes_at_once(passes, at_once, blocks)
+            batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
             steps = (passes / batch, remaining, config.seed, config.recipe.visit_steps)
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:

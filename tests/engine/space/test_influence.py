@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.render import Shot, TorchRasterizer
-from abcd_ns.engine.space.influence import coarser, influence, weights, worth_training
+from abcd_ns.engine.space.influence import coarser, influence, weights, weights_by_pixel, worth_training
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.training_loop import train
@@ -62,6 +62,16 @@ def test_what_stands_in_front_takes_its_share(rasterizer):
     half = weights(gaussians, rasterizer, shot, torch.full((view.height, view.width), 0.5))
     assert float(bare.sum()) > 1
     torch.testing.assert_close(half, bare / 2)
+
+
+def test_weights_by_pixel_are_what_is_painted_white_among_what_is_frozen(rasterizer):
+    gaussians, (view,) = random_gaussians(80, seed=4, size=0.15), ring_of_views(1)
+    chosen = torch.arange(80) % 3 == 0
+    frozen = rasterizer.project(gaussians[~chosen], view)
+    found = weights_by_pixel(gaussians[chosen], rasterizer, Shot(view, view.full, frozen))
+    picture = rasterizer(painted(gaussians, chosen), view, sh_degree=0)
+    assert torch.allclose(found, picture.color[..., 0], atol=1e-6)
+    assert float(found.max()) > 0.5
 
 
 def test_a_view_that_sees_nothing_has_no_influence(rasterizer):

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from abcd_ns.engine.train.schedule import (
     FROZEN_COST,
     LAYER_SHARE,
+    SHORTER,
     WINDOW_COST,
     exponential_decay,
+    passes_at_once,
     passes_for_layers,
     passes_of_sweep,
     plan_sweep,
@@ -74,6 +76,14 @@ def test_passes_leave_a_tenth_of_the_time_for_layers(frozen):
     layers = FROZEN_COST * frozen + WINDOW_COST * trained
     assert layers / (layers + passes * trained) <= LAYER_SHARE < layers / (layers + (passes - 1) * trained)
     assert passes_for_layers(0, 0) == 0
+
+
+@given(passes=st.integers(1, 60), at_once=st.integers(1, 40), blocks=st.integers(1, 30))
+def test_visits_are_the_shorter_the_more_are_out_at_once(passes, at_once, blocks):
+    found = passes_at_once(passes, at_once, blocks)
+    assert passes_at_once(passes, 1, blocks) == passes
+    assert passes / SHORTER <= passes_at_once(passes, at_once + 1, blocks) <= found <= passes
+    assert blocks == 1 or passes_at_once(passes, blocks, blocks) == passes / SHORTER
 
 
 def test_learning_rate_decays_exponentially():

@@ -124,14 +124,14 @@ class StepDrawing:
         """What to draw next; helpers begin at once."""
         active, step = self._run.active, self._run.state.step
         if self.crew is not None:
-            task = Task(active.done, step, self._degree)
+            task = Task(active.done, step, self.degree)
             self.crew.begin(live_gaussians(self._run.params), task)
         views = enumerate(self._views_of_step(active, self._order, active.done))
         return Batch(step, tuple(self._sample(view, place, step) for place, view in views))
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
-        rendered = self._draw(live_gaussians(self._run.params), batch.samples, self._degree)
+        rendered = self._draw(live_gaussians(self._run.params), batch.samples, self.degree)
         if not self._run.active.shown:
             for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
                 self._run.health.see(share_of_picture(sample.layers and sample.layers.front, own))
@@ -159,12 +159,18 @@ class StepDrawing:
             return photometric
         return photometric + run.density.regularisation(run.params, run.count())
 
+    def whole(self, view: int) -> Sample:
+        """All that a view shows of the block in this visit."""
+        run, active = self._run, self._run.active
+        seen, crop = run.views_at(active.reduction)[view], active.geometry.crops[view]
+        return self._sample_of(seen, crop, 0, run.state.step)
+
     def contributions(self) -> list[Contribution]:
         """What helpers add to the step."""
         return [] if self.crew is None else self.crew.contributions()
 
     @property
-    def _degree(self) -> int:
+    def degree(self) -> int:
         """The degree of spherical harmonics in this step."""
         active = self._run.active
         changes = active.is_alone or self._run.config.recipe.sh_restart

@@ -1,0 +1,122 @@
+"""What a block is to make good of the pictures while others are trained at the same time: its share.
+
+Blocks that begin from old versions of each other all see the same error. If each makes good all of it, all
+together overshoot (docs/design.md, Freshness). So each is trained towards a picture between the one that its
+visit begins with and the photo:
+
+    target = picture + share (photo - picture)        share = w / (w + q o)
+
+where w and o are what the block and all others weigh in a pixel, sums of alpha T, and q is the part of the
+others that is out at the same time. The shares of blocks that are out together add up to 1: they meet at the
+photo.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.layers.layer_store import Kept, LayerStore, rounded
+from abcd_ns.engine.render import Raster
+from abcd_ns.engine.space.influence import Influence, weights_by_pixel
+from abcd_ns.engine.train.layer_source import LayerRoom
+from abcd_ns.engine.train.run import TrainingRun
+from abcd_ns.engine.train.step.batch import Sample
+from abcd_ns.engine.train.step.drawing import StepDrawing
+from abcd_ns.engine.types import Gaussians
+
+FAINT = 0.01
+"""Weight that a block is given in every pixel: where nobody shows, nobody else needs to be waited for."""
+ROOM = 10 / 26
+"""Of the room for layers, for pictures that visits begin with: 5 numbers a pixel, where F and B have 8."""
+
+
+def shares(
+    own: Float[Tensor, "h w"], all_of_them: Float[Tensor, "h w"], beside: float
+) -> Float[Tensor, "h w"]:
+    """A block's share of each pixel's error; see above.
+
+    Args:
+        own: what the block weighs.
+        all_of_them: what it and all others weigh.
+        beside: q.
+    """
+    own = own + FAINT
+    return own / (own + beside * (all_of_them + FAINT - own).clamp_min(0))
+
+
+def shown_beside(
+    influence: Influence, block: int, others: Collection[int], blocks: int, views: Sequence[int]
+) -> dict[int, float]:
+    """By view, which part of the other blocks' weight is of those that are out at the same time; views that
+    show none of these are left out.
+
+    Args:
+        others: blocks that are out.
+        blocks: how many there are. Where influences are not known, all weigh the same.
+    """
+    found = {}
+    for view in views:
+        shown = {b: known.get(view, 0.0) for b, known in influence.items() if b != block}
+        whole = sum(shown.values())
+        if whole > 0:
+            part = sum(shown.get(b, 0.0) for b in sorted(others)) / whole
+        else:
+            part = len(others) / max(blocks - 1, 1)
+        if part > 0:
+            found[view] = min(part, 1.0)
+    return found
+
+
+class SharedResidual:
+    """The pictures that a visit begins with, and what its block is to add to them.
+
+    Args:
+        own: gives the block as others draw it, who do not see what joins it in this visit.
+        beside: by view, which part of the other blocks' weight is out at the same time.
+        room: for pictures. What has none is drawn again when it is asked for.
+    """
+
+    def __init__(
+        self,
+        run: TrainingRun,
+        steps: StepDrawing,
+        own: Callable[[], Gaussians],
+        beside: Mapping[int, float],
+        room: LayerRoom,
+    ) -> None:
+        self._run, self._steps, self._own, self._beside = run, steps, own, beside
+        self._degree, self._store = steps.degree, LayerStore(run.device, room.device, room.ram)
+        if beside:
+            gaussians = own().to(run.device)
+            for view in beside:
+                self._store.put(view, Kept(self._draw(gaussians, view)))
+
+    def target(self, sample: Sample, photo: Float[Tensor, "_h _w 3"]) -> Float[Tensor, "_h _w 3"]:
+        """What a sample is trained on in its photo's place."""
+        view = sample.view.index
+        if view not in self._beside:
+            return photo
+        kept = self._store.get(view)
+        found = self._draw(self._own().to(self._run.device), view) if kept is None else kept.layers
+        part = sample.crop.within(self._run.active.geometry.crops[view])
+        (found,) = found[(slice(None), *part.slices)].to(sample.background.dtype)
+        light = self._run.light
+        raster = Raster(found[..., :3], found[..., 3], found[..., 3], {})
+        began = sample.picture(raster, None if light is None else light.of(view))
+        return began.lerp(photo.to(began), found[..., 4:])
+
+    @torch.no_grad()
+    def _draw(self, own: Gaussians, view: int) -> Float[Tensor, "1 h w 5"]:
+        """What the rasterizer drew of a view, and the block's shares of it."""
+        run, sample = self._run, self._steps.whole(view)
+        options = {"antialiased": run.config.antialiased}
+        (raster,) = run.rasterizer.draw(own, [sample.shot], sh_degree=self._degree, **options)
+        weights = weights_by_pixel(own, run.rasterizer, sample.shot, **options)
+        left = raster.transmittance
+        if sample.layers is not None:
+            front, back = sample.layers.front.transmittance, sample.layers.back.transmittance
+            weights, left = front * weights, front * left * back
+        parts = (raster.transmittance, shares(weights, 1 - left, self._beside[view]))
+        return rounded(torch.cat((raster.color, torch.stack(parts, dim=-1)), dim=-1)[None])
