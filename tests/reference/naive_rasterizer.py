@@ -1,10 +1,11 @@
 """The slow twin of the rasterizers: textbook formulas, one pixel and one Gaussian at a time, in float64.
 
-Written from the papers (EWA splatting; Kerbl et al. 2023) and gsplat 1.4.0's CUDA sources; shares no code
-with the package. Differentiable by autograd.
+Written from the papers (EWA splatting; Kerbl et al. 2023; Huang et al. 2024) and gsplat 1.4.0's CUDA sources;
+shares no code with the package. Differentiable by autograd.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -61,7 +62,9 @@ def sh_color(dc: Tensor, rest: Tensor, direction: Tensor, degree: int) -> Tensor
 @dataclass
 class _Splat:
     mean: Tensor
-    conic: Tensor
+    """The middle of the square that its tiles touch."""
+    sigma: Callable[[Tensor], Tensor]
+    """alpha = opacity exp(-sigma) at a pixel."""
     opacity: Tensor
     color: Tensor
     depth: Tensor
@@ -70,7 +73,7 @@ class _Splat:
 
 
 def _project(g: Gaussians, i: int, mean: Tensor, mean_c: Tensor, view: View, antialiased: bool) -> tuple:
-    """(conic matrix, opacity, radius) of the i-th Gaussian."""
+    """(mean, sigma, opacity, radius) of the i-th Gaussian."""
     fx, fy, cx, cy = (float(view.K[r, c]) for r, c in ((0, 0), (1, 1), (0, 2), (1, 2)))
     x, y, z = mean_c
     pad_x, pad_y = 0.3 * 0.5 * view.width / fx, 0.3 * 0.5 * view.height / fy
@@ -90,17 +93,35 @@ def _project(g: Gaussians, i: int, mean: Tensor, mean_c: Tensor, view: View, ant
         opacity = opacity * torch.sqrt(torch.linalg.det(sharp).clamp_min(0) / det)
     mid = cov.trace().item() / 2
     radius = math.ceil(3 * math.sqrt(mid + math.sqrt(max(0.01, mid * mid - det.item()))))
-    outside = (
-        mean[0].item() + radius <= 0
-        or mean[0].item() - radius >= view.width
-        or mean[1].item() + radius <= 0
-        or mean[1].item() - radius >= view.height
-    )
-    return torch.linalg.inv(cov), opacity, 0 if outside else radius
+    conic = torch.linalg.inv(cov)
+    return mean, lambda pixel: 0.5 * (mean - pixel) @ conic @ (mean - pixel), opacity, radius
+
+
+def _project_surfel(g: Gaussians, i: int, mean_c: Tensor, view: View) -> tuple:
+    """The same of the i-th surfel, whose plane each ray is intersected with."""
+    axes = view.viewmat[:3, :3] @ rotation(g.quats[i])[:, :2] * g.scales[i, :2].exp()
+    columns = torch.cat((axes, mean_c[:, None]), dim=1)
+    conic = view.K @ columns @ torch.diag(mean_c.new_tensor([1.0, 1.0, -1.0])) @ columns.T @ view.K.T
+    conic = conic / conic[2, 2]  # dual, of the outline of one standard deviation
+    middle = conic[:2, 2]
+    extent = (middle * middle - conic.diagonal()[:2]).max().item()
+
+    def sigma(pixel: Tensor) -> Tensor:
+        ray = torch.linalg.inv(view.K) @ torch.cat((pixel, pixel.new_ones(1)))
+        s, t, _ = torch.linalg.solve(torch.cat((axes, -ray[:, None]), dim=1), -mean_c)
+        return torch.minimum(0.5 * (s * s + t * t), (middle - pixel).square().sum())
+
+    opacity = torch.sigmoid(g.opacities[i, 0])
+    return middle, sigma, opacity, math.ceil(3 * math.sqrt(max(1e-4, extent)))
+
+
+def _in_image(middle: Tensor, radius: int, view: View) -> bool:
+    size = (view.width, view.height)
+    return all(-radius < x < side + radius for x, side in zip(middle.tolist(), size, strict=True))
 
 
 def _splats(
-    g: Gaussians, view: View, sh_degree: int, antialiased: bool, windowed: bool
+    g: Gaussians, view: View, sh_degree: int, antialiased: bool, windowed: bool, surfels: bool
 ) -> tuple[Tensor, list[_Splat]]:
     R, t = view.viewmat[:3, :3], view.viewmat[:3, 3]
     center = -R.T @ t
@@ -115,9 +136,13 @@ def _splats(
         if not 0.01 <= means_c[i][2].item() <= 1e10:
             splats.append(None)
             continue
-        conic, opacity, radius = _project(g, i, means2d[i], means_c[i], view, antialiased)
+        found = _project(g, i, means2d[i], means_c[i], view, antialiased)
+        if surfels:
+            found = _project_surfel(g, i, means_c[i], view)
+        middle, sigma, opacity, radius = found
+        radius = radius if _in_image(middle, radius, view) else 0
         color = sh_color(g.features_dc[i], g.features_rest[i], g.means[i] - center, sh_degree)
-        splats.append(_Splat(means2d[i], conic, opacity, color, means_c[i][2], radius, windowed))
+        splats.append(_Splat(middle, sigma, opacity, color, means_c[i][2], radius, windowed))
     return means2d, splats
 
 
@@ -138,8 +163,7 @@ def _pixel(
     for splat in splats:
         if not _touches_tile(splat, px, py) or (splat.windowed and not near <= splat.depth.item() < far):
             continue
-        delta = splat.mean - torch.tensor([px + 0.5, py + 0.5], dtype=torch.float64)
-        sigma = 0.5 * delta @ splat.conic @ delta
+        sigma = splat.sigma(torch.tensor([px + 0.5, py + 0.5], dtype=torch.float64))
         alpha = torch.clamp_max(splat.opacity * torch.exp(-sigma), 0.999)
         if sigma.item() < 0 or alpha.item() < 1 / 255:
             continue
@@ -162,15 +186,16 @@ def naive_rasterize(
     near: Tensor | None = None,
     far: Tensor | None = None,
     antialiased: bool = False,
+    primitive: str = "3dgs",
 ) -> NaiveRaster:
     """Draw in float64. `near` and `far` [h, w] are the z window, of the frozen if any, else of all."""
     crop = crop or view.full
-    means2d, own = _splats(
-        gaussians, view, sh_degree, antialiased, windowed=near is not None and frozen is None
-    )
+    options = (sh_degree, antialiased)
+    own_window, surfels = near is not None and frozen is None, primitive == "2dgs"
+    means2d, own = _splats(gaussians, view, *options, own_window, surfels)
     everyone = list(own)
     if frozen is not None:
-        everyone += _splats(frozen.detach(), view, sh_degree, antialiased, windowed=near is not None)[1]
+        everyone += _splats(frozen.detach(), view, *options, near is not None, surfels)[1]
     drawable = [s for s in everyone if s is not None and s.radius > 0]
     drawable.sort(key=lambda s: s.depth.item())  # stable: ties by index
     pixels = []

@@ -31,18 +31,18 @@ BUILDER = "abcd_ns.engine.build_kernels"
 """The module that knows all kernels. By name, as it imports the kernels' owners, and they import this."""
 
 
-def build_kernels(kernels: Sequence[Kernel], side: int, chunk: int) -> None:
+def build_kernels(kernels: Sequence[Kernel], side: int, chunk: int, primitive: str = "3dgs") -> None:
     """Build what is missing, in a process of its own. Without a C++ compiler nothing happens.
 
     In this process the compiler would cost seconds of imports, and memory that is never given back. Where
     building fails a warning says so: the kernels stay eager.
 
     Args:
-        kernels: what is wanted; the process builds all kernels for `side` and `chunk`, see BUILDER.
+        kernels: what is wanted; the process builds all kernels for the other arguments, see BUILDER.
     """
     if all(kernel.is_built for kernel in kernels) or not can_build():
         return
-    command = [sys.executable, "-m", BUILDER, str(side), str(chunk)]
+    command = [sys.executable, "-m", BUILDER, str(side), str(chunk), primitive]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     if run.returncode != 0:
         reason = (run.stderr.strip().splitlines() or [f"exit code {run.returncode}"])[-1]

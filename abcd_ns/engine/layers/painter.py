@@ -98,7 +98,7 @@ class Painter:
         self.ownership = ownership
         self.device = torch.device(device)
         self._pass_gaussians = pass_gaussians
-        self._optics = Optics(views, rasterizer.window_side)
+        self._optics = Optics(views, rasterizer.slack)
 
     @property
     def tree(self) -> BlockTree:
@@ -106,7 +106,7 @@ class Painter:
 
     def frusta(self, seen: Iterable[tuple[View, Crop]]) -> Frusta:
         """What crops look at, for `load`."""
-        return Frusta(seen, self.rasterizer.window_side)
+        return Frusta(seen, self.rasterizer.slack)
 
     def units(self, exclude: int | None = None) -> tuple[int, ...]:
         """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass.

@@ -7,11 +7,13 @@ import torch
 from abcd_ns.engine.render.base import CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.cpu.chunk_kernels import CompilePolicy
+from abcd_ns.engine.render.primitive import PrimitiveName
 from abcd_ns.engine.render.self_check import self_check
 from abcd_ns.engine.render.z_window import ZWindow
 
 __all__ = [
     "CutShot",
+    "PrimitiveName",
     "Raster",
     "Rasterizer",
     "Shot",
@@ -26,13 +28,18 @@ WITHOUT_GSPLAT = ("cpu", "mps")
 
 
 def make_rasterizer(
-    name: Literal["auto", "torch", "gsplat"], device: torch.device | str, *, compile: CompilePolicy = "auto"
+    name: Literal["auto", "torch", "gsplat"],
+    device: torch.device | str,
+    *,
+    primitive: PrimitiveName = "3dgs",
+    compile: CompilePolicy = "auto",
 ) -> Rasterizer:
     """The rasterizer called `name`; "auto" takes gsplat where there may be kernels for it, else torch.
 
     gsplat's kernels are checked against the torch backend on a tiny scene first (see self_check).
 
     Args:
+        primitive: what a Gaussian is.
         compile: passed to TorchRasterizer.
 
     Raises:
@@ -41,13 +48,13 @@ def make_rasterizer(
     """
     device = torch.device(device)
     if name == "torch" or (name == "auto" and device.type in WITHOUT_GSPLAT):
-        return TorchRasterizer(compile)
+        return TorchRasterizer(compile, primitive=primitive)
     if device.type in WITHOUT_GSPLAT:
         raise ValueError(
             f'The gsplat rasterizer needs a CUDA device, not "{device}"; set the rasterizer to "torch".'
         )
     from abcd_ns.engine.render.cuda.backend import GsplatRasterizer  # imports gsplat
 
-    rasterizer = GsplatRasterizer()
+    rasterizer = GsplatRasterizer(primitive)
     self_check(rasterizer, device)
     return rasterizer

@@ -1,5 +1,6 @@
 """What every rasterizer takes and gives."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -9,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.render.extents import extents_of
+from abcd_ns.engine.render.primitive import Primitive
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.z_window import ZWindow
@@ -26,7 +28,7 @@ class Raster:
     """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
     info: dict[str, Any]
     """gsplat 1.4.0's `info` for the Gaussians that take gradients, from v cameras: means2d [v, n, 2], radii
-    [v, n], depths, conics, opacities, width, height, n_cameras, gaussian_ids. Of the full image, not the
+    [v, n], depths, opacities, width, height, n_cameras, gaussian_ids. Of the full image, not the
     crop."""
 
     @property
@@ -78,9 +80,16 @@ class Rasterizer(Protocol):
     """
 
     name: str
-    """Identifies backend and version; part of every layer's key."""
+    """Identifies primitive, backend and version; part of every layer's key."""
+    primitive: Primitive
+    """What a Gaussian is."""
     window_side: int
     """Side of the tiles that z windows are given by, px."""
+
+    @property
+    def slack(self) -> float:
+        """How far beyond its own size a Gaussian may count on screen, px: blur, half a tile's diagonal."""
+        return self.primitive.blur_pixels + self.window_side / math.sqrt(2)
 
     def window_grid(self, crop: Crop) -> TileGrid:
         """The tiles of a crop that its z windows are given by."""
@@ -121,8 +130,9 @@ class Rasterizer(Protocol):
             gaussians: take gradients where their tensors require them; `info` is about these alone. Several
                 rasters may share one `info`, of that many cameras.
             sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
-            antialiased: scale opacities by gsplat's compensation factor.
-            absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward.
+            antialiased: scale opacities by gsplat's compensation factor; of surfels it has none.
+            absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward,
+                where the primitive has it.
             weigh: give zeros for depths, from a leaf `info["weights"]` [v, n] that every Gaussian's depth is
                 taken from: after backward its gradient is the sum of the Gaussian's weights alpha T, each
                 times the gradient of the pixel's depth; and that changes no other gradient.

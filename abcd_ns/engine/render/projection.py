@@ -10,7 +10,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.gaussians.spherical_harmonics import BASES, MAX_SH_DEGREE
-from abcd_ns.engine.render import splat_kernels as rows
+from abcd_ns.engine.render.primitive import SPLATS, Primitive
+from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.types import Gaussians, View
 
 
@@ -19,40 +20,41 @@ class Splats:
     """N Gaussians as a rasterizer draws them. Pixels of the full image throughout."""
 
     planes: Float[Tensor, "r n"]
-    """A row for each quantity, see splat_kernels."""
+    """A row for each quantity: x, y, depth, some that give the shape, opacity, three of colour, four of
+    bounds. See splat_kernels and surfel_kernels."""
 
     def __len__(self) -> int:
         return self.planes.shape[1]
 
     @property
     def means2d(self) -> Float[Tensor, "n 2"]:
-        """Centres (x, y)."""
-        return self.planes[: rows.DEPTH].T
+        """Middles (x, y) of what may be drawn."""
+        return self.planes[:DEPTH].T
 
     @property
     def depths(self) -> Float[Tensor, "n"]:
         """Camera z of the 3D centres, world units."""
-        return self.planes[rows.DEPTH]
+        return self.planes[DEPTH]
 
     @property
-    def conics(self) -> Float[Tensor, "n 3"]:
-        """Inverses of the 2D covariances (xx, xy, yy), blur included."""
-        return self.planes[rows.CONIC_XX : rows.OPACITY].T
+    def shapes(self) -> Float[Tensor, "n s"]:
+        """How they spread: of Gaussians inverses of the 2D covariances (xx, xy, yy), blur included."""
+        return self.planes[DEPTH + 1 : -8].T
 
     @property
     def opacities(self) -> Float[Tensor, "n"]:
         """After the sigmoid and, if antialiased, after compensation."""
-        return self.planes[rows.OPACITY]
+        return self.planes[-8]
 
     @property
     def colors(self) -> Float[Tensor, "n 3"]:
         """As this camera sees them: linear, 0 or more, may exceed 1."""
-        return self.planes[rows.RED : rows.GRADED].T
+        return self.planes[-7:-4].T
 
     @property
     def radii(self) -> Int[Tensor, "n"]:
         """3 sigma along the longer axis, rounded up; 0 for what no pixel sees."""
-        return self.planes[rows.RADIUS].detach().int()
+        return self.planes[-1].detach().int()
 
     @property
     def black(self) -> "Splats":
@@ -67,21 +69,26 @@ class Splats:
 
 
 class _Splat(torch.autograd.Function):
-    """`splat` and its gradient by the Gaussians; nothing but the inputs is kept in between."""
+    """`Primitive.project` and its gradient by the Gaussians; nothing but the inputs is kept in between."""
 
     @staticmethod
     def forward(
-        ctx: Any, parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"], built: bool
+        ctx: Any,
+        parameters: Float[Tensor, "p n"],
+        camera: Float[Tensor, "c"],
+        primitive: Primitive,
+        built: bool,
     ) -> Float[Tensor, "r n"]:
         ctx.save_for_backward(parameters, camera)
-        ctx.built = built
-        return rows.SPLAT(parameters, camera, built=built)[0]
+        ctx.primitive, ctx.built = primitive, built
+        return primitive.project(parameters, camera, built=built)[0]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Float[Tensor, "r n"]) -> tuple[Float[Tensor, "p n"], None, None]:
-        graded = grad[: rows.GRADED].contiguous()
-        return rows.SPLAT_BACKWARD(*ctx.saved_tensors, graded, built=ctx.built)[0], None, None
+    def backward(ctx: Any, grad: Float[Tensor, "r n"]) -> tuple[Float[Tensor, "p n"], None, None, None]:
+        graded = grad[: ctx.primitive.graded].contiguous()
+        back = ctx.primitive.project_backward(*ctx.saved_tensors, graded, built=ctx.built)
+        return back[0], None, None, None
 
 
 def pack(gaussians: Gaussians) -> Float[Tensor, "p n"]:
@@ -110,12 +117,13 @@ def project_packed(
     sh_degree: int = 0,
     antialiased: bool = False,
     built: bool = True,
+    primitive: Primitive = SPLATS,
 ) -> Splats:
     """See `project`; of packed Gaussians."""
     camera = camera_numbers(view, parameters, sh_degree, antialiased)
     if camera.requires_grad and torch.is_grad_enabled():
-        return Splats(rows.splat(parameters, camera)[0])
-    return Splats(_Splat.apply(parameters, camera, built))
+        return Splats(primitive.project.function(parameters, camera)[0])
+    return Splats(_Splat.apply(parameters, camera, primitive, built))
 
 
 def project(
@@ -125,6 +133,7 @@ def project(
     sh_degree: int = 0,
     antialiased: bool = False,
     built: bool = True,
+    primitive: Primitive = SPLATS,
 ) -> Splats:
     """Project Gaussians into a view; differentiable in the Gaussians, and in the pose if it takes gradients.
 
@@ -132,12 +141,13 @@ def project(
         sh_degree: the degree of spherical harmonics in use.
         antialiased: multiply opacities by sqrt(det(cov) / det(cov + blur)), as in Mip-Splatting.
         built: use machine code where it is there.
+        primitive: what a Gaussian is.
 
     Raises:
         ValueError: `sh_degree` is above 3, or above what the Gaussians hold.
     """
     check_degree(gaussians, sh_degree)
-    options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": built}
+    options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": built, "primitive": primitive}
     return project_packed(pack(gaussians), view, **options)
 
 

@@ -84,7 +84,7 @@ def _graded_rows(parameters: Sequence[Tensor], camera: Tensor, bounds: bool) -> 
     slope_x, slope_y = mx * inverse_z, my * inverse_z
     u, v = fx * slope_x + cx, fy * slope_y + cy
 
-    axes = _camera_axes(rotation, (qw, qx, qy, qz), [scale.exp() for scale in scales])
+    axes = camera_axes(rotation, (qw, qx, qy, qz), [scale.exp() for scale in scales])
     # As in gsplat, the Jacobian is taken at a centre clamped to 1.3 times the image's field of view: further
     # out the linearisation explodes.
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
@@ -92,23 +92,23 @@ def _graded_rows(parameters: Sequence[Tensor], camera: Tensor, bounds: bool) -> 
     slope_y = slope_y.maximum(-cy / fy - margin_y).minimum((height - cy) / fy + margin_y)
     across = [fx * inverse_z * (axes[0][k] - slope_x * axes[2][k]) for k in range(3)]
     down = [fy * inverse_z * (axes[1][k] - slope_y * axes[2][k]) for k in range(3)]
-    xx, xy, yy = _dot(across, across), _dot(across, down), _dot(down, down)
+    xx, xy, yy = dot(across, across), dot(across, down), dot(down, down)
     # Lagrange's identity: xx yy - xy^2 = |across x down|^2, without the cancellation.
     normal = [across[i] * down[j] - across[j] * down[i] for i, j in ((1, 2), (2, 0), (0, 1))]
-    det_sharp = _dot(normal, normal)
+    det_sharp = dot(normal, normal)
     det = det_sharp + EPS_2D * (xx + yy) + EPS_2D * EPS_2D
     xx, yy = xx + EPS_2D, yy + EPS_2D
 
     opacity = torch.sigmoid(logit)
     opacity = opacity * torch.where(antialiased > 0, _safe_sqrt(det_sharp / det), 1.0)
     away = [x - number[19], y - number[20], z - number[21]]
-    per_length = torch.rsqrt(_dot(away, away).clamp_min(TINY))
-    colors = _colors(parameters[11:], [value * per_length for value in away], number[23:])
+    per_length = torch.rsqrt(dot(away, away).clamp_min(TINY))
+    colors = sh_color(parameters[11:], [value * per_length for value in away], number[23:])
     rows = [u, v, depth, yy / det, -xy / det, xx / det, opacity, *colors]
     return [*rows, xx, xy, yy, _radius(u, v, depth, xx, yy, det, width, height, near)] if bounds else rows
 
 
-def _camera_axes(
+def camera_axes(
     rotation: tuple[Tensor, ...], quaternion: tuple[Tensor, ...], deviations: list[Tensor]
 ) -> list[list[Tensor]]:
     """The Gaussian's three axes, one standard deviation long, in camera space: [component][axis]."""
@@ -122,11 +122,13 @@ def _camera_axes(
     )
     columns = [[row[k] for row in turned] for k in range(3)]
     return [
-        [_dot(rotation[3 * i : 3 * i + 3], columns[k]) * deviations[k] for k in range(3)] for i in range(3)
+        [dot(rotation[3 * i : 3 * i + 3], columns[k]) * deviations[k] for k in range(3)] for i in range(3)
     ]
 
 
-def _colors(harmonics: Sequence[Tensor], direction: list[Tensor], in_use: tuple[Tensor, ...]) -> list[Tensor]:
+def sh_color(
+    harmonics: Sequence[Tensor], direction: list[Tensor], in_use: tuple[Tensor, ...]
+) -> list[Tensor]:
     bases = sh_basis_rows(*direction)
     # Multiplied, not left out: coefficients of degrees not in use get a gradient of zeros, as gsplat gives
     # them; Adam counts such steps.
@@ -138,7 +140,7 @@ def _colors(harmonics: Sequence[Tensor], direction: list[Tensor], in_use: tuple[
     return [(value + 0.5).clamp_min(0.0) for value in sums]
 
 
-def _dot(a: list[Tensor] | tuple[Tensor, ...], b: list[Tensor]) -> Tensor:
+def dot(a: list[Tensor] | tuple[Tensor, ...], b: list[Tensor]) -> Tensor:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -183,9 +185,9 @@ def tile_rows(
     seen = seen & (x + radius + GSPLAT_TILE > left) & (x - radius - GSPLAT_TILE < left + width)
     reach = 2.0 * (splats[OPACITY] / MIN_ALPHA).log().clamp_min(0) + REACH_MARGIN
     half_height = (reach * yy).sqrt()
-    first, count = _tile_span(y - half_height, y + half_height, *_gsplat_bounds(y, radius), top, height, side)
+    first, count = tile_span(y - half_height, y + half_height, *gsplat_bounds(y, radius), top, height, side)
     flank = xy * (reach / xx).sqrt()
-    low, high = _gsplat_bounds(x, radius)
+    low, high = gsplat_bounds(x, radius)
     band = (x, y, reach, xy / yy, splats[CONIC_XX], flank, low, high, yy, left, width, side)
     return torch.stack((first, torch.where(seen, count, 0.0))), torch.stack(band)
 
@@ -204,17 +206,17 @@ def tile_columns(bands: Float[Tensor, "b q"], rows: Float[Tensor, "q"]) -> tuple
     right_half = ((reach - right_v * right_v / variance).clamp_min(0) / bands[PRECISION]).sqrt()
     left_half = ((reach - left_v * left_v / variance).clamp_min(0) / bands[PRECISION]).sqrt()
     low, high = x + left_v * bands[SLOPE] - left_half, x + right_v * bands[SLOPE] + right_half
-    return (torch.stack(_tile_span(low, high, bands[LOW], bands[HIGH], bands[LEFT], bands[WIDTH], side)),)
+    return (torch.stack(tile_span(low, high, bands[LOW], bands[HIGH], bands[LEFT], bands[WIDTH], side)),)
 
 
-def _gsplat_bounds(mean: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+def gsplat_bounds(mean: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
     """First and last pixel, along one axis, of the 16 px tiles that the square of the radius touches."""
     first = (mean / GSPLAT_TILE - radius / GSPLAT_TILE).floor() * GSPLAT_TILE
     last = (mean / GSPLAT_TILE + radius / GSPLAT_TILE).ceil() * GSPLAT_TILE - 1
     return first, last
 
 
-def _tile_span(low, high, first_bound, last_bound, start, size, side) -> tuple[Tensor, Tensor]:
+def tile_span(low, high, first_bound, last_bound, start, size, side) -> tuple[Tensor, Tensor]:
     """The tiles along one axis with a pixel centre in [low, high], in the crop and within the bounds.
 
     Returns (first tile, counted from the image's edge; number of tiles).
@@ -232,4 +234,3 @@ SPLAT_BACKWARD = Kernel(
 )
 TILE_ROWS = Kernel("tile-rows", tile_rows, (f"{SPLAT_ROWS} n", f"{GRID} n"), _SH)
 TILE_COLUMNS = Kernel("tile-columns", tile_columns, (f"{BAND_ROWS} q", "q"), _SH)
-SPLAT_KERNELS = (SPLAT, SPLAT_BACKWARD, TILE_ROWS, TILE_COLUMNS)

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from abcd_ns.engine.space.tree import Box, in_float64
 from abcd_ns.engine.space.visibility import (
-    BLUR_PIXELS,
-    half_diagonal,
     reach_radius,
     widest_slant,
     world_size,
@@ -52,12 +50,12 @@ class Frusta:
     """What some crops look at: the space between five planes each, kept on the CPU.
 
     Args:
-        tile_side: of the tiles in which fragments are given to cells, px; see intervals.py.
+        slack: of the rasterizer, px.
     """
 
-    def __init__(self, seen: Iterable[tuple[View, Crop]], tile_side: int) -> None:
+    def __init__(self, seen: Iterable[tuple[View, Crop]], slack: float) -> None:
         self.seen = tuple(seen)
-        planes = [_planes(view, crop, ROUNDING + screen_slack(tile_side)) for view, crop in self.seen]
+        planes = [_planes(view, crop, ROUNDING + slack) for view, crop in self.seen]
         self._planes = torch.stack(planes) if planes else torch.zeros(0, 5, 4, dtype=torch.float64)
 
     def may_show(self, boxes: Sequence[Box]) -> Bool[Tensor, "n v"]:
@@ -71,11 +69,6 @@ class Frusta:
         inward = torch.einsum("nca,vpa->nvpc", corners, self._planes[..., :3]) + self._planes[..., 3:]
         # A corner without end may give NaN, which is not below 0: then the box may show.
         return ~(inward < 0).all(dim=3).any(dim=2)
-
-
-def screen_slack(tile_side: int) -> float:
-    """How far beyond its own size a Gaussian may count on screen, px: blur, and half a tile's diagonal."""
-    return BLUR_PIXELS + half_diagonal(tile_side)
 
 
 def _planes(view: View, crop: Crop, margin: float) -> Float64[Tensor, "5 4"]:
@@ -101,15 +94,15 @@ class Optics:
     """Bounds over all views, for tests of reach that do not depend on the view.
 
     Args:
-        tile_side: of the tiles in which fragments are given to cells, px; see intervals.py.
+        slack: of the rasterizer, px.
     """
 
-    def __init__(self, views: Sequence[View], tile_side: int) -> None:
+    def __init__(self, views: Sequence[View], slack: float) -> None:
         centers = torch.stack([view.center.double().cpu() for view in views])
         self._middle = centers.mean(dim=0)
         self._spread = float((centers - self._middle).norm(dim=1).max())
         self._widest = min(views, key=lambda view: float(view.K.diagonal()[:2].min()))
-        self._pixels = screen_slack(tile_side)
+        self._pixels = slack
         self.slant = max(widest_slant(view) for view in views)
 
     def slack(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

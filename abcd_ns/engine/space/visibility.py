@@ -7,17 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from abcd_ns.engine.render.primitive import DRAWN_SIGMAS
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.types import Crop, Gaussians, View
-
-DRAWN_SIGMAS = 3.33
-"""How far out a Gaussian is drawn, in standard deviations on screen. Fragments under alpha = 1/255 are
-skipped, and opacity is at most 1, so exp(-d^2 / 2) >= 1/255: d <= sqrt(2 ln 255) = 3.3291."""
-
-BLUR_VARIANCE = 0.3
-"""The variance that is added to every projected Gaussian (gsplat's eps2d), px^2."""
-BLUR_PIXELS = DRAWN_SIGMAS * math.sqrt(BLUR_VARIANCE)
-"""How far out it is drawn on that account alone, px."""
 
 
 def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int = 16) -> Crop | None:
@@ -46,11 +38,6 @@ def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int =
 def reach_radius(scales: Float[Tensor, "n 3"], sigma: float = DRAWN_SIGMAS) -> Float[Tensor, "n"]:
     """`sigma` standard deviations along each Gaussian's longest axis, world units; `scales` are logs."""
     return sigma * scales.amax(dim=1).exp()
-
-
-def half_diagonal(side: int) -> float:
-    """From the middle of a tile of `side` px to its farthest point, px."""
-    return side / math.sqrt(2)
 
 
 def world_size(pixels: float, depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:

@@ -226,9 +226,9 @@ class Planner:
         found = self._run.views_at(reduction)
         views = list(found.values())
         if reduction not in self._culling or self._culling[reduction][0] is not found:  # or poses moved
-            side = self._run.rasterizer.window_side
-            frusta = Frusta(((v, v.full) for v in views), side)
-            self._culling[reduction] = found, frusta, Optics(views, side)
+            slack = self._run.rasterizer.slack
+            frusta = Frusta(((v, v.full) for v in views), slack)
+            self._culling[reduction] = found, frusta, Optics(views, slack)
         _, frusta, optics = self._culling[reduction]
         (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
         seeing = [view for view, may in zip(views, shows, strict=True) if may]

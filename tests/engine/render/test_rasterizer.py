@@ -31,6 +31,8 @@ from tests.reference.rasterizer_scenes import (
 VIEW = small_view()
 CROP = Crop(5, 3, 22, 15)
 EAGER = TorchRasterizer("never")
+SURFELS = TorchRasterizer("never", primitive="2dgs")
+BOTH = pytest.mark.parametrize("draw", [EAGER, SURFELS], ids=["3dgs", "2dgs"])
 
 
 def window_for(grid: TileGrid, seed: int = 3) -> ZWindow:
@@ -75,16 +77,18 @@ def test_how_many_tiles_are_drawn_together_changes_nothing_but_rounding(together
         (1, False, CROP, True, 16),
     ],
 )
-def test_equals_the_naive_twin(sh_degree, antialiased, crop, with_frozen, window_side):
+@BOTH
+def test_equals_the_naive_twin(draw, sh_degree, antialiased, crop, with_frozen, window_side):
     gaussians, frozen = random_gaussians(12), random_gaussians(8, seed=7) if with_frozen else None
     window = window_for(TileGrid(crop or VIEW.full, window_side)) if window_side else None
     near, far = by_pixel(window) if window else (None, None)
     options = {"sh_degree": sh_degree, "crop": crop, "frozen": frozen, "antialiased": antialiased}
 
     expected, expected_grads = gradients(
-        lambda g: naive_rasterize(g, VIEW, near=near, far=far, **options), gaussians
+        lambda g: naive_rasterize(g, VIEW, near=near, far=far, primitive=draw.primitive.name, **options),
+        gaussians,
     )
-    image, grads = gradients(lambda g: EAGER(g, VIEW, z_window=window, **options), gaussians)
+    image, grads = gradients(lambda g: draw(g, VIEW, z_window=window, **options), gaussians)
 
     torch.testing.assert_close(image, expected, rtol=1e-11, atol=1e-12)
     for name in PARAM_NAMES:
@@ -348,7 +352,7 @@ def test_clear_errors():
         TorchRasterizer(window_side=6)
     with pytest.raises(ValueError, match="CUDA device"):
         make_rasterizer("gsplat", "cpu")
-    assert make_rasterizer("auto", "cpu").name == TorchRasterizer.name
+    assert make_rasterizer("auto", "cpu").name == EAGER.name
 
 
 def test_each_view_of_a_batch_counts_by_its_own_size():

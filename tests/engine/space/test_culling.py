@@ -46,7 +46,7 @@ def test_what_may_not_show_draws_nothing(seed, size, where, crop):
     gaussians.means[:] = gaussians.means + torch.tensor(where, dtype=torch.float64)
     views = ring_of_views(3, dtype=torch.float64)
     seen = [(view, crop or view.full) for view in views]
-    shows = Frusta(seen, 4).may_show([bounds_of(gaussians)])[0].tolist()
+    shows = Frusta(seen, DRAW.slack).may_show([bounds_of(gaussians)])[0].tolist()
     for (view, crop), shown in zip(seen, shows, strict=True):
         if not shown:
             drawn = DRAW(gaussians, view, crop=crop, sh_degree=0).layer
@@ -65,14 +65,14 @@ def test_most_of_what_is_beside_and_behind_is_passed_over():
             view.center + 20 * right + forward,
         )
     ]
-    assert Frusta([(view, view.full)], 4).may_show(boxes)[:, 0].tolist() == [True, False, False]
+    assert Frusta([(view, view.full)], DRAW.slack).may_show(boxes)[:, 0].tolist() == [True, False, False]
 
 
 def test_a_box_without_end_may_always_show():
     (view,) = ring_of_views(1)
-    assert Frusta([(view, view.full)], 4).may_show([EVERYWHERE]).tolist() == [[True]]
-    assert Frusta([(view, view.full)], 4).may_show([]).shape == (0, 1)
-    assert Frusta([], 4).may_show([EVERYWHERE]).shape == (1, 0)
+    assert Frusta([(view, view.full)], DRAW.slack).may_show([EVERYWHERE]).tolist() == [[True]]
+    assert Frusta([(view, view.full)], DRAW.slack).may_show([]).shape == (0, 1)
+    assert Frusta([], DRAW.slack).may_show([EVERYWHERE]).shape == (1, 0)
 
 
 def test_bounds_hold_means_and_extents():
@@ -105,12 +105,10 @@ def test_intersection_of_boxes():
 
 def test_too_wide_a_lens_switches_bounds_off():
     views = ring_of_views(2)
-    assert (
-        Optics(views, 4).drawn_within(Box(torch.zeros(3).double(), torch.ones(3).double())) is not EVERYWHERE
-    )
-    optics = Optics(views, 4)
+    optics, box = Optics(views, DRAW.slack), Box(torch.zeros(3).double(), torch.ones(3).double())
+    assert optics.drawn_within(box) is not EVERYWHERE
     optics.slant = BOUNDS_SLANT + 0.1
-    assert optics.drawn_within(Box(torch.zeros(3).double(), torch.ones(3).double())) is EVERYWHERE
+    assert optics.drawn_within(box) is EVERYWHERE
 
 
 def street(blocks: int) -> Gaussians:

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.render.extents import extents_of
+from abcd_ns.engine.render.primitive import SPLATS
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.space.visibility import (
-    BLUR_PIXELS,
     footprint,
     reach_radius,
     reaches,
@@ -126,7 +126,8 @@ def test_no_gaussian_draws_in_a_box_it_is_said_not_to_reach(seed, cropped):
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
     box = Box(middle - 0.7, torch.tensor([math.inf, 0.5, 0.9]).double() + middle)
     truth = drawn_in_box(view, crop, box, means2d, radii, depths, conics)
-    anywhere = reaches(gaussians, box, world_size(BLUR_PIXELS, depths.clamp(min=0), view), widest_slant(view))
+    blur = world_size(SPLATS.blur_pixels, depths.clamp(min=0), view)
+    anywhere = reaches(gaussians, box, blur, widest_slant(view))
     assert not bool((truth & ~anywhere).any())
 
 
@@ -136,7 +137,8 @@ def test_the_tests_of_reach_are_not_vacuous():
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
     box = Box(middle - 1.2, middle + 1.2)
     truth = drawn_in_box(view, view.full, box, means2d, radii, depths, conics)
-    anywhere = reaches(gaussians, box, world_size(BLUR_PIXELS, depths.clamp(min=0), view), widest_slant(view))
+    blur = world_size(SPLATS.blur_pixels, depths.clamp(min=0), view)
+    anywhere = reaches(gaussians, box, blur, widest_slant(view))
     assert int(truth.sum()) >= 20
     assert int(anywhere.sum()) < 400
 

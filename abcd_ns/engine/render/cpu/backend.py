@@ -14,8 +14,9 @@ from abcd_ns.engine.render.cpu.binning import Candidates, find_candidates
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.render.cpu.compositing_function import Composite, Job, pair_weights
 from abcd_ns.engine.render.image_size import image_size
+from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree, pack, project_packed
-from abcd_ns.engine.render.splat_kernels import CONIC_XX, DEPTH, GRADED, OPACITY, RADIUS
+from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
 from abcd_ns.engine.render.z_window import ZWindow, showing
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
@@ -45,7 +46,8 @@ class _TakeColumns(torch.autograd.Function):
 
 
 class TorchRasterizer(Rasterizer):
-    """gsplat 1.4.0's `rasterization(packed=False)` in plain torch: same picture, same gradient.
+    """gsplat 1.4.0's `rasterization(packed=False)` or `rasterization_2dgs` in plain torch: same picture, same
+    gradient.
 
     Works in float32 and float64 and on any device; made to be fast on a CPU. Deterministic.
 
@@ -56,12 +58,11 @@ class TorchRasterizer(Rasterizer):
         tile_side: pixels along a tile's side; a divisor of 16. Speed only.
         chunk: Gaussians per kernel call and tile. Speed and memory only.
         window_side: pixels along the sides of the tiles of its z windows; 0 takes `tile_side`.
+        primitive: what a Gaussian is.
 
     Raises:
         ValueError: `tile_side` does not divide 16, or `window_side` is no multiple of it.
     """
-
-    name = "torch-3"
 
     def __init__(
         self,
@@ -70,12 +71,15 @@ class TorchRasterizer(Rasterizer):
         tile_side: int = TILE_SIDE,
         chunk: int = CHUNK,
         window_side: int = 0,
+        primitive: PrimitiveName = "3dgs",
     ) -> None:
         if tile_side < 1 or 16 % tile_side:
             raise ValueError(f"tile_side is {tile_side}; choose one of 1, 2, 4, 8, 16.")
         if window_side % tile_side:
             raise ValueError(f"window_side is {window_side}; choose a multiple of tile_side, {tile_side}.")
-        self.kernels = ChunkKernels(compile, tile_side, chunk)
+        self.primitive = PRIMITIVES[primitive]
+        self.name = f"{self.primitive.prefix}torch-3"
+        self.kernels = ChunkKernels(compile, tile_side, chunk, self.primitive)
         self.tile_side = tile_side
         self.chunk = chunk
         self.window_side = window_side or tile_side
@@ -91,8 +95,11 @@ class TorchRasterizer(Rasterizer):
     ) -> Splats:
         """See Rasterizer.project."""
         check_degree(gaussians, sh_degree)
-        options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": self.kernels.built}
-        return project_packed(self._pack(gaussians), view, **options)
+        return self._project(self._pack(gaussians), view, sh_degree, antialiased)
+
+    def _project(self, packed: Float[Tensor, "p n"], view: View, sh_degree: int, antialiased: bool) -> Splats:
+        options = {"built": self.kernels.built, "primitive": self.primitive}
+        return project_packed(packed, view, sh_degree=sh_degree, antialiased=antialiased, **options)
 
     def draw(
         self,
@@ -106,30 +113,32 @@ class TorchRasterizer(Rasterizer):
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
         check_degree(gaussians, sh_degree)
-        options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": self.kernels.built}
-        packed = pack(gaussians)
-        own = torch.stack([project_packed(packed, shot.view, **options).planes for shot in shots])
-        info = _info(own, shots)
+        packed, graded_rows = pack(gaussians), self.primitive.graded
+        seen = [self._project(packed, shot.view, sh_degree, antialiased) for shot in shots]
+        own = torch.stack([splats.planes for splats in seen])
+        info = _info(own, shots, center := self.primitive.center)
         # Through info's tensor, so that it is in the graph.
         depths = own[:, DEPTH]
         if weigh:
             info["weights"] = depths = torch.zeros_like(depths, requires_grad=True)
-        rows = (info["means2d"].transpose(1, 2), depths[:, None], own[:, CONIC_XX:GRADED])
+        graded = torch.cat((own[:, :DEPTH], depths[:, None], own[:, DEPTH + 1 : graded_rows]), dim=1)
+        rows = (graded[:, :center], info["means2d"].transpose(1, 2), graded[:, center + 2 :])
         graded = torch.cat(rows, dim=1)
         graded, bounds = _side_by_side(graded), _side_by_side(own.detach())
         grid_of = torch.arange(len(shots), device=own.device).repeat_interleave(own.shape[2])
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
         if frozen:
             others = [_without_depths(planes) if weigh else planes for _, planes in frozen]
-            graded = torch.cat((graded, *(planes[:GRADED] for planes in others)), dim=1)
+            graded = torch.cat((graded, *(planes[:graded_rows] for planes in others)), dim=1)
             bounds = torch.cat((bounds, *(planes for _, planes in frozen)), dim=1)
             grid_of = torch.cat((grid_of, *(grid_of.new_full((p.shape[1],), k) for k, p in frozen)))
         sheet = TileSheet(tuple(TileGrid(shot.crop, self.tile_side) for shot in shots))
-        candidates = find_candidates(Splats(bounds), grid_of, sheet, built=self.kernels.built)
+        candidates = self._find(Splats(bounds), grid_of, sheet)
         if any(shot.z_window is not None for shot in shots):
             masked = _masked(shots, grid_of, own.shape[0] * own.shape[2])
             candidates = candidates.within([shot.z_window for shot in shots], masked)
-        job = self._job(candidates, bounds, info["means2d"] if absgrad else None)
+        sums_absolute = absgrad and self.primitive.has_absgrad
+        job = self._job(candidates, bounds, info["means2d"] if sums_absolute else None)
         images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, candidates.rows), job))
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
@@ -174,7 +183,7 @@ class TorchRasterizer(Rasterizer):
     ) -> list[ZWindow]:
         projected = [self.project(gaussians, view, antialiased=antialiased) for view, _ in seen]
         splats, candidates = self._candidates(projected, [crop for _, crop in seen])
-        drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
+        drawn = splats.planes[: self.primitive.graded].index_select(1, candidates.rows)
         weight = pair_weights(drawn, self._job(candidates, splats.planes))
         # Pairs come by depth, so that sorting by tile alone keeps them in order.
         tile, order = candidates.pairs.tile.int().sort(stable=True)
@@ -193,10 +202,14 @@ class TorchRasterizer(Rasterizer):
         sheet = TileSheet(tuple(TileGrid(crop, self.tile_side) for crop in crops))
         splats = Splats(torch.cat([splats.planes for splats in seen], dim=1)) if len(seen) > 1 else seen[0]
         grid_of = torch.arange(len(seen), device=splats.planes.device).repeat_interleave(len(seen[0]))
-        return splats, find_candidates(splats, grid_of, sheet, built=self.kernels.built)
+        return splats, self._find(splats, grid_of, sheet)
+
+    def _find(self, splats: Splats, grid_of: Int[Tensor, "n"], sheet: TileSheet) -> Candidates:
+        options = {"built": self.kernels.built, "primitive": self.primitive}
+        return find_candidates(splats, grid_of, sheet, **options)
 
     def _layers(self, splats: Splats, candidates: Candidates) -> list[Layer]:
-        drawn = splats.planes[:GRADED].index_select(1, candidates.rows)
+        drawn = splats.planes[: self.primitive.graded].index_select(1, candidates.rows)
         images = candidates.sheet.to_images(Composite.apply(drawn, self._job(candidates, splats.planes)))
         return [Layer(image[1:4].permute(1, 2, 0), image[0]) for image in images]
 
@@ -229,7 +242,8 @@ def _a_few(items: Sequence[Item], crops: Sequence[Crop], gaussians: Gaussians) -
 
 
 def _without_depths(planes: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:
-    return torch.cat((planes[:DEPTH], torch.zeros_like(planes[DEPTH:CONIC_XX]), planes[CONIC_XX:]))
+    rest = planes[DEPTH + 1 :]
+    return torch.cat((planes[:DEPTH], torch.zeros_like(planes[DEPTH : DEPTH + 1]), rest))
 
 
 def _side_by_side(planes: Float[Tensor, "v r n"]) -> Float[Tensor, "r vn"]:
@@ -244,14 +258,13 @@ def _masked(shots: Sequence[Shot], grid_of: Int[Tensor, "n"], own: int) -> Bool[
     return is_frozen == masks_frozen[grid_of]
 
 
-def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot]) -> dict[str, Any]:
+def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot], center: int) -> dict[str, Any]:
     """What gsplat's densification strategies read."""
     return {
-        "means2d": own[:, :DEPTH].transpose(1, 2),
-        "radii": own[:, RADIUS].detach().int(),
+        "means2d": own[:, center : center + 2].transpose(1, 2),
+        "radii": own[:, -1].detach().int(),
         "depths": own[:, DEPTH],
-        "conics": own[:, CONIC_XX:OPACITY].transpose(1, 2),
-        "opacities": own[:, OPACITY],
+        "opacities": own[:, -8],
         **image_size([shot.view for shot in shots], own.device),
         "n_cameras": len(shots),
         "camera_ids": None,

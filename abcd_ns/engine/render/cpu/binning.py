@@ -15,8 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.render.splat_kernels import DEPTH, TILE_COLUMNS, TILE_ROWS
+from abcd_ns.engine.render.splat_kernels import DEPTH, TILE_COLUMNS
 from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
 from abcd_ns.engine.render.z_window import ZWindow
 
@@ -237,7 +238,12 @@ class Candidates:
 
 @torch.no_grad()
 def find_candidates(
-    splats: Splats, grid_of: Int[Tensor, "n"], sheet: TileSheet, *, built: bool = True
+    splats: Splats,
+    grid_of: Int[Tensor, "n"],
+    sheet: TileSheet,
+    *,
+    built: bool = True,
+    primitive: Primitive = SPLATS,
 ) -> Candidates:
     """What the tiles may have to draw.
 
@@ -246,7 +252,7 @@ def find_candidates(
         built: use machine code where it is there.
     """
     planes = splats.planes.detach()
-    spans, bands = TILE_ROWS(planes, sheet.numbers(planes).index_select(1, grid_of), built=built)
+    spans, bands = primitive.tile_rows(planes, sheet.numbers(planes).index_select(1, grid_of), built=built)
     rows = (spans[1] > 0).nonzero()[:, 0]
     depths = planes[DEPTH].index_select(0, rows).sort(stable=True)
     rows = rows.index_select(0, depths.indices)

@@ -1,6 +1,7 @@
 """The chunk kernels of one size, and the choice between eager and built ones."""
 
 import functools
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -9,28 +10,47 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.kernels.build import build_kernels
-from abcd_ns.engine.render import splat_kernels
-from abcd_ns.engine.render.cpu.torch_kernels import STATE_PLANES, backward_chunk, forward_chunk, weigh_chunk
-from abcd_ns.engine.render.splat_kernels import GRADED, OPACITY, SPLAT_KERNELS
+from abcd_ns.engine.render import splat_kernels, surfel_kernels
+from abcd_ns.engine.render.cpu import splat_fragments, surfel_fragments
+from abcd_ns.engine.render.cpu.splat_fragments import SplatFragments
+from abcd_ns.engine.render.cpu.surfel_fragments import SurfelFragments
+from abcd_ns.engine.render.cpu.torch_kernels import (
+    STATE_PLANES,
+    Fragments,
+    backward_chunk,
+    forward_chunk,
+    weigh_chunk,
+)
+from abcd_ns.engine.render.primitive import SPLATS, Primitive
 
 CompilePolicy = Literal["auto", "always", "never"]
 
 
+FRAGMENTS: dict[str, Fragments] = {"3dgs": SplatFragments(), "2dgs": SurfelFragments()}
+"""By primitive."""
+DEPENDS = {
+    "3dgs": (splat_kernels.__file__, splat_fragments.__file__),
+    "2dgs": (splat_kernels.__file__, surfel_kernels.__file__, surfel_fragments.__file__),
+}
+"""Source files."""
+
+
 @functools.cache
-def chunk_kernels(side: int, chunk: int) -> tuple[Kernel, Kernel, Kernel]:
+def chunk_kernels(side: int, chunk: int, primitive: Primitive = SPLATS) -> tuple[Kernel, Kernel, Kernel]:
     """`forward_chunk`, `backward_chunk`, `weigh_chunk` for tiles of `side` px, `chunk` Gaussians a call."""
-    pixels = side * side
+    pixels, fragments = side * side, FRAGMENTS[primitive.name]
     state = f"{STATE_PLANES} {pixels} a"
-    given = (f"{GRADED} {chunk} a", "2 a", state)
-    depends = (splat_kernels.__file__,)
-    forward = functools.partial(forward_chunk, side)
-    backward = functools.partial(backward_chunk, side)
-    weigh = functools.partial(weigh_chunk, side)
-    seen = (f"{OPACITY + 1} {chunk} a", "2 a", f"1 {pixels} a")
+    given = (f"{fragments.opacity + 4} {chunk} a", "2 a", state)
+    seen = (f"{fragments.opacity + 1} {chunk} a", "2 a", f"1 {pixels} a")
+
+    def kernel(name: str, function: Callable[..., tuple[Tensor, ...]], shapes: tuple[str, ...]) -> Kernel:
+        bound = functools.partial(function, fragments, side)
+        return Kernel(f"{primitive.prefix}{name}-{side}-{chunk}", bound, shapes, DEPENDS[primitive.name])
+
     return (
-        Kernel(f"forward-{side}-{chunk}", forward, given, depends),
-        Kernel(f"backward-{side}-{chunk}", backward, (*given, state), depends),
-        Kernel(f"weigh-{side}-{chunk}", weigh, seen, depends),
+        kernel("forward", forward_chunk, given),
+        kernel("backward", backward_chunk, (*given, state)),
+        kernel("weigh", weigh_chunk, seen),
     )
 
 
@@ -42,9 +62,10 @@ class ChunkKernels:
             "always" builds them now; "never" is eager.
     """
 
-    def __init__(self, policy: CompilePolicy, side: int, chunk: int) -> None:
-        self._policy, self._size = policy, (side, chunk)
-        self._forward, self._backward, self._weigh = chunk_kernels(side, chunk)
+    def __init__(self, policy: CompilePolicy, side: int, chunk: int, primitive: Primitive = SPLATS) -> None:
+        self._policy, self._size, self._primitive = policy, (side, chunk), primitive
+        self._forward, self._backward, self._weigh = chunk_kernels(side, chunk, primitive)
+        self.fragments = FRAGMENTS[primitive.name]
         self.built = policy != "never" and all(kernel.is_built for kernel in self._all)
         """Whether float32 on the CPU runs fast."""
         if policy == "always":
@@ -53,12 +74,12 @@ class ChunkKernels:
     def warm_up(self) -> None:
         """Build the kernels, a few minutes once per machine, unless the policy is "never"."""
         if self._policy != "never" and not self.built:
-            build_kernels(self._all, *self._size)
+            build_kernels(self._all, *self._size, self._primitive.name)
             self.built = all(kernel.is_built for kernel in self._all)
 
     @property
     def _all(self) -> tuple[Kernel, ...]:
-        return (*SPLAT_KERNELS, self._forward, self._backward, self._weigh)
+        return (*self._primitive.kernels, self._forward, self._backward, self._weigh)
 
     def forward(
         self,

@@ -12,13 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.render.cpu.binning import Level, TileLists
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels
-from abcd_ns.engine.render.cpu.torch_kernels import (
-    ALL_GRADIENTS,
-    GRADIENTS,
-    STATE_PLANES,
-    gather_params,
-)
-from abcd_ns.engine.render.splat_kernels import CONIC_XX, OPACITY
+from abcd_ns.engine.render.cpu.torch_kernels import STATE_PLANES, gather_params
 
 COMPACT = 0.75
 """Tiles whose pixels are all finished are dropped once fewer than this share is left."""
@@ -33,7 +27,8 @@ class Job:
     """How many there are in all, drawn or not."""
     kernels: ChunkKernels
     absgrad_target: Tensor | None
-    """Gets an attribute `absgrad` in the backward pass: means2d [v, n, 2] of the first v n splats."""
+    """Gets an attribute `absgrad` in the backward pass: means2d [v, n, 2] of the first v n splats. None where
+    the primitive has no such sums."""
 
 
 class _Drawn(NamedTuple):
@@ -127,9 +122,9 @@ def _composite(
 
 
 class Composite(torch.autograd.Function):
-    """Drawn Gaussians by rank [10, m] -> planes [5, p, t] of all tiles: transmittance, colour, depth.
+    """Drawn Gaussians by rank [d, m] -> planes [5, p, t] of all tiles: transmittance, colour, depth.
 
-    Rows are the GRADED ones of splat_kernels. Memory for the backward pass: five planes per tile and chunk
+    Rows are the GRADED ones of a primitive. Memory for the backward pass: five planes per tile and chunk
     of K Gaussians, that is 5/K floats per fragment instead of the dozens that autograd would keep; everything
     else is computed again.
     """
@@ -142,26 +137,26 @@ class Composite(torch.autograd.Function):
         planes = final.new_zeros((STATE_PLANES, sheet.pixels_per_tile, sheet.tiles))
         planes[0] = 1.0
         planes.index_copy_(2, lists.tiles, torch.cat((final[:1].abs(), final[1:])))
-        ctx.job, ctx.drawn = job, [(drawn.level, drawn.columns) for drawn in trace]
-        ctx.save_for_backward(table, origins, final, *(drawn.state for drawn in trace))
+        ctx.job, ctx.drawn = job, [(level.level, level.columns) for level in trace]
+        ctx.save_for_backward(drawn, table, origins, final, *(level.state for level in trace))
         return planes
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Float[Tensor, "5 p t"]) -> tuple[Float[Tensor, "d m"], None]:
-        job, lists = ctx.job, ctx.job.lists
-        table, origins, final, *states = ctx.saved_tensors
+        job, lists, fragments = ctx.job, ctx.job.lists, ctx.job.kernels.fragments
+        drawn, table, origins, final, *states = ctx.saved_tensors
         tiled = grad.index_select(2, lists.tiles)
         total = (final[1:] * tiled[1:]).sum(dim=0) + final[0].abs() * tiled[0]
         upstream = torch.cat((tiled[1:], total[None]))
-        trace = [_Drawn(*drawn, state) for drawn, state in zip(ctx.drawn, states, strict=True)]
+        trace = [_Drawn(*level, state) for level, state in zip(ctx.drawn, states, strict=True)]
         per_slot = _slot_gradients(job, table, origins, upstream, trace)
         sums = sum_bags(per_slot, lists.slots, lists.bags)
         if job.absgrad_target is not None:
             target = job.absgrad_target
-            absolute = sums.new_zeros((job.splats, 2)).index_copy_(0, lists.rows, sums[:, GRADIENTS:])
+            absolute = sums.new_zeros((job.splats, 2)).index_copy_(0, lists.rows, sums[:, -2:])
             target.absgrad = absolute[: target.shape[0] * target.shape[1]].view_as(target)
-        return _to_parameters(table[:, :-1], sums), None
+        return fragments.to_drawn(drawn, sums), None
 
 
 def _slot_gradients(
@@ -169,7 +164,7 @@ def _slot_gradients(
 ) -> Float[Tensor, "s g"]:
     """The backward kernel's sums for every slot; 0 for slots that early stopping left out."""
     lists = job.lists
-    kept = GRADIENTS if job.absgrad_target is None else ALL_GRADIENTS
+    kept = job.kernels.fragments.gradients + (0 if job.absgrad_target is None else 2)
     per_slot = table.new_zeros((lists.ranks.numel(), kept))
     for level, columns, state in trace:
         params = gather_params(table, _level_ranks(lists, level, columns))
@@ -191,7 +186,8 @@ def _put(per_slot: Tensor, level: Level, columns: Tensor | None, by_slot: Tensor
 def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
     """For each pair of the job's lists the sum of the Gaussian's weight alpha T over the tile's pixels."""
     lists = job.lists
-    table, origins = _table(drawn[: OPACITY + 1], job)
+    table, origins = _table(drawn, job)
+    table = table[: job.kernels.fragments.opacity + 1]
     per_slot = table.new_zeros(lists.ranks.numel())
 
     def weigh(level: Level, columns: Tensor | None, state: Tensor) -> Tensor:
@@ -206,7 +202,7 @@ def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
 
 def _table(drawn: Float[Tensor, "d m"], job: Job) -> tuple[Float[Tensor, "c n"], Float[Tensor, "2 a"]]:
     """What is drawn, with a last column of opacity 0 for empty slots, and the tiles' corners."""
-    table = F.pad(drawn, (0, 1))
+    table = F.pad(job.kernels.fragments.table(drawn), (0, 1))
     return table, job.lists.sheet.origins(table).index_select(1, job.lists.tiles)
 
 
@@ -221,15 +217,3 @@ def sum_bags(
     ends = torch.cat((starts[1:], starts.new_tensor([members.numel()])))
     owner = torch.repeat_interleave(torch.arange(starts.numel(), device=starts.device), ends - starts)
     return values.new_zeros((starts.numel(), values.shape[1])).index_add_(0, owner, values[members])
-
-
-def _to_parameters(table: Float[Tensor, "c m"], sums: Float[Tensor, "m g"]) -> Float[Tensor, "d m"]:
-    """Gradients of the drawn rows, from the backward kernel's sums.
-
-    sigma = (xx dx^2 + yy dy^2) / 2 + xy dx dy and alpha = opacity exp(-sigma), with d = mean - pixel.
-    """
-    xx, xy, yy, opacity = table[CONIC_XX : OPACITY + 1]
-    s, s_dx, s_dy, s_xx, s_xy, s_yy, red, green, blue, depth = sums.T[:GRADIENTS]
-    means = (xx * s_dx + xy * s_dy, xy * s_dx + yy * s_dy)
-    conics = (0.5 * s_xx, s_xy, 0.5 * s_yy)
-    return torch.stack((*means, depth, *conics, -s / opacity, red, green, blue))

@@ -8,23 +8,13 @@ stops for good at the fragment that would bring T to 1e-4 or below; the *sign* o
 T is negative is finished, and |T| is its transmittance. Pixels outside the image start at T = -1.
 """
 
+from typing import Any, Protocol, runtime_checkable
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from abcd_ns.engine.render.splat_kernels import (
-    BLUE,
-    CONIC_XX,
-    CONIC_XY,
-    CONIC_YY,
-    DEPTH,
-    GREEN,
-    MIN_ALPHA,
-    OPACITY,
-    RED,
-    X,
-    Y,
-)
+from abcd_ns.engine.render.splat_kernels import DEPTH, MIN_ALPHA, X, Y
 
 MAX_ALPHA = 0.999
 """Alphas are clamped to this."""
@@ -32,13 +22,45 @@ MIN_TRANSMITTANCE = 1e-4
 """The fragment after which T would be at most this, and all behind it, are not drawn."""
 STATE_PLANES = 5
 
-MOMENTS = 6
-GRADIENTS = MOMENTS + 4
-"""What the backward kernel sums per Gaussian and tile: with s = dL/dsigma and d = mean - pixel, the moments
-s, s dx, s dy, s dx^2, s dx dy, s dy^2; then dL/d(red, green, blue, depth); then |dL/d(x, y)|."""
-ALL_GRADIENTS = GRADIENTS + 2
-
 Params = Float[Tensor, "c k a"]
+
+
+@runtime_checkable
+class Fragments(Protocol):
+    """What a primitive is to these kernels: alpha at a pixel, and what follows from its gradient.
+
+    Its parameters are rows: x and y of the mean, camera z, others of its own, opacity, red, green, blue.
+    """
+
+    opacity: int
+    """Which row that is; colours come after it."""
+    gradients: int
+    """Sums that `sums` gives without those of absolute values."""
+
+    def alphas(self, side: int, params: Params, origins: Float[Tensor, "2 a"]) -> tuple[Tensor, Any]:
+        """min(0.999, opacity exp(-sigma)) of each fragment, [k, p, a], 0 where it is not drawn; and whatever
+        `sums` wants to know again."""
+        ...
+
+    def sums(
+        self, params: Params, known: Any, weights: Tensor, sigma_grads: Tensor, upstream: Tensor
+    ) -> list[Tensor]:
+        """What is to be summed over pixels, [k, p, a] each; the last four are dL/d(red, green, blue, depth).
+
+        Args:
+            weights: alpha T.
+            sigma_grads: dL/dsigma.
+            upstream: dL/d(red, green, blue, depth) of each pixel.
+        """
+        ...
+
+    def table(self, drawn: Float[Tensor, "d m"]) -> Float[Tensor, "c m"]:
+        """Parameters from the rows that a rasterizer projects, see Splats."""
+        ...
+
+    def to_drawn(self, drawn: Float[Tensor, "d m"], sums: Float[Tensor, "m g"]) -> Float[Tensor, "d m"]:
+        """Gradients of these rows from the sums."""
+        ...
 
 
 def gather_params(table: Float[Tensor, "c m"], ranks: Int[Tensor, "k a"]) -> Params:
@@ -46,7 +68,7 @@ def gather_params(table: Float[Tensor, "c m"], ranks: Int[Tensor, "k a"]) -> Par
     return table.index_select(1, ranks.reshape(-1)).view(table.shape[0], *ranks.shape)
 
 
-def _offsets(params: Params, origins: Float[Tensor, "2 a"], side: int) -> tuple[Tensor, Tensor]:
+def offsets(params: Params, origins: Float[Tensor, "2 a"], side: int) -> tuple[Tensor, Tensor]:
     """Mean minus pixel centre: dx [k, side, 1, a]-like planes, both broadcast to [k, p, a]."""
     pixel = torch.arange(side * side, device=params.device)
     columns = ((pixel % side) + 0.5).to(params.dtype)[:, None]
@@ -54,14 +76,6 @@ def _offsets(params: Params, origins: Float[Tensor, "2 a"], side: int) -> tuple[
     dx = (params[X] - origins[0])[:, None] - columns
     dy = (params[Y] - origins[1])[:, None] - rows
     return dx, dy
-
-
-def _alphas(params: Params, dx: Tensor, dy: Tensor) -> Float[Tensor, "k p a"]:
-    """min(0.999, opacity exp(-sigma)) of each fragment, 0 where it is not drawn."""
-    half_xx, xy, half_yy = 0.5 * params[CONIC_XX], params[CONIC_XY], 0.5 * params[CONIC_YY]
-    sigma = dx * (half_xx[:, None] * dx + xy[:, None] * dy) + half_yy[:, None] * dy * dy
-    alphas = (params[OPACITY][:, None] * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
-    return torch.where((sigma >= 0) & (alphas >= MIN_ALPHA), alphas, 0.0)
 
 
 def _advance(T: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -72,24 +86,27 @@ def _advance(T: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def forward_chunk(
+    fragments: Fragments,
     side: int,
     params: Params,
     origins: Float[Tensor, "2 a"],
     state: Float[Tensor, "5 p a"],
 ) -> tuple[Float[Tensor, "5 p a"]]:
     """Composite one chunk behind what `state` holds."""
-    alphas = _alphas(params, *_offsets(params, origins, side))
+    alphas, _ = fragments.alphas(side, params, origins)
+    color = fragments.opacity + 1
     T, red, green, blue, depth = state.unbind(0)
     for k in range(params.shape[1]):
         T, weight, _ = _advance(T, alphas[k])
-        red = red + weight * params[RED, k]
-        green = green + weight * params[GREEN, k]
-        blue = blue + weight * params[BLUE, k]
+        red = red + weight * params[color, k]
+        green = green + weight * params[color + 1, k]
+        blue = blue + weight * params[color + 2, k]
         depth = depth + weight * params[DEPTH, k]
     return (torch.stack((T, red, green, blue, depth)),)
 
 
 def weigh_chunk(
+    fragments: Fragments,
     side: int,
     params: Params,
     origins: Float[Tensor, "2 a"],
@@ -101,7 +118,7 @@ def weigh_chunk(
         params: rows up to the opacity.
         state: transmittance.
     """
-    alphas = _alphas(params, *_offsets(params, origins, side))
+    alphas, _ = fragments.alphas(side, params, origins)
     T, sums = state[0], []
     for k in range(params.shape[1]):
         T, weight, _ = _advance(T, alphas[k])
@@ -110,6 +127,7 @@ def weigh_chunk(
 
 
 def backward_chunk(
+    fragments: Fragments,
     side: int,
     params: Params,
     origins: Float[Tensor, "2 a"],
@@ -128,17 +146,17 @@ def backward_chunk(
         state: as it was before the chunk.
         upstream: dL/d(red, green, blue, depth), then `total`.
     """
-    dx, dy = _offsets(params, origins, side)
-    alphas = _alphas(params, dx, dy)
+    alphas, known = fragments.alphas(side, params, origins)
+    color = fragments.opacity + 1
     T, total = state[0], upstream[4]
     done = (state[1:] * upstream[:4]).sum(dim=0)
     weights, sigma_grads = [], []
     for k in range(params.shape[1]):
         alpha = alphas[k]
         value = (
-            upstream[0] * params[RED, k]
-            + upstream[1] * params[GREEN, k]
-            + upstream[2] * params[BLUE, k]
+            upstream[0] * params[color, k]
+            + upstream[1] * params[color + 1, k]
+            + upstream[2] * params[color + 2, k]
             + upstream[3] * params[DEPTH, k]
         )
         next_T, weight, drawn = _advance(T, alpha)
@@ -148,21 +166,13 @@ def backward_chunk(
         sigma_grads.append(torch.where(drawn & (alpha < MAX_ALPHA), -alpha * alpha_grad, 0.0))
         weights.append(weight)
         T = next_T
-    sums = _sum_pixels(params, dx, dy, torch.stack(weights), torch.stack(sigma_grads), upstream)
-    return (sums,)
+    sums = fragments.sums(params, known, torch.stack(weights), torch.stack(sigma_grads), upstream)
+    return (torch.stack([plane.sum(dim=1) for plane in sums]),)
 
 
-def _sum_pixels(
-    params: Params,
-    dx: Tensor,
-    dy: Tensor,
-    weights: Tensor,
-    sigma_grads: Tensor,
-    upstream: Tensor,
-) -> Float[Tensor, "g k a"]:
-    s_dx, s_dy = sigma_grads * dx, sigma_grads * dy
-    planes = [sigma_grads, s_dx, s_dy, s_dx * dx, s_dx * dy, s_dy * dy]
-    planes += [weights * upstream[channel] for channel in range(4)]
-    xx, xy, yy = params[CONIC_XX][:, None], params[CONIC_XY][:, None], params[CONIC_YY][:, None]
-    planes += [(xx * s_dx + xy * s_dy).abs(), (xy * s_dx + yy * s_dy).abs()]
-    return torch.stack([plane.sum(dim=1) for plane in planes])
+def alpha_of(
+    opacity: Float[Tensor, "k a"], sigma: Float[Tensor, "k p a"], drawn: Tensor
+) -> Float[Tensor, "k p a"]:
+    """min(0.999, opacity exp(-sigma)) where it is drawn, else 0."""
+    alphas = (opacity[:, None] * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
+    return torch.where(drawn & (alphas >= MIN_ALPHA), alphas, 0.0)

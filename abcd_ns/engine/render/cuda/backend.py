@@ -14,11 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.cuda.kinds import KINDS
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, Packed
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_screen, project
 from abcd_ns.engine.render.extents import extents_of
+from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree
-from abcd_ns.engine.render.splat_kernels import SPLAT_ROWS
 from abcd_ns.engine.render.z_window import ZWindow, showing
 from abcd_ns.engine.types import Crop, Gaussians, View
 
@@ -33,8 +34,9 @@ class GsplatRasterizer(Rasterizer):
 
     window_side = TILE
 
-    def __init__(self) -> None:
-        self.name = f"gsplat-{gsplat.__version__}"
+    def __init__(self, primitive: PrimitiveName = "3dgs") -> None:
+        self.primitive, self._kind = PRIMITIVES[primitive], KINDS[primitive]
+        self.name = f"{self.primitive.prefix}gsplat-{gsplat.__version__}"
         self._cameras = Cameras()
 
     def warm_up(self) -> None:
@@ -47,8 +49,8 @@ class GsplatRasterizer(Rasterizer):
         """See Rasterizer.project."""
         check_degree(gaussians, sh_degree)
         if len(gaussians) == 0:
-            return Splats(gaussians.means.new_zeros((SPLAT_ROWS, 0)))
-        return project(gaussians, [view], self._cameras, sh_degree, antialiased).splats(0)
+            return Splats(gaussians.means.new_zeros((self.primitive.graded + 4, 0)))
+        return project(self._kind, gaussians, [view], self._cameras, sh_degree, antialiased).splats(0)
 
     @torch.no_grad()
     def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
@@ -61,7 +63,7 @@ class GsplatRasterizer(Rasterizer):
             for k in range(0, len(places), most):
                 part = places[k : k + most]
                 seen = [views[place] for place in part]
-                radii, means2d, *_ = place_on_screen(gaussians, seen, self._cameras)
+                (radii, means2d, *_), _ = place_on_screen(self._kind, gaussians, seen, self._cameras)
                 for place, extent in zip(part, extents_of(means2d, radii, seen[0]), strict=True):
                     found[place] = extent
         return torch.stack(found).cpu()
@@ -124,7 +126,8 @@ class GsplatRasterizer(Rasterizer):
         return showing(drawing.sheet.grids[0], drawing.tile, drawing.z, drawing.weights(), visible)
 
     def _drawing_of(self, splats: Splats, crop: Crop, windowed: bool = False) -> Drawing:
-        return Drawing.of(Packed.of_splats([(0, splats)]), [crop], self._cameras, windowed=windowed)
+        packed = Packed.of_splats([(0, splats)])
+        return Drawing.of(self._kind, packed, [crop], self._cameras, windowed=windowed)
 
     def _draw_alike(
         self,
@@ -141,7 +144,7 @@ class GsplatRasterizer(Rasterizer):
         ]
         if len(gaussians) == 0 and not frozen:
             return _nothing(gaussians, shots)
-        own = project(gaussians, views, self._cameras, sh_degree, antialiased)
+        own = project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased)
         weights = torch.zeros_like(own.depths, requires_grad=weigh)
         everyone = Packed.of(_showing(own, weights) if weigh else own)
         if frozen:
@@ -150,10 +153,11 @@ class GsplatRasterizer(Rasterizer):
             everyone = everyone.and_then(others)
         windows = [shot.z_window for shot in shots]
         windowed = any(window is not None for window in windows)
-        drawing = Drawing.of(everyone, crops, self._cameras, windowed=windowed)
+        drawing = Drawing.of(self._kind, everyone, crops, self._cameras, windowed=windowed)
         if windowed:
             always = 0 if shots[0].frozen is None else own.radii.numel()
             drawing = drawing.only(drawing.inside(windows, always))
+        absgrad = absgrad and self.primitive.has_absgrad
         if absgrad and own.means2d.requires_grad:
             _forward_absgrad(own.means2d, drawing.means2d)
         info = _info(own, views[0]) | ({"weights": weights} if weigh else {})
@@ -193,9 +197,11 @@ def _forward_absgrad(means2d: Float[Tensor, "c n 2"], drawn: Float[Tensor, "m 2"
 
 
 def _info(own: Projected, view: View) -> dict[str, Any]:
-    names = ("means2d", "radii", "depths", "conics", "opacities")
-    info: dict[str, Any] = {name: getattr(own, name) for name in names}
-    return info | {
+    return {
+        "means2d": own.centers,
+        "radii": own.radii,
+        "depths": own.depths,
+        "opacities": own.opacities,
         "width": view.width,
         "height": view.height,
         "n_cameras": len(own.radii),
@@ -211,7 +217,8 @@ def _nothing(gaussians: Gaussians, shots: Sequence[Shot]) -> list[Raster]:
         gaussians.opacities[:, 0].expand(len(shots), -1),
     )
     features = means.new_zeros((len(shots), 0, 4))
-    empty = Projected(opacities.int(), means[..., :2], opacities, means, opacities, features)
-    zero, info = empty.means2d.sum(), _info(empty, shots[0].view)
+    centers = means[..., :2]
+    empty = Projected(opacities.int(), centers, opacities, means, opacities, features, centers)
+    zero, info = empty.centers.sum(), _info(empty, shots[0].view)
     colors = [zero.expand(shot.crop.height, shot.crop.width, 3) for shot in shots]
     return [Raster(color, 1.0 - color[..., 0], color[..., 0], info) for color in colors]

@@ -6,15 +6,16 @@ what is left out goes to the end of the list, to a tile that is not drawn.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import torch
 import torch.nn.functional as F
-from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles, rasterize_to_pixels
+from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles
 from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
+from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -35,7 +36,7 @@ class Packed:
     radii: Int[Tensor, "m"]
     means2d: Float[Tensor, "m 2"]
     depths: Float[Tensor, "m"]
-    conics: Float[Tensor, "m 3"]
+    shapes: Float[Tensor, "m s"]
     opacities: Float[Tensor, "m"]
     features: Float[Tensor, "m 4"]
 
@@ -47,7 +48,8 @@ class Packed:
         """Camera by camera."""
         cameras, n = projected.radii.shape
         numbers = torch.arange(cameras, device=projected.radii.device)[:, None].expand(-1, n)
-        return Packed(numbers.flatten(), *(value.flatten(0, 1) for value in vars(projected).values()))
+        names = (field.name for field in fields(Packed) if field.name != "cameras")
+        return Packed(numbers.flatten(), *(getattr(projected, name).flatten(0, 1) for name in names))
 
     @staticmethod
     def of_splats(splats: Sequence[tuple[int, Splats]]) -> "Packed":
@@ -55,7 +57,7 @@ class Packed:
         numbers = [s.planes.new_full((len(s),), camera, dtype=torch.int64) for camera, s in splats]
         each = Splats(torch.cat([s.planes for _, s in splats], dim=1))
         features = torch.cat((each.colors, each.depths[:, None]), dim=-1)
-        values = (each.radii, each.means2d, each.depths, each.conics, each.opacities, features)
+        values = (each.radii, each.means2d, each.depths, each.shapes, each.opacities, features)
         return Packed(torch.cat(numbers), *(value.contiguous() for value in values))
 
     def and_then(self, others: "Packed") -> "Packed":
@@ -145,9 +147,12 @@ class Sheet:
 class Drawing:
     """Second half of gsplat's `rasterization(packed=True)`, for crops."""
 
+    kind: Kind
     splats: Packed
     means2d: Float[Tensor, "m 2"]
     """Relative to the upper left tile of each splat's crop."""
+    shapes: Float[Tensor, "m s"]
+    """Likewise."""
     sheet: Sheet
     keys: Int64[Tensor, "q"]
     """Sorted: camera, tile, bits of the depth."""
@@ -155,7 +160,9 @@ class Drawing:
     """Whose they are."""
 
     @staticmethod
-    def of(splats: Packed, crops: Sequence[Crop], cameras: Cameras, *, windowed: bool = False) -> "Drawing":
+    def of(
+        kind: Kind, splats: Packed, crops: Sequence[Crop], cameras: Cameras, *, windowed: bool = False
+    ) -> "Drawing":
         """What may be drawn in a crop of each camera.
 
         Args:
@@ -165,9 +172,10 @@ class Drawing:
         # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
         # By 0 too: a view would hold on to what it is of, which holds on to this (see _forward_absgrad).
         corners = cameras.corners(sheet.tiled, splats.means2d)
-        means2d = splats.means2d - (corners if len(crops) == 1 else corners.index_select(0, splats.cameras))
+        corners = corners if len(crops) == 1 else corners.index_select(0, splats.cameras)
+        means2d, shapes = splats.means2d - corners, kind.moved(splats.shapes, corners)
         if len(splats) == 0:
-            return Drawing(splats, means2d, sheet, splats.cameras, splats.cameras.int())
+            return Drawing(kind, splats, means2d, shapes, sheet, splats.cameras, splats.cameras.int())
         _, rows, cols = sheet.shape
         _, keys, owners = isect_tiles(
             means2d,
@@ -181,7 +189,7 @@ class Drawing:
             camera_ids=splats.cameras,
             gaussian_ids=splats.cameras,  # asked for, and not read
         )
-        return Drawing(splats, means2d, sheet, keys, owners)
+        return Drawing(kind, splats, means2d, shapes, sheet, keys, owners)
 
     @property
     def tile(self) -> Int64[Tensor, "q"]:
@@ -225,7 +233,7 @@ class Drawing:
         """(features, transmittance) of each crop."""
         splats = self.splats
         features, alphas = self._rasterize(
-            self.means2d, splats.conics, splats.features, splats.opacities, self.owners, absgrad
+            self.means2d, self.shapes, splats.features, splats.opacities, self.owners, absgrad
         )
         parts = self._parts()
         return [
@@ -247,28 +255,28 @@ class Drawing:
         count = len(self.owners)
         if count == 0:
             return self.z
-        parts = (self.means2d, self.splats.conics, self.splats.opacities)
-        means2d, conics, opacities = (part.index_select(0, self.owners) for part in parts)
+        parts = (self.means2d, self.shapes, self.splats.opacities)
+        means2d, shapes, opacities = (part.index_select(0, self.owners) for part in parts)
         dark = means2d.new_zeros((count, 1)).requires_grad_()
         each = torch.arange(count, device=dark.device, dtype=self.owners.dtype)
         with torch.enable_grad():
-            picture, _ = self._rasterize(means2d, conics, dark, opacities, each)
+            picture, _ = self._rasterize(means2d, shapes, dark, opacities, each)
             (found,) = torch.autograd.grad(picture[0][self._parts()[0]].sum(), dark)
         return found[:, 0]
 
     def _rasterize(
         self,
         means2d: Float[Tensor, "p 2"],
-        conics: Float[Tensor, "p 3"],
+        shapes: Float[Tensor, "p s"],
         features: Float[Tensor, "p f"],
         opacities: Float[Tensor, "p"],
         owners: Int[Tensor, "q"],
         absgrad: bool = False,
     ) -> tuple[Tensor, Tensor]:
         cameras, rows, cols = self.sheet.shape
-        return rasterize_to_pixels(
+        return self.kind.draw(
             means2d,
-            conics,
+            shapes,
             features,
             opacities,
             *self.sheet.size,

@@ -4,10 +4,11 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
 import torch
-from gsplat.cuda._wrapper import fully_fused_projection, spherical_harmonics
+from gsplat.cuda._wrapper import spherical_harmonics
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from abcd_ns.engine.render.cuda.kinds import Kind, OnScreen
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.types import Crop, Gaussians, View
 
@@ -88,65 +89,59 @@ class Projected:
     """0 where nothing is drawn; nothing else is initialised there."""
     means2d: Float[Tensor, "c n 2"]
     depths: Float[Tensor, "c n"]
-    conics: Float[Tensor, "c n 3"]
+    shapes: Float[Tensor, "c n s"]
+    """See Splats."""
     opacities: Float[Tensor, "c n"]
     features: Float[Tensor, "c n 4"]
     """Colour, then depth: what is composited."""
+    centers: Float[Tensor, "c n 2"]
+    """Where their middles are; by whose gradient they grow."""
 
     def splats(self, camera: int) -> Splats:
         """As one of the cameras sees them."""
         rows = (
             self.means2d[camera].T,
             self.depths[camera, None],
-            self.conics[camera].T,
+            self.shapes[camera].T,
             self.opacities[camera, None],
             self.features[camera, :, :3].T,
-            self.radii.new_zeros((3, self.radii.shape[1])),  # covariances
+            self.radii.new_zeros((3, self.radii.shape[1])),  # bounds, as the CPU has them
             self.radii[camera, None],
         )
         return Splats(torch.cat([row.to(self.depths) for row in rows]))
 
 
 def place_on_screen(
-    gaussians: Gaussians, views: Sequence[View], cameras: Cameras, antialiased: bool = False
-) -> tuple[Tensor | None, ...]:
-    """radii, means2d, depths, conics as in Projected, compensations or None, and the cameras' centres."""
-    viewmats, Ks, centers = cameras.poses(views, gaussians.means)
-    found = fully_fused_projection(
-        gaussians.means,
-        None,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        viewmats,
-        Ks,
-        views[0].width,
-        views[0].height,
-        near_plane=views[0].near,
-        packed=False,
-        calc_compensations=antialiased,
-    )
-    return *found, centers
+    kind: Kind, gaussians: Gaussians, views: Sequence[View], cameras: Cameras, antialiased: bool = False
+) -> tuple[OnScreen, Float[Tensor, "c 3"]]:
+    """Where views see Gaussians, and the views' centres in world space."""
+    *matrices, centers = cameras.poses(views, gaussians.means)
+    return kind.place(gaussians, tuple(matrices), views[0], antialiased), centers
 
 
 def project(
-    gaussians: Gaussians, views: Sequence[View], cameras: Cameras, sh_degree: int, antialiased: bool
+    kind: Kind,
+    gaussians: Gaussians,
+    views: Sequence[View],
+    cameras: Cameras,
+    sh_degree: int,
+    antialiased: bool,
 ) -> Projected:
     """The first half of gsplat's `rasterization(packed=False)`, for the full images.
 
     Args:
         views: of one size and near plane.
     """
-    radii, means2d, depths, conics, compensations, centers = place_on_screen(
-        gaussians, views, cameras, antialiased
-    )
+    placed, eyes = place_on_screen(kind, gaussians, views, cameras, antialiased)
+    radii, means2d, depths, shapes, centers, compensations = placed
     opacities = gaussians.opacities[:, 0].sigmoid().expand(len(views), -1)
     if compensations is not None:
         opacities = opacities * compensations
     used = (sh_degree + 1) ** 2
     coefficients = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)[:, :used]
     # Camera by camera: for all at once gsplat would copy the coefficients, most of a Gaussian, for each.
-    directions = (gaussians.means - centers[:, None]).unbind()
+    directions = (gaussians.means - eyes[:, None]).unbind()
     seen = zip(directions, (radii > 0).unbind(), strict=True)
     colors = torch.stack([spherical_harmonics(sh_degree, d, coefficients, masks=m) for d, m in seen])
     features = torch.cat((torch.clamp_min(colors + 0.5, 0.0), depths[..., None]), dim=-1)
-    return Projected(radii, means2d, depths, conics, opacities, features)
+    return Projected(radii, means2d, depths, shapes, opacities, features, centers)

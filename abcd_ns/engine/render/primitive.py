@@ -1,0 +1,68 @@
+"""What a Gaussian may be: 3DGS's ellipsoid or 2DGS's disc, with the same parameters."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from abcd_ns.engine.kernels import Kernel
+from abcd_ns.engine.render import splat_kernels, surfel_kernels
+
+PrimitiveName = Literal["3dgs", "2dgs"]
+DRAWN_SIGMAS = 3.33
+"""How far out a Gaussian is drawn, in standard deviations on screen. Fragments under alpha = 1/255 are
+skipped, and opacity is at most 1, so exp(-d^2 / 2) >= 1/255: d <= sqrt(2 ln 255) = 3.3291."""
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """How Gaussians are projected, and which tiles may draw them.
+
+    What they look like in a pixel is `Fragments` on the CPU, and `cuda.kinds` on CUDA.
+    """
+
+    name: PrimitiveName
+    prefix: str
+    """Of names that tell primitives apart."""
+    project: Kernel
+    """Parameters and camera to rows, see Splats; then the gradient."""
+    project_backward: Kernel
+    tile_rows: Kernel
+    """These rows to bounds by rows of tiles; see splat_kernels.tile_rows."""
+    graded: int
+    """Rows that take gradients: all but the last four."""
+    center: int
+    """The first of two such rows that say where on screen the middle is; its gradient asks for growth."""
+    has_absgrad: bool
+    """Whether that gradient's absolute values by pixel are summed, too."""
+    blur_pixels: float
+    """How far from its middle a point may be drawn, px."""
+
+    @property
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Those that go by rows."""
+        return (self.project, self.project_backward, self.tile_rows, splat_kernels.TILE_COLUMNS)
+
+
+SPLATS = Primitive(
+    name="3dgs",
+    prefix="",
+    project=splat_kernels.SPLAT,
+    project_backward=splat_kernels.SPLAT_BACKWARD,
+    tile_rows=splat_kernels.TILE_ROWS,
+    graded=splat_kernels.GRADED,
+    center=splat_kernels.X,
+    has_absgrad=True,
+    blur_pixels=DRAWN_SIGMAS * math.sqrt(splat_kernels.EPS_2D),
+)
+SURFELS = Primitive(
+    name="2dgs",
+    prefix="surfel-",
+    project=surfel_kernels.SURFEL,
+    project_backward=surfel_kernels.SURFEL_BACKWARD,
+    tile_rows=surfel_kernels.SURFEL_TILE_ROWS,
+    graded=surfel_kernels.GRADED,
+    center=surfel_kernels.U,
+    has_absgrad=False,
+    blur_pixels=DRAWN_SIGMAS * math.sqrt(0.5),
+)
+PRIMITIVES: dict[PrimitiveName, Primitive] = {each.name: each for each in (SPLATS, SURFELS)}
