@@ -19,6 +19,7 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
+from tests.reference.gsplat_surfel_stand_ins import checked, place_in_cameras, surfel_sigma
 from tests.reference.simulated_device import kernel
 
 PAIRS_AT_ONCE = 4096
@@ -27,9 +28,11 @@ LOG_STOP = math.log(1e-4)
 """Of the transmittance at which drawing stops."""
 NAMES = (
     "fully_fused_projection",
+    "fully_fused_projection_2dgs",
     "isect_offset_encode",
     "isect_tiles",
     "rasterize_to_pixels",
+    "rasterize_to_pixels_2dgs",
     "spherical_harmonics",
 )
 """What is stood in for."""
@@ -118,6 +121,25 @@ def fully_fused_projection(
         _project, means, quats, scales, viewmats, Ks
     )
     return radii, means2d, depths, conics, compensations if calc_compensations else None
+
+
+def fully_fused_projection_2dgs(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    packed: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """radii [C, N], means2d [C, N, 2], depths [C, N], ray_transforms [C, N, 3, 3], normals [C, N, 3]. As in
+    CUDA, cameras get no gradient."""
+    assert not packed
+    cameras, size = list(zip(viewmats.detach(), Ks, strict=True)), (width, height, near_plane, far_plane)
+    return _Differentiable.apply(partial(place_in_cameras, cameras, size), means, quats, scales)
 
 
 def spherical_harmonics(
@@ -216,7 +238,7 @@ def rasterize_to_pixels(
     assert backgrounds is None
     assert packed
     assert means2d.shape == (len(opacities), 2)
-    assert conics.shape == (len(opacities), 3)
+    assert conics.shape[:2] == (len(opacities), 3)
     assert len(colors) == len(opacities)
     assert flatten_ids.dtype == isect_offsets.dtype == torch.int32
     assert isect_offsets.shape[1] * tile_size >= image_height
@@ -228,6 +250,12 @@ def rasterize_to_pixels(
     tensors = means2d, conics, colors, opacities, isect_offsets, flatten_ids, masks
     image = _Rasterize.apply(size, absgrad, *tensors)
     return image[..., :-1], image[..., -1:]
+
+
+def rasterize_to_pixels_2dgs(*args: Any, **options: Any) -> tuple[Any, ...]:
+    """As `rasterize_to_pixels`; of what else CUDA gives, nothing."""
+    args, options = checked(*args, **options)
+    return (*rasterize_to_pixels(*args, **options), None, None, None)
 
 
 def _in_image(offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
@@ -308,8 +336,11 @@ def _tiles(
     values = [x.detach()[rows].double() for x in (means2d, conics, colors, opacities)]
     values[0] = (values[0] - origin)[:, None] - centers
     values = [x.requires_grad_(wants_gradient) for x in values]
-    (dx, dy), (a, b, c) = values[0].unbind(2), values[1][:, None].unbind(2)
-    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    if values[1].ndim == 3:
+        sigma = surfel_sigma(values[0], values[1], origin[:, None] + centers)
+    else:
+        (dx, dy), (a, b, c) = values[0].unbind(2), values[1][:, None].unbind(2)
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = (values[3][:, None] * torch.exp(-sigma)).clamp_max(0.999)
     alpha = torch.where((sigma >= 0) & (alpha >= 1 / 255), alpha, 0.0)
     through = torch.log1p(-alpha)

@@ -19,8 +19,10 @@ from tests.reference.rasterizer_scenes import as_leaves, probe, relative_error
 from tests.reference.scenes import cell_windows, random_gaussians, ring_of_views
 
 DRAW = TorchRasterizer()
-BY_SIDE = {side: TorchRasterizer(tile_side=side) for side in (1, 4, 16)}
-"""Rasterizers by the side of their tiles, and so of their windows."""
+PRIMITIVES = ["3dgs", "2dgs"]
+DRAWS = {(p, side): TorchRasterizer(tile_side=side, primitive=p) for p in PRIMITIVES for side in (1, 4, 16)}
+"""Rasterizers by primitive, and by the side of their tiles, and so of their windows."""
+BOTH = pytest.mark.parametrize("primitive", PRIMITIVES)
 SETTINGS = PaintSettings(sh_degree=1)
 
 
@@ -31,9 +33,9 @@ def painter(
     return Painter(scene, views, draw, ownership=ownership, pass_gaussians=pass_gaussians)
 
 
-def merged(gaussians: Gaussians, view: View) -> Layer:
+def merged(gaussians: Gaussians, view: View, draw=DRAW) -> Layer:
     with torch.no_grad():
-        return DRAW(gaussians, view, sh_degree=1).layer
+        return draw(gaussians, view, sh_degree=1).layer
 
 
 def difference(a: Layer, b: Layer) -> float:
@@ -64,7 +66,8 @@ def translucent(count: int, size: float = 0.1, dtype=torch.float64) -> Gaussians
         (torch.float32, 1e-6, 4),
     ],
 )
-def test_folding_cells_by_fragments_gives_the_merged_picture(tree, dtype, tolerance, side):
+@BOTH
+def test_folding_cells_by_fragments_gives_the_merged_picture(primitive, tree, dtype, tolerance, side):
     gaussians = translucent(200, 0.12, dtype)
     cut = {
         "kd": lambda: build_kd(gaussians.means, 7),
@@ -72,15 +75,17 @@ def test_folding_cells_by_fragments_gives_the_merged_picture(tree, dtype, tolera
         "thin": lambda: build_grid(gaussians.means, counts=(6, 1, 1)),
     }[tree]()
     views = views_in_and_out(dtype)
-    paint = painter(cut, gaussians, views, draw=BY_SIDE[side])
+    draw = DRAWS[primitive, side]
+    paint = painter(cut, gaussians, views, draw=draw)
     for view in views:
-        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view)) < tolerance
+        assert difference(paint.picture(view, SETTINGS), merged(gaussians, view, draw)) < tolerance
 
 
 @pytest.mark.parametrize("side", [4, 16])
-def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(side):
+@BOTH
+def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(primitive, side):
     gaussians, (view, *_) = translucent(60, 0.12), views_in_and_out(torch.float64)
-    tree, draw = build_kd(gaussians.means, 5), BY_SIDE[side]
+    tree, draw = build_kd(gaussians.means, 5), DRAWS[primitive, side]
     weights = probe(view.height, view.width)[..., :4]
 
     def gradients_of(layer_of) -> dict[str, torch.Tensor]:
@@ -138,14 +143,15 @@ def test_units_hold_every_block_but_the_active_one_exactly_once(ownership):
 
 
 @pytest.mark.parametrize(("pass_gaussians", "side"), [(0, 4), (60, 4), (10_000, 4), (60, 16)])
-def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussians, side):
+@BOTH
+def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pass_gaussians, side):
     """Wherever the window lies, and however many units share the frozen blocks."""
     gaussians = translucent(200)
     views = views_in_and_out(torch.float64)
     tree = build_kd(gaussians.means, 8)
     owner = tree.assign(gaussians.means)
     own, frozen = gaussians[owner == 3], gaussians[owner != 3]
-    draw = BY_SIDE[side]
+    draw = DRAWS[primitive, side]
     paint = painter(tree, gaussians, views, pass_gaussians=pass_gaussians, draw=draw)
     units = paint.units(exclude=3)
     loaded = {unit: paint.load(unit, exclude=3) for unit in units}
@@ -164,7 +170,7 @@ def test_front_inside_and_back_are_everything_but_the_active_block(pass_gaussian
             with torch.no_grad():
                 (inside,) = draw.draw(own[:0], [Shot(view, view.full, cut.inside, window)], sh_degree=1)
             layers = (cut.front, inside.layer, cut.back)
-            assert difference(fold(list(layers)), merged(frozen, view)) < 1e-12
+            assert difference(fold(list(layers)), merged(frozen, view, draw)) < 1e-12
 
 
 def test_the_picture_does_not_depend_on_names_order_or_empty_blocks():

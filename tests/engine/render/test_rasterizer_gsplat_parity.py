@@ -49,7 +49,7 @@ def test_projection_equals_gsplats(antialiased):
     assert 100 < int(seen.sum()) < 390
     assert torch.equal(splats.radii, radii)
 
-    found = (splats.means2d, splats.depths, splats.conics, splats.opacities)
+    found = (splats.means2d, splats.depths, splats.shapes, splats.opacities)
     ours_loss = theirs_loss = 0
     generator = torch.Generator().manual_seed(0)
     for value, reference in zip(found, expected, strict=True):
@@ -69,7 +69,7 @@ def test_projection_equals_gsplats(antialiased):
 def test_bounds_use_the_inverse_of_the_conics():
     splats = project(random_gaussians(50), VIEW)
     xx, xy, yy = splats.planes[COV_XX : COV_YY + 1]
-    a, b, c = splats.conics.unbind(-1)
+    a, b, c = splats.shapes.unbind(-1)
     identity = torch.stack((xx * a + xy * b, xx * b + xy * c, xy * a + yy * b, xy * b + yy * c), dim=-1)
     torch.testing.assert_close(
         identity, torch.tensor([1.0, 0, 0, 1]).double().expand(50, 4), rtol=0, atol=1e-9

@@ -11,6 +11,8 @@ import torch
 from abcd_ns.engine.render import CutShot, Rasterizer, Shot, TorchRasterizer, ZWindow, self_check
 from abcd_ns.engine.render.cuda import backend as gsplat_backend
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
+from abcd_ns.engine.render.cuda.pairs import TILE
+from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
@@ -27,11 +29,16 @@ from tests.reference.rasterizer_scenes import (
 VIEW = small_view(70, 45)
 
 
-@pytest.fixture
-def backend():
+@pytest.fixture(params=["3dgs", "2dgs"])
+def backend(request):
     """A GsplatRasterizer on CPU stand-ins."""
     with lent():
-        yield GsplatRasterizer()
+        yield GsplatRasterizer(request.param)
+
+
+def torch_twin(backend: GsplatRasterizer, side: int = 4) -> TorchRasterizer:
+    """Windows are given by tiles, so that only those of tiles of one size can be compared."""
+    return TorchRasterizer("never", tile_side=side, primitive=backend.primitive.name)
 
 
 @pytest.mark.parametrize(
@@ -42,16 +49,17 @@ def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_de
     gaussians, frozen = random_gaussians(40), random_gaussians(15, seed=3) if with_frozen else None
     options = {"crop": crop, "frozen": frozen, "antialiased": antialiased, "sh_degree": sh_degree}
     image, grads = gradients(lambda g: backend(g, VIEW, **options), gaussians)
-    expected, expected_grads = gradients(lambda g: TorchRasterizer("never")(g, VIEW, **options), gaussians)
+    expected, expected_grads = gradients(lambda g: torch_twin(backend)(g, VIEW, **options), gaussians)
     torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
     for name in PARAM_NAMES:
         assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
 
 
+@pytest.mark.parametrize("backend", ["3dgs"], indirect=True)  # gsplat gives surfels' cameras no gradient
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_gradient_of_a_pose_equals_the_torch_backends(backend, antialiased):
     gaussians, found = random_gaussians(40), []
-    for draw in (backend, TorchRasterizer("never")):
+    for draw in (backend, torch_twin(backend)):
         seen = replace(VIEW, viewmat=VIEW.viewmat.clone().requires_grad_())
         for _ in range(2):  # the second time, nothing is taken from what was kept
             picture = stacked(draw(gaussians, seen, sh_degree=3, antialiased=antialiased))
@@ -64,9 +72,7 @@ def test_the_near_plane_is_the_views(backend):
     gaussians = random_gaussians(40)
     near = 1.001 * float(backend.project(gaussians, VIEW).depths.median())
     cut = replace(VIEW, near=near)
-    found, expected = (
-        draw(gaussians, cut, sh_degree=0).color for draw in (backend, TorchRasterizer("never"))
-    )
+    found, expected = (draw(gaussians, cut, sh_degree=0).color for draw in (backend, torch_twin(backend)))
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-10)
     assert not torch.allclose(found, backend(gaussians, VIEW, sh_degree=0).color)
 
@@ -78,7 +84,7 @@ def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen
     raster = backend(
         as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True
     )
-    expected = TorchRasterizer("never")(
+    expected = torch_twin(backend)(
         as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True
     )
     size = raster.transmittance.shape
@@ -88,14 +94,15 @@ def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen
     info = raster.info
     assert torch.equal(info["radii"], expected.info["radii"])
     assert relative_error(info["means2d"].grad, expected.info["means2d"].grad) < 1e-8
-    assert relative_error(info["means2d"].absgrad, expected.info["means2d"].absgrad) < 1e-8
+    if backend.primitive.has_absgrad:
+        assert relative_error(info["means2d"].absgrad, expected.info["means2d"].absgrad) < 1e-8
     assert (info["width"], info["height"]) == (VIEW.width, VIEW.height)
 
 
 @pytest.mark.parametrize("with_frozen", [False, True])
 def test_weights_are_those_of_the_torch_backend(backend, with_frozen):
     frozen, found = random_gaussians(15, seed=3) if with_frozen else None, []
-    for rasterizer in (backend, TorchRasterizer("never")):
+    for rasterizer in (backend, torch_twin(backend)):
         seen = None if frozen is None else rasterizer.project(frozen, VIEW)
         leaves, shot = as_leaves(random_gaussians(40)), Shot(VIEW, Crop(19, 5, 30, 31), seen)
         (raster,) = rasterizer.draw(leaves, [shot], sh_degree=0, weigh=True)
@@ -118,15 +125,11 @@ def test_nothing_to_draw(backend):
 
 
 def test_self_check_accepts_it(backend):
-    assert 0 < self_check(backend, "cpu") < 1e-4
-
-
-TILED = TorchRasterizer("never", tile_side=16)
-"""Windows are given by tiles, so that only tiles of one size can be compared."""
+    assert 0 < self_check(backend, "cpu") < (1e-4 if backend.primitive.name == "3dgs" else 5e-4)
 
 
 def window_for(crop: Crop, seed: int = 3) -> ZWindow:
-    grid, generator = TILED.window_grid(crop), torch.Generator().manual_seed(seed)
+    grid, generator = TileGrid(crop, TILE), torch.Generator().manual_seed(seed)
     near, size = torch.rand(2, grid.tiles, generator=generator, dtype=torch.float64)
     return ZWindow(grid, 4 * near + 1, 4 * near + 1 + 3 * size)
 
@@ -137,7 +140,7 @@ def test_a_z_window_is_that_of_the_torch_backend(backend, crop, with_frozen):
     gaussians, frozen = random_gaussians(40), random_gaussians(30, seed=3) if with_frozen else None
     options = {"crop": crop, "frozen": frozen, "sh_degree": 1, "z_window": window_for(crop)}
     image, grads = gradients(lambda g: backend(g, VIEW, **options), gaussians)
-    expected, expected_grads = gradients(lambda g: TILED(g, VIEW, **options), gaussians)
+    expected, expected_grads = gradients(lambda g: torch_twin(backend, TILE)(g, VIEW, **options), gaussians)
     torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
     for name in PARAM_NAMES:
         assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
@@ -181,8 +184,11 @@ def several_shots(backend, windowed: bool, with_frozen: bool) -> list[Shot]:
 @pytest.mark.parametrize("with_frozen", [False, True])
 def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, windowed, with_frozen):
     found = []
-    for draws in (backend, TILED):
-        leaves, shots = as_leaves(random_gaussians(40)), several_shots(TILED, windowed, with_frozen)
+    for draws in (backend, torch_twin(backend, TILE)):
+        leaves, shots = (
+            as_leaves(random_gaussians(40)),
+            several_shots(torch_twin(backend, TILE), windowed, with_frozen),
+        )
         rasters = draws.draw(leaves, shots, sh_degree=2, absgrad=True)
         infos = {id(raster.info): raster.info for raster in rasters}
         assert {info["n_cameras"] for info in infos.values()} == {len(shots)}
@@ -195,7 +201,7 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
         assert sum(len(info["radii"]) for info in infos.values()) == len(shots)
         values = {"picture": torch.cat([stacked(raster).flatten() for raster in rasters])}
         values |= {name: value.grad for name, value in leaves.items()}
-        for name in ("grad", "absgrad"):
+        for name in ("grad", "absgrad")[: 1 + backend.primitive.has_absgrad]:
             rows = torch.cat([getattr(info["means2d"], name) for info in infos.values()])
             values[name] = rows[torch.tensor(order).argsort()]
         found.append(values)
@@ -209,7 +215,7 @@ def test_where_many_views_see_gaussians_is_what_each_says(backend, monkeypatch):
     gaussians.means[0] -= 100
     views = [moved(VIEW, 2.0 * k, width=(70, 50)[k % 2], near=(0.01, 2.0)[k % 3 == 0]) for k in range(-9, 10)]
     found = backend.extents(gaussians, views)
-    torch.testing.assert_close(found, TILED.extents(gaussians, views))
+    torch.testing.assert_close(found, torch_twin(backend, TILE).extents(gaussians, views))
     assert torch.equal(found, Rasterizer.extents(backend, gaussians, views))
     assert bool(found.isinf().any(dim=1).any())
     nobody = backend.extents(Gaussians.empty(dtype=torch.float64), views)
@@ -221,7 +227,9 @@ def test_cut_is_that_of_the_torch_backend(backend, crop):
     gaussians, inside = random_gaussians(60), window_for(crop)
     span = ZWindow.everything(inside.grid, "cpu", torch.float64)
     shot = CutShot(VIEW, crop, span.before(inside), inside, span.behind(inside))
-    found, expected = (draw.cut(gaussians, shot, sh_degree=1) for draw in (backend, TILED))
+    found, expected = (
+        draw.cut(gaussians, shot, sh_degree=1) for draw in (backend, torch_twin(backend, TILE))
+    )
     for side in ("front", "back"):
         one, other = getattr(found, side), getattr(expected, side)
         torch.testing.assert_close(one.color, other.color, rtol=1e-9, atol=1e-10)
@@ -236,9 +244,8 @@ def test_cut_is_that_of_the_torch_backend(backend, crop):
 @pytest.mark.parametrize("visible", [0.06, 0.3])
 def test_the_depth_window_is_that_of_the_torch_backend(backend, crop, visible):
     gaussians = random_gaussians(30)
-    found, expected = (
-        draw.depth_window(gaussians, VIEW, crop=crop, visible=visible) for draw in (backend, TILED)
-    )
+    draws = (backend, torch_twin(backend, TILE))
+    found, expected = (draw.depth_window(gaussians, VIEW, crop=crop, visible=visible) for draw in draws)
     assert found.grid == expected.grid
     torch.testing.assert_close(found.near, expected.near)
     torch.testing.assert_close(found.far, expected.far)
