@@ -22,7 +22,7 @@ from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_po
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
-from abcd_ns.engine.render import Raster, Rasterizer, make_rasterizer
+from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, psnr, psnrs, ssim_windows
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
@@ -58,6 +58,8 @@ class AbcdModelConfig(SplatfactoModelConfig):
 
     ownership: tyro.conf.Fixed[Literal["fragments", "means"]] = "fragments"
     """What a layer holds in composited pictures; taken over from the method's recipe."""
+    primitive: tyro.conf.Fixed[PrimitiveName] = "3dgs"
+    """What a Gaussian is; taken over from the run's options."""
 
 
 class AbcdModel(SplatfactoModel):
@@ -102,7 +104,8 @@ class AbcdModel(SplatfactoModel):
     def draws_with(self) -> Rasterizer:
         """The rasterizer, made on first use."""
         if self._rasterizer is None:
-            self._rasterizer = make_rasterizer(self.config.rasterizer, self.device)
+            config = self.config
+            self._rasterizer = make_rasterizer(config.rasterizer, self.device, primitive=config.primitive)
         return self._rasterizer
 
     # -- the scene -----------------------------------------------------------------------------------
@@ -147,7 +150,8 @@ class AbcdModel(SplatfactoModel):
             if len(colors) != len(points):  # as of a .ply without colours
                 colors = torch.full_like(points, GREY)
             points, colors = thin_points(points, colors, views, point_pixels)
-        return gaussians_from_points(points.float(), colors, sh_degree=config.sh_degree)
+        flat = config.primitive == "2dgs"
+        return gaussians_from_points(points.float(), colors, sh_degree=config.sh_degree, flat=flat)
 
     # -- checkpoints ---------------------------------------------------------------------------------
 

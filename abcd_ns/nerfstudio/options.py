@@ -167,6 +167,7 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         "rasterize_mode": ("antialiased", "antialiased" if training.antialiased else "classic"),
         "background_color": ("background", training.background),
         "ownership": ("recipe.ownership", training.recipe.ownership),
+        "primitive": ("primitive", training.primitive),
     }
     for name, (source, value) in mirrored.items():
         if getattr(model, name) not in (value, _default(type(model), name)):

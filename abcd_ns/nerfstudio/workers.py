@@ -105,4 +105,5 @@ def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int)
         )
     data.device_photo_bytes = device_photo_bytes
 
-    return VisitWorker(setup, make_rasterizer(config.pipeline.model.rasterizer, device), data.target, device)
+    drawn_by, primitive = config.pipeline.model.rasterizer, setup.config.primitive
+    return VisitWorker(setup, make_rasterizer(drawn_by, device, primitive=primitive), data.target, device)

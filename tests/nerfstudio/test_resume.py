@@ -236,8 +236,11 @@ def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
     moved = MadeFor.of([Path("new") / photo.name for photo in photos], views, TrainingConfig())
     fewer = MadeFor.of(photos[:2], views[:2], TrainingConfig())
     turned = MadeFor.of(photos, [*views[1:], views[0]], TrainingConfig())
+    discs = MadeFor.of(photos, views, TrainingConfig(primitive="2dgs"))
     with ParameterStore.create(tmp_path / "new", mine.header()) as store:
         mine.check(store)
+        with pytest.raises(UserError, match="primitive 3dgs, not 2dgs"):
+            discs.check(store)
         moved.check(store)
         with pytest.raises(UserError, match=f"photos {mine.photos}, not {fewer.photos}"):
             fewer.check(store)

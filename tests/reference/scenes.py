@@ -120,7 +120,7 @@ def make_coordinator(
         Budget(steps=steps),
         StoredScene(tree, store, ram_bytes),
         views,
-        rasterizer or TorchRasterizer(),
+        rasterizer or TorchRasterizer(primitive=config.primitive),
         *nothing_live(gaussians.sh_degree, device),
         device=device,
     )

@@ -132,7 +132,7 @@ def disk_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
 
 def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig, batch: int) -> float:
     """Seconds that a step on these Gaussians takes, forward and backward; the best of a few."""
-    rasterizer = make_rasterizer("auto", gaussians.device)
+    rasterizer = make_rasterizer("auto", gaussians.device, primitive=training.primitive)
     rasterizer.warm_up()
     leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in gaussians.items()})
     best = float("inf")

@@ -14,6 +14,8 @@ from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 
 INITIAL_OPACITY = 0.1
+THICKNESS = -14.0
+"""Logarithm of a surfel's third scale, world units: not drawn here, but it tells viewers that it is flat."""
 NEIGHBOURS = 3
 """Other points whose mean distance is a point's size."""
 
@@ -24,6 +26,7 @@ def gaussians_from_points(
     *,
     sh_degree: int = 3,
     seed: int = 0,
+    flat: bool = False,
 ) -> Gaussians:
     """Isotropic Gaussians at `points`, as wide as the mean distance to the three nearest others.
 
@@ -32,6 +35,7 @@ def gaussians_from_points(
             points are too few.
         colors: 0..255.
         seed: of the random rotations.
+        flat: make them discs of THICKNESS.
     """
     keep = torch.isfinite(points).all(dim=1)
     if not bool(keep.all()):
@@ -46,9 +50,12 @@ def gaussians_from_points(
             stacklevel=2,
         )
     generator = torch.Generator().manual_seed(seed)
+    scales = spacing(points).log()[:, None].repeat(1, 3)
+    if flat:
+        scales[:, 2] = THICKNESS
     return Gaussians(
         means=points.clone(),
-        scales=spacing(points).log()[:, None].repeat(1, 3),
+        scales=scales,
         quats=_random_quats(count, generator).to(points.dtype),
         features_dc=(colors.to(points.dtype) / 255 - 0.5) / SH_C0,
         features_rest=points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3),
@@ -66,7 +73,7 @@ def split_off(gaussians: Gaussians, keep: int, seed: int) -> tuple[Gaussians, Ga
     order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(seed))
     chosen, others = gaussians[order[:keep].sort().values], gaussians[order[keep:].sort().values]
     wide = torch.maximum(chosen.scales, spacing(chosen.means).log()[:, None])
-    return replace(chosen, scales=wide), others
+    return replace(chosen, scales=torch.where(chosen.scales == THICKNESS, THICKNESS, wide)), others
 
 
 def thin_out(gaussians: Gaussians, limit: int | None, seed: int) -> Gaussians:

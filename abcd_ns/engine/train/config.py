@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from abcd_ns.engine.render.primitive import PrimitiveName
 from abcd_ns.engine.train.capture.light import Kind as LightKind
 from abcd_ns.engine.train.capture.poses import Kind as PosesKind
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -18,6 +19,9 @@ class TrainingConfig:
     """What makes the method; set by whoever defines one."""
     limits: Limits = field(default=Limits())
     """What fits on the device; set by whoever knows its memory."""
+    primitive: PrimitiveName = "3dgs"
+    """What a Gaussian is: 3DGS's ellipsoid, or the flat disc of 2DGS, a surfel. Part of the scene: whoever
+    draws it later takes it from the run's options."""
     window_weight: float = 0.06
     """Frozen fragments between a block's nearest and farthest ones are sorted in with these, in each tile of
     4 x 4 pixels (gsplat: 16 x 16). This much of their weight, in a picture of the block alone, may be nearer
@@ -102,6 +106,9 @@ class TrainingConfig:
             if not fits:
                 value = getattr(self, name.replace("-", "_"))
                 raise UserError(f"--pipeline.training.{name} must be {words}, not {value}.")
+        if self.primitive == "2dgs" and (self.antialiased or self.poses != "off"):
+            name = "antialiased" if self.antialiased else "poses"
+            raise UserError(f"--pipeline.training.{name} is for 3dgs: gsplat's surfels do not have it.")
         if self.light != "none" and recipe.exact:
             raise UserError("--pipeline.training.light is for methods that train by visits, not abcd-exact.")
         if self.poses != "off" and (recipe.exact or recipe.overlap > 0):

@@ -80,7 +80,7 @@ class TrainingRun:
 
     def fit_density(self, blocks: int) -> None:
         """Density control for a scene of so many blocks."""
-        self.density = DensityControl(for_blocks(self.config.density, blocks))
+        self.density = DensityControl(for_blocks(self.config.density, blocks, self.rasterizer.primitive))
 
     @property
     def progress(self) -> float:

@@ -8,6 +8,7 @@ from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
 
+from abcd_ns.engine.render import PrimitiveName
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
@@ -53,6 +54,7 @@ class MadeFor:
     blocks_are_trained: str
     """In turn, jointly, or each alone: what the store holds besides blocks depends on it."""
     sh_degree: int
+    primitive: PrimitiveName
 
     @staticmethod
     def of(photos: Sequence[Path], views: Sequence[View], training: TrainingConfig) -> "MadeFor":
@@ -63,7 +65,7 @@ class MadeFor:
         x, y, z = (round(value, 3) for value in views[0].center.tolist())
         recipe = training.recipe
         how = "jointly" if recipe.exact else "each alone" if recipe.overlap > 0 else "in turn"
-        return MadeFor(digest.hexdigest(), (x, y, z), how, training.sh_degree)
+        return MadeFor(digest.hexdigest(), (x, y, z), how, training.sh_degree, training.primitive)
 
     def check(self, store: ParameterStore) -> None:
         """See that `store` was made for the same.
@@ -83,6 +85,7 @@ class MadeFor:
         theirs, mine = store.header.get(MADE_FOR), _plain(self)
         if theirs is None:  # made before this was written down
             return ""
+        theirs = {"primitive": "3dgs"} | theirs  # nothing else there was
         different = [name for name in mine if not _agree(theirs.get(name), mine[name])]
         return "; ".join(
             f"{name.replace('_', ' ')} {theirs.get(name)}, not {mine[name]}" for name in different

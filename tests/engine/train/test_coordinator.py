@@ -26,11 +26,16 @@ def equal(a: Gaussians, b: Gaussians) -> bool:
     return all(torch.equal(value, getattr(b, name)) for name, value in a.items())
 
 
-def test_training_improves_every_photo(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=120, background="black")
+BOTH = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
+
+
+@BOTH
+def test_training_improves_every_photo(tmp_path, views, photos, start, primitive):
+    options = {"steps": 120, "background": "black", "primitive": primitive}
+    coordinator = make_coordinator(tmp_path, start, views, blocks=4, **options)
 
     def error() -> list[float]:
-        draw = TorchRasterizer()
+        draw = coordinator.run.rasterizer
         scene = whole_scene(coordinator)
         with torch.no_grad():
             pictures = [draw(scene, v, sh_degree=1).color.clamp(0, 1) for v in views]
@@ -67,7 +72,8 @@ def test_ablated_with_one_block_is_the_same_too(tmp_path, views, photos, start):
 
 
 @pytest.mark.parametrize("ownership", ["fragments", "means"])
-def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership):
+@BOTH
+def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership, primitive):
     """Through kept F and B == through a render of all blocks at once (invariant 3), in float64."""
     gaussians = random_gaussians(100, size=0.08, dtype=torch.float64)
     views = ring_of_views(3, dtype=torch.float64)
@@ -81,6 +87,7 @@ def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership):
         window_weight=0.0,
         density=still,
         batch=1,
+        primitive=primitive,
     )
     for _ in range(3):
         batch = coordinator.next_batch()
@@ -102,7 +109,7 @@ def test_the_blocks_gradient_is_that_of_the_whole_picture(tmp_path, ownership):
 
 def _gradient_of_whole_picture(coordinator, sample, weights, block, ownership) -> dict[str, torch.Tensor]:
     """By autograd through one render of everything (fragments) or through the fold of all blocks (means)."""
-    draw, tree = TorchRasterizer(), coordinator.scene.tree
+    draw, tree = coordinator.run.rasterizer, coordinator.scene.tree
     blocks = {b: coordinator.scene.gaussians(b) for b in range(tree.num_blocks)}
     active = Gaussians(**{n: v.clone().requires_grad_() for n, v in blocks[block].items()})
     degree = coordinator.run.active.sh_degree
@@ -272,12 +279,13 @@ def test_the_state_of_a_run_survives_json(tmp_path, views, photos, start):
 
 
 @pytest.mark.parametrize("pass_gaussians", [0, 30])
-def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start, pass_gaussians):
+@BOTH
+def test_the_sandwich_of_a_sample_is_the_merged_picture(tmp_path, views, start, pass_gaussians, primitive):
     """What a step sees of the scene, before any training, is what a viewer would see."""
     start, views = start.to(torch.float64), [view.to(torch.float64) for view in views]
-    options = {"window_weight": 0.0, "pass_gaussians": pass_gaussians}
+    options = {"window_weight": 0.0, "pass_gaussians": pass_gaussians, "primitive": primitive}
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, **options)
-    draw = TorchRasterizer()
+    draw = coordinator.run.rasterizer
     scene = whole_scene(coordinator)
     for _ in range(4):
         batch = coordinator.next_batch()

@@ -17,6 +17,7 @@ from gsplat.strategy import ops as gsplat_ops
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
+from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.density.shedding import WEIGHED, faded, may_grow, price_at, weigh, worthless
 
@@ -37,6 +38,8 @@ CULL_SCALE = 0.5
 """Standard deviation, in scene units, over which a Gaussian is pruned once opacities were reset."""
 SPLIT_SCALE = 0.01
 """Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
+PLAIN_GRADIENT = 0.25
+"""Thresholds of gradients, as a share of those of absolute ones: 0.0002 (3DGS, 2DGS) of 0.0008 (AbsGS)."""
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 MCMC_NOISE_LR = 5e5
@@ -70,7 +73,8 @@ class DensityConfig:
     densify_grad_thresh: float = 0.0008
     """Mean norm of the screen-space gradient over which a Gaussian is cloned or split."""
     use_absgrad: bool = True
-    """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum."""
+    """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum. Surfels have no such
+    sums: they are judged by a quarter of the threshold."""
     price: float | None = None
     """Pixels that a Gaussian must fill (sum of alpha T) in all views of its block together, once growth ends;
     those that fill less go, and those that fill less than four times as many do not grow (`default`
@@ -87,8 +91,11 @@ class DensityConfig:
         return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
 
 
-def for_blocks(config: DensityConfig, blocks: int) -> DensityConfig:
-    """The options of a scene of so many blocks: nothing is left to choose."""
+def for_blocks(config: DensityConfig, blocks: int, primitive: Primitive = SPLATS) -> DensityConfig:
+    """The options of a scene of so many blocks of a primitive: nothing is left to choose."""
+    if config.use_absgrad and not primitive.has_absgrad:
+        plain = config.densify_grad_thresh * PLAIN_GRADIENT
+        config = replace(config, use_absgrad=False, densify_grad_thresh=plain)
     every, price = (REFINE_EVERY_SCENE, PRICE_SCENE) if blocks == 1 else (REFINE_EVERY_BLOCK, PRICE_BLOCK)
     given = every if config.refine_every == 0 else config.refine_every
     return replace(config, refine_every=given, price=price if config.price is None else config.price)
