@@ -129,6 +129,7 @@ def camera_axes(
 def sh_color(
     harmonics: Sequence[Tensor], direction: list[Tensor], in_use: tuple[Tensor, ...]
 ) -> list[Tensor]:
+    """max(0, SH(direction) + 0.5): red, green, blue."""
     bases = sh_basis_rows(*direction)
     # Multiplied, not left out: coefficients of degrees not in use get a gradient of zeros, as gsplat gives
     # them; Adam counts such steps.
@@ -141,6 +142,7 @@ def sh_color(
 
 
 def dot(a: list[Tensor] | tuple[Tensor, ...], b: list[Tensor]) -> Tensor:
+    """Of two vectors of rows."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
