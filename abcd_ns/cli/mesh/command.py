@@ -172,7 +172,7 @@ def _pictures(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[WholeP
     painter = Painter(
         scene,
         views,
-        make_rasterizer(config.model.rasterizer, device),
+        make_rasterizer(config.model.rasterizer, device, primitive=config.training.primitive),
         ownership="fragments",
         pass_gaussians=min(default_pass(scene), room),
         device=device,
