@@ -9,7 +9,7 @@ Only what this package uses is there: projection by cameras, lists and pictures 
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -19,7 +19,8 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
-from tests.reference.gsplat_surfel_stand_ins import checked, place_in_cameras, surfel_sigma
+from tests.reference.differentiable_kernel import Differentiable
+from tests.reference.gsplat_surfel_stand_ins import fully_fused_projection_2dgs, surfel_sigma  # noqa: F401 - lent
 from tests.reference.simulated_device import kernel
 
 PAIRS_AT_ONCE = 4096
@@ -36,36 +37,6 @@ NAMES = (
     "spherical_harmonics",
 )
 """What is stood in for."""
-
-
-class _Differentiable(torch.autograd.Function):
-    """A kernel, and another for its gradient: torch's own of the same computation, which is done again."""
-
-    @staticmethod
-    def forward(ctx: Any, compute: Callable[..., Any], *tensors: Tensor) -> Any:
-        ctx.compute = compute
-        ctx.save_for_backward(*tensors)
-        results = tuple(kernel(compute, *tensors))
-        whole = [x for x in results if not x.is_floating_point()]
-        ctx.mark_non_differentiable(*whole)
-        return results
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor | None) -> Any:
-        inputs, wanted = ctx.saved_tensors, ctx.needs_input_grad[1:]
-        given = [g for g in upstream if g is not None and g.is_floating_point()]
-
-        def gradient(*tensors: Tensor) -> list[Tensor]:
-            leaves = [x.detach().requires_grad_(w) for x, w in zip(tensors, wanted, strict=False)]
-            with torch.enable_grad():
-                results = [x for x in ctx.compute(*leaves) if x.is_floating_point()]
-            asked = [x for x in leaves if x.requires_grad]
-            if not any(x.requires_grad for x in results):  # as colours of degree 0 by directions
-                return [torch.zeros_like(x) for x in asked]
-            return torch.autograd.grad(results, asked, tensors[len(leaves) :], materialize_grads=True)
-
-        found = iter(kernel(gradient, *inputs, *given))
-        return None, *(next(found) if w else None for w in wanted)
 
 
 def fully_fused_projection(
@@ -117,29 +88,10 @@ def fully_fused_projection(
             cameras.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=True))])
         return [torch.stack(values) for values in zip(*cameras, strict=True)]
 
-    radii, means2d, depths, conics, compensations = _Differentiable.apply(
+    radii, means2d, depths, conics, compensations = Differentiable.apply(
         _project, means, quats, scales, viewmats, Ks
     )
     return radii, means2d, depths, conics, compensations if calc_compensations else None
-
-
-def fully_fused_projection_2dgs(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    packed: bool = False,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """radii [C, N], means2d [C, N, 2], depths [C, N], ray_transforms [C, N, 3, 3], normals [C, N, 3]. As in
-    CUDA, cameras get no gradient."""
-    assert not packed
-    cameras, size = list(zip(viewmats.detach(), Ks, strict=True)), (width, height, near_plane, far_plane)
-    return _Differentiable.apply(partial(place_in_cameras, cameras, size), means, quats, scales)
 
 
 def spherical_harmonics(
@@ -152,7 +104,7 @@ def spherical_harmonics(
         return (torch.where(masks[0][..., None], colors, torch.nan) if masks else colors,)
 
     tensors = (dirs, coeffs) if masks is None else (dirs, coeffs, masks)
-    return _Differentiable.apply(_harmonics, *tensors)[0]
+    return Differentiable.apply(_harmonics, *tensors)[0]
 
 
 @torch.no_grad()
@@ -252,10 +204,33 @@ def rasterize_to_pixels(
     return image[..., :-1], image[..., -1:]
 
 
-def rasterize_to_pixels_2dgs(*args: Any, **options: Any) -> tuple[Any, ...]:
+def rasterize_to_pixels_2dgs(
+    means2d: Tensor,
+    ray_transforms: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    normals: Tensor,
+    densify: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    masks: Tensor | None = None,
+    packed: bool = False,
+    absgrad: bool = False,
+    distloss: bool = False,
+) -> tuple[Tensor | None, ...]:
     """As `rasterize_to_pixels`; of what else CUDA gives, nothing."""
-    args, options = checked(*args, **options)
-    return (*rasterize_to_pixels(*args, **options), None, None, None)
+    assert ray_transforms.shape == (len(opacities), 3, 3)
+    assert normals.shape == (len(opacities), 3)
+    assert densify.shape == means2d.shape
+    assert not absgrad
+    assert not distloss
+    splats = means2d, ray_transforms, colors, opacities
+    lists = image_width, image_height, tile_size, isect_offsets, flatten_ids
+    return (*rasterize_to_pixels(*splats, *lists, backgrounds, masks, packed), None, None, None)
 
 
 def _in_image(offsets: Tensor, size: tuple[int, int, int]) -> Tensor:

@@ -1,11 +1,12 @@
 """What gsplat 1.4.0's 2DGS kernels compute, in torch; see gsplat_stand_ins."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs
 from torch import Tensor
+
+from tests.reference.differentiable_kernel import Differentiable
 
 
 def place_surfels(
@@ -33,39 +34,39 @@ def place_surfels(
     return [torch.where(drawn, radii, 0.0).int(), means2d, depths, rays, normals]
 
 
-def place_in_cameras(
-    cameras: Sequence[tuple[Tensor, Tensor]], size: tuple[int, int, float, float], *surfels: Tensor
-) -> list[Tensor]:
-    """The same of several cameras (viewmat, K); what is not drawn is NaN."""
-    found = []
-    for camera in cameras:
-        with torch.no_grad():
-            radii = place_surfels((*surfels, *camera), *size)[0]
-        drawn = (radii > 0).nonzero()[:, 0]
-        values = place_surfels((*(x[drawn] for x in surfels), *camera), *size)[1:]
-        empty = [x.new_full((len(radii), *x.shape[1:]), torch.nan) for x in values]
-        found.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=True))])
-    return [torch.stack(values) for values in zip(*found, strict=True)]
+def fully_fused_projection_2dgs(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    eps2d: float = 0.3,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    packed: bool = False,
+    sparse_grad: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """radii [C, N], means2d [C, N, 2], depths [C, N], ray_transforms [C, N, 3, 3], normals [C, N, 3]. As in
+    CUDA, cameras get no gradient."""
+    assert (eps2d, radius_clip, packed, sparse_grad) == (0.3, 0, False, False)
+    size = width, height, near_plane, far_plane
 
+    def _place(*tensors: Tensor) -> list[Tensor]:
+        *surfels, viewmats, Ks = tensors
+        found = []
+        for camera in zip(viewmats, Ks, strict=True):
+            with torch.no_grad():
+                radii = place_surfels((*surfels, *camera), *size)[0]
+            drawn = (radii > 0).nonzero()[:, 0]
+            values = place_surfels((*(x[drawn] for x in surfels), *camera), *size)[1:]
+            empty = [x.new_full((len(radii), *x.shape[1:]), torch.nan) for x in values]
+            found.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=True))])
+        return [torch.stack(values) for values in zip(*found, strict=True)]
 
-def checked(
-    means2d: Tensor,
-    ray_transforms: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    normals: Tensor,
-    densify: Tensor,
-    *lists: Any,
-    distloss: bool = False,
-    **options: Any,
-) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """What `rasterize_to_pixels_2dgs` is given, as `rasterize_to_pixels` takes it."""
-    assert ray_transforms.shape == (len(opacities), 3, 3)
-    assert normals.shape == (len(opacities), 3)
-    assert densify.shape == means2d.shape
-    assert not options.get("absgrad")
-    assert not distloss
-    return (means2d, ray_transforms, colors, opacities, *lists), options
+    return Differentiable.apply(_place, means, quats, scales, viewmats.detach(), Ks.detach())
 
 
 def surfel_sigma(offset: Tensor, rays: Tensor, pixels: Tensor) -> Tensor:

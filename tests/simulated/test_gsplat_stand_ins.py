@@ -145,9 +145,10 @@ def test_each_is_one_launch_and_lists_wait_once():
         torch.testing.assert_close(raster.color.detach().cpu(), expected.color, rtol=1e-4, atol=1e-5)
 
 
-def test_auto_is_gsplat_on_the_simulated_device_and_agrees_with_torch():
+@pytest.mark.parametrize(("primitive", "name"), [("3dgs", "gsplat"), ("2dgs", "surfel-gsplat")])
+def test_auto_is_gsplat_on_the_simulated_device_and_agrees_with_torch(primitive, name):
     with simulated_device(), stand_ins.lent():
-        rasterizer = make_rasterizer("auto", DEVICE)
-        assert rasterizer.name.startswith("gsplat")
-        assert 0 < self_check(rasterizer, DEVICE) < 1e-4
+        rasterizer = make_rasterizer("auto", DEVICE, primitive=primitive)
+        assert rasterizer.name.startswith(name)
+        assert 0 < self_check(rasterizer, DEVICE) < (1e-4 if primitive == "3dgs" else 5e-4)
         assert make_rasterizer("torch", DEVICE).name.startswith("torch")

@@ -23,11 +23,9 @@ def no_gradient(gaussians: Gaussians) -> Gaussians:
 class Broken(TorchRasterizer):
     """A torch backend with a fault in one place."""
 
-    name = "broken"
-
     def __init__(self, fault: str) -> None:
         super().__init__("never")
-        self.fault = fault
+        self.name, self.fault = "broken", fault
 
     def project(self, gaussians, view, **options):
         splats = super().project(gaussians, view, **options)
