@@ -5,7 +5,13 @@ import warnings
 import pytest
 import torch
 
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points, thin_out
+from abcd_ns.engine.gaussians.initialize import (
+    THICKNESS,
+    gaussians_from_points,
+    random_points,
+    split_off,
+    thin_out,
+)
 from abcd_ns.engine.types import Gaussians
 
 
@@ -64,3 +70,11 @@ def test_too_few_points_are_warned_of_and_give_numbers_all_the_same(points, warn
     assert ["too few" in str(warning.message) for warning in caught] == [True] * warns
     assert len(made) == len(points)
     assert all(bool(torch.isfinite(value).all()) for _, value in made.items())
+
+
+def test_surfels_begin_flat_and_stay_so_where_they_are_widened():
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
+    discs = gaussians_from_points(points, torch.zeros(40, 3), flat=True)
+    chosen, others = split_off(discs, 10, seed=0)
+    assert bool((torch.cat((chosen.scales, others.scales))[:, 2] == THICKNESS).all())
+    assert bool((chosen.scales[:, :2] > discs.scales[:, :2].mean()).all())

@@ -10,9 +10,12 @@ from gsplat.strategy import DefaultStrategy
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, make_adam
+from abcd_ns.engine.render.primitive import SURFELS
+from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from abcd_ns.errors import UserError
 from tests.reference.scenes import random_gaussians
 
 
@@ -212,6 +215,21 @@ def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given,
     price = 8.0 if blocks == 1 else 2.0
     assert for_blocks(config, blocks) == replace(config, refine_every=expected, price=price)
     assert for_blocks(replace(config, price=3.0), blocks).price == 3.0
+
+
+def test_surfels_grow_by_plain_gradients_and_2dgs_threshold():
+    found = for_blocks(DensityConfig(), 1, SURFELS)
+    assert not found.use_absgrad
+    assert math.isclose(found.densify_grad_thresh, 2e-4)
+    plain = DensityConfig(use_absgrad=False, densify_grad_thresh=3e-4)
+    assert for_blocks(plain, 1, SURFELS).densify_grad_thresh == 3e-4
+
+
+@pytest.mark.parametrize("option", [{"antialiased": True}, {"poses": "SO3xR3"}])
+def test_what_gsplats_surfels_lack_is_refused(option):
+    TrainingConfig(**option).check()
+    with pytest.raises(UserError, match=f"{next(iter(option))} is for 3dgs"):
+        TrainingConfig(primitive="2dgs", **option).check()
 
 
 @pytest.mark.parametrize("resets", [None, 0])
