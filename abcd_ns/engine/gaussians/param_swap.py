@@ -27,7 +27,7 @@ LEARNING_RATES = {
 RATED_FOR = 10_000
 """Steps after which a block is trained with these rates, which are made for 30,000."""
 YOUNG_RATES = 4.0
-"""Times as large they are before, at most."""
+"""Times as large they are before, at most; a step of four views is as large as that by itself."""
 
 STEP_PARTS = 128
 """Adam's step count is a multiple of 1 over this, which float32 counts exactly to beyond 100,000."""
@@ -149,11 +149,10 @@ def rates_of_young(views: int, batch: int) -> float:
 
     A step of Adam moves a parameter by about its rate, whatever the gradient: how far a block gets in T steps
     is bounded by rate x T. So few steps take larger rates, which fall with the root of their number until
-    they are those of steps of `batch` views. A scene of one block that has had as many steps as views was
-    best with 4 times the rates at 800 steps, and with half of that at 2,500 (docs/decisions.md).
+    they are those that steps of `batch` views have.
     """
     steps = max(views, 1) / batch
-    return min(max(math.sqrt(RATED_FOR / steps) / batch, 1.0), YOUNG_RATES)
+    return max(min(math.sqrt(RATED_FOR / steps), YOUNG_RATES) / batch, 1.0)
 
 
 def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:
