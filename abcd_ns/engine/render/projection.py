@@ -60,7 +60,7 @@ class Splats:
     def black(self) -> "Splats":
         """The same, which hide what they hid, and show nothing."""
         planes = self.planes.clone()
-        planes[rows.RED : rows.GRADED] = 0
+        planes[-7:-4] = 0
         return Splats(planes)
 
     def __getitem__(self, index: Int[Tensor, "m"]) -> "Splats":

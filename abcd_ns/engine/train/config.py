@@ -46,9 +46,6 @@ class TrainingConfig:
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
     first_passes: int = 8
     """Uses of each of these views in a visit of the first sweep."""
-    last_passes: int = 0
-    """Uses of each of these views in a visit of late sweeps; one more with each sweep until then. 0 takes as
-    many as leave a tenth of the time for drawing layers, by the Gaussians of a block and around it."""
     heal: bool = True
     """Where blocks are trained within layers: undo a visit that left its pictures worse than it found them,
     shrink giants. Values that are no numbers are mended in any case."""

@@ -189,7 +189,7 @@ class Planner:
             else:
                 state.sweep += 1
             remaining = None if self._budget.steps is None else self._budget.steps - state.planned
-            last = config.last_passes or passes_for_layers(state.trained, state.frozen)
+            last = config.recipe.last_passes or passes_for_layers(state.trained, state.frozen)
             state.trained = state.frozen = 0
             passes = passes_of_sweep(state.sweep, config.first_passes, last)
             used = {block: self._views_used(state, seen) for block, seen in state.views.items()}

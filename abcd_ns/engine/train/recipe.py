@@ -23,6 +23,9 @@ class Recipe:
     visit_steps: int = 0
     """Steps of every visit, whatever the views that see its block, as the paper has; 0 shares steps out by
     views."""
+    last_passes: int = 0
+    """Uses of each view in a visit of late sweeps; one more with each sweep until then. 0 takes as many as
+    leave a tenth of the time for drawing layers, by the Gaussians of a block and around it."""
     keep_moments: bool = True
     """A block keeps Adam's moments and densification's statistics from visit to visit. Off, as in the paper,
     every visit begins with new ones."""

@@ -7,6 +7,7 @@ from itertools import pairwise
 from abcd_ns.engine.events import VisitEnded
 from abcd_ns.engine.space.partition import build_grid
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.lab.stability.lab import BUDGET, STILL, Lab, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.stability.scenarios.captures import table
@@ -54,7 +55,7 @@ def train_stale(
         density=STILL,
         heal=heal,
         first_passes=2,
-        last_passes=2,
+        recipe=Recipe(last_passes=2),
         kind=partial(stale_coordinator, every=every, damping=damping),
     )
     rising = share_rising(objectives(lab, stage, coordinator))

@@ -19,6 +19,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.health.health_rules import unsound
 from abcd_ns.engine.train.health_record import standing
 from abcd_ns.engine.train.planner import NothingSeenError
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.lab.stability.lab import (
     SH_DEGREE,
@@ -167,7 +168,7 @@ def hidden_block(lab: Lab) -> tuple[Coordinator, int]:
         warmup=0.0,
         density=STILL,
         first_passes=1,
-        last_passes=1,
+        recipe=Recipe(last_passes=1),
     )
     while coordinator.state.sweep < 2:
         lab.finish(coordinator, stage, steps=1)
