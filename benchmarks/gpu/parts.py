@@ -80,13 +80,16 @@ class Task:
 
 
 def build(_: Task) -> Iterator[Found]:
-    """gsplat's extension, compiled if need be; whether the rasterizer computes what it should."""
+    """gsplat's extension, compiled if need be; whether the rasterizers compute what they should."""
     found: Found = {"hardware": asdict(look_at_hardware())}
     yield found
     device, began = "cuda" if torch.cuda.is_available() else "cpu", time.perf_counter()
     rasterizer = make_rasterizer("auto", device)
     found |= {"rasterizer": rasterizer.name, "ready_seconds": time.perf_counter() - began}
-    yield found | {"self_check": self_check(rasterizer, device)}
+    found["self_check"] = self_check(rasterizer, device)
+    yield found
+    surfels = make_rasterizer("auto", device, primitive="2dgs")
+    yield found | {"self_check_2dgs": self_check(surfels, device)}
 
 
 def tests(task: Task) -> Iterator[Found]:

@@ -145,7 +145,9 @@ def test_every_record_is_drawn(tmp_path):
 @pytest.mark.cli
 def test_a_dry_run_goes_through(tmp_path, capsys):
     assert main(Args(out=tmp_path, parts=("build",), dry_run=True)) == 0
-    assert read_json(tmp_path / "build.json")["found"]["self_check"] < 1e-3
+    checks = read_json(tmp_path / "build.json")["found"]
+    assert checks["self_check"] < 1e-3
+    assert checks["self_check_2dgs"] < 1e-3
     assert "build" in capsys.readouterr().out
 
 

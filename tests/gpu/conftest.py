@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.render import Rasterizer, TorchRasterizer, make_rasterizer
+from abcd_ns.engine.render.primitive import PRIMITIVES
 
 
 @pytest.fixture(scope="session")
@@ -22,8 +23,14 @@ def device() -> torch.device:
 
 
 @pytest.fixture(scope="session")
-def rasterizer(device) -> Rasterizer:
-    """The one under test; gsplat's is checked against the torch backend as it is made."""
+def rasterizers(device) -> dict[str, Rasterizer]:
+    """Those under test, by primitive; gsplat's are checked against the torch backend as they are made."""
     if device.type == "cuda":
-        return make_rasterizer("gsplat", device)
-    return TorchRasterizer("never", tile_side=16)
+        return {name: make_rasterizer("gsplat", device, primitive=name) for name in PRIMITIVES}
+    return {name: TorchRasterizer("never", tile_side=16, primitive=name) for name in PRIMITIVES}
+
+
+@pytest.fixture(scope="session")
+def rasterizer(rasterizers) -> Rasterizer:
+    """That of 3DGS."""
+    return rasterizers["3dgs"]

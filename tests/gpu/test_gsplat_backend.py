@@ -44,13 +44,14 @@ def view() -> View:
 
 
 @pytest.mark.parametrize("crop", CROPS)
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(("primitive", "antialiased"), [("3dgs", False), ("3dgs", True), ("2dgs", False)])
 @pytest.mark.parametrize("with_frozen", [False, True])
-def test_equals_the_torch_backend(rasterizer, scene, crop, antialiased, with_frozen):
+def test_equals_the_torch_backend(rasterizers, scene, crop, primitive, antialiased, with_frozen):
+    rasterizer = rasterizers[primitive]
     frozen = scene(100, seed=3) if with_frozen else None
     options = {"sh_degree": 3, "crop": crop, "antialiased": antialiased, "frozen": frozen}
     image, grads = gradients(lambda g: rasterizer(g, view(), **options), scene(300))
-    torch_rasterizer = TorchRasterizer("never")
+    torch_rasterizer = TorchRasterizer("never", primitive=primitive)
     expected, expected_grads = gradients(lambda g: torch_rasterizer(g, view(), **options), scene(300))
     # A fragment at the 1/255 threshold may fall on either side: rounding differs, so a few pixels may too.
     difference = (image - expected).abs() / expected.abs().amax()

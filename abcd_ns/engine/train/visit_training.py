@@ -113,6 +113,7 @@ class VisitTraining:
             self.live.refine(infos, clock, self.steps.contributions() if infos else ())
             if self.live.is_due_to_shed(taken):
                 self.live.shed()
+                self.live.hold_back_giants()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _adapt_light(self, rendered: Rendered) -> None:

@@ -208,8 +208,9 @@ def test_a_run_with_an_undone_visit_can_be_resumed_within_it(tmp_path, views, ph
     assert equal(*results)
 
 
-def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30)
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, photos, start, blocks):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=30)
     train_step(coordinator, photos)
     means, scales = coordinator.params["means"].detach(), coordinator.params["scales"].detach()
     with torch.no_grad():
@@ -225,10 +226,11 @@ def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, 
     assert torch.equal(scales[2:], kept)
 
 
-def test_giants_are_held_back_in_visits_that_refine_nothing(tmp_path, views, photos, start):
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_giants_are_held_back_in_visits_that_refine_nothing(tmp_path, views, photos, start, blocks):
     start.scales[0] = 5.0
-    still = DensityConfig(strategy="off")
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=20, warmup=0.0, density=still)
+    options = {"steps": 20, "warmup": 0.0, "density": DensityConfig(strategy="off")}
+    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, **options)
     told = listen(coordinator, Mended)
     train(coordinator, photos)
     assert {event.what for event in told} == {"giants"}

@@ -1,8 +1,8 @@
 """Notices what goes wrong in the live block, counts it, tells it, and mends what can be mended.
 
-In any run: gradients, moments and values that are no numbers. Where blocks are trained within layers, since
-there others have to live with the result: giants, and visits that left their pictures worse than they found
-them. A run in which nothing goes wrong is the same with or without all this,
+In any run: gradients, moments and values that are no numbers. Where blocks are trained within layers: giants,
+and, where there are others that have to live with the result, visits that left their pictures worse than they
+found them. A run in which nothing goes wrong is the same with or without all this,
 on a CPU bit for bit: healthy tensors are read, never written.
 """
 
@@ -45,7 +45,7 @@ class Health:
     Hooks into the optimizers, so that no caller can forget to ask: what they step with is numbers.
 
     Args:
-        may_act: where there are several blocks, also hold back giants, and undo visits.
+        may_act: also hold back giants and, where there are several blocks, undo visits.
     """
 
     def __init__(
@@ -73,8 +73,8 @@ class Health:
             optimizer.register_step_pre_hook(self._clean_gradients)
 
     @property
-    def acts(self) -> bool:
-        """Whether giants are held back and visits undone."""
+    def undoes(self) -> bool:
+        """Whether visits are undone."""
         return self._may_act and self._scene.tree.num_blocks > 1
 
     @property
@@ -100,7 +100,7 @@ class Health:
 
     def note(self, losses: Sequence[tuple[int, Float[Tensor, ""]]]) -> None:
         """Remember the loss of each view in this step: (view, loss) pairs."""
-        self._losses = list(losses) if self.acts else []
+        self._losses = list(losses) if self.undoes else []
 
     def end_step(self, psnrs: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
         """Call after the optimizers stepped.
@@ -128,6 +128,8 @@ class Health:
         Photos may agree on such a Gaussian, as a far wall say. But its place in the order is that of its
         mean: from anywhere else it may come before what it lies behind, and veil half the picture.
         """
+        if not self._may_act:
+            return
         scales, means = self._params["scales"], self._params["means"]
         nearest = means.new_full((len(means),), math.inf)
         for view in views:
@@ -155,7 +157,7 @@ class Health:
         record.visits += 1
         record.hidden = not active.shown
         self._active = self._attached = None
-        if not self.acts or active.is_whole:
+        if not self.undoes or active.is_whole:
             return state
         rise = loss_rise(list(active.objective.values()))
         record.rises += rise is not None and rise[1] > rise[0]

@@ -47,7 +47,7 @@ class LiveBlock:
         run.health.begin_visit(active, run.state.health)
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
         if active.done == 0 and not active.is_whole:
-            self._hold_back_giants()
+            self.hold_back_giants()
 
     def detached(self) -> BlockState:
         """The live block, on the CPU; it stays live."""
@@ -82,7 +82,7 @@ class LiveBlock:
             self.clocks = replace(self.clocks, resets=clock.steps // run.config.density.reset_every)
         if run.density.refines(clock, infos):
             self.clocks = replace(self.clocks, refined=clock.steps)
-            self._hold_back_giants()
+            self.hold_back_giants()
 
     def shed(self) -> None:
         """Take out Gaussians that fill too little of the block's views; tells how many."""
@@ -134,6 +134,6 @@ class LiveBlock:
         grown = self._run.active.sole and self.clocks.refined == self.clocks.steps
         return grown and is_full(len(self), 1, *limits)
 
-    def _hold_back_giants(self) -> None:
-        if self._run.health.acts:
-            self._run.health.hold_back_giants(self._run.views.values())
+    def hold_back_giants(self) -> None:
+        """Shrink what is too large for every camera."""
+        self._run.health.hold_back_giants(self._run.views.values())
