@@ -42,8 +42,8 @@ U, V, A, B, C, D, E, F, OPACITY, RED, GREEN, BLUE = range(DEPTH + 1, DEPTH + 13)
 """Rows that `surfel` gives, after the middle x, y of the box around the ellipse of one standard deviation and
 the camera z: the disc's middle on screen, the matrix, what it looks like,"""
 GRADED = BLUE + 1
-NORMAL_X, NORMAL_Y, NORMAL_Z, RADIUS = range(GRADED, GRADED + 4)
-"""then, without gradients, the normal in camera space, towards the camera, and gsplat's radius."""
+RADIUS = GRADED + 3
+"""then, without gradients, nothing in the three rows where splats have bounds, and gsplat's radius."""
 SURFEL_ROWS = RADIUS + 1
 MIN_EXTENT = 1e-4
 """Squared half sides of boxes are clamped to this, px^2."""
@@ -104,10 +104,8 @@ def _surfel_rows(parameters: Sequence[Tensor], camera: Tensor, bounds: bool) -> 
     drawn = (depth >= near) & (depth <= FAR_PLANE) & (distance != 0)
     drawn = drawn & (box_x + radius > 0) & (box_x - radius < width)
     drawn = drawn & (box_y + radius > 0) & (box_y - radius < height)
-    normal = [component[2] for component in axes]
-    turn = torch.where(dot(normal, [mx, my, depth]) < 0, 1.0, -1.0)
-    radius = torch.where(drawn, radius.clamp_max(MAX_RADIUS), 0.0)
-    return [*rows, *(turn * component for component in normal), radius]
+    nothing = torch.zeros_like(radius)
+    return [*rows, nothing, nothing, nothing, torch.where(drawn, radius.clamp_max(MAX_RADIUS), 0.0)]
 
 
 def relative_matrix(rows: Sequence[Tensor]) -> tuple[Tensor, ...]:

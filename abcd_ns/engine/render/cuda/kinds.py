@@ -72,17 +72,9 @@ class SplatKind(Kind):
         )
         return radii, means2d, depths, conics, means2d, compensations
 
-    def draw(
-        self,
-        means2d: Tensor,
-        shapes: Tensor,
-        features: Tensor,
-        opacities: Tensor,
-        *lists: Any,
-        **options: Any,
-    ) -> tuple[Tensor, Tensor]:
+    def draw(self, *splats: Any, **options: Any) -> tuple[Tensor, Tensor]:
         """See Kind."""
-        return rasterize_to_pixels(means2d, shapes, features, opacities, *lists, **options)
+        return rasterize_to_pixels(*splats, **options)
 
 
 class SurfelKind(Kind):
