@@ -7,13 +7,10 @@ with 1 the run is that of one process. Visits are trained one after the other, i
 thread, so that neither the machine nor how busy it is has a part in the result. Runs of ns-train's trainer.
 """
 
-import json
-import multiprocessing
-import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-import torch
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
@@ -21,8 +18,7 @@ from abcd_ns.engine.events import Event, VisitBegan, VisitEnded
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio import pipeline
 from abcd_ns.nerfstudio.workers import make_worker, setup_of
-from benchmarks import workers
-from benchmarks.records import write_runs
+from benchmarks.runs import runs_of, trainer_alone
 from tests.cluster.in_process import InProcessWorkers
 
 
@@ -64,7 +60,6 @@ class Row:
 
 def run(args: Args, at_once: int, seed: int) -> Row:
     """Train and look at held-out views."""
-    torch.set_num_threads(1)
     pipeline.dispatcher_for = lambda local, config, _: Dispatcher(
         local, InProcessWorkers(make_worker(config, setup_of(local, 1, False), 0), at_once), lag=at_once
     )
@@ -79,12 +74,8 @@ def run(args: Args, at_once: int, seed: int) -> Row:
             out -= 1
             row.visits += 1
 
-    with tempfile.TemporaryDirectory() as folder:
-        one = workers.Args(args.data, args.downscale, blocks=args.blocks, steps=args.steps, seed=seed)
-        config = workers.config_of(one, 2, Path(folder))  # any number but 1 asks for a dispatcher
-        config.pipeline.training.processes, config.machine.device_type = 1, "cpu"
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+    asked = {"downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
+    with trainer_alone(args.data, seed=seed, workers=2, **asked) as trainer:  # any number but 1 dispatches
         coordinator = trainer.pipeline.coordinator
         coordinator.announce.subscribe(hear)
         trainer.train()
@@ -96,24 +87,12 @@ def run(args: Args, at_once: int, seed: int) -> Row:
 def main(args: Args) -> None:
     """Make the runs that are missing, print the table, write the file after each."""
     asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
-    rows = []
-    if args.out is not None and args.out.exists():
-        found = json.loads(args.out.read_text())
-        rows = [Row(**row) for row in found["runs"] if asked.items() <= found.items()]
-    for seed in args.seeds:
-        for at_once in args.visits:
-            if any((row.at_once, row.seed) == (at_once, seed) for row in rows):
-                continue
-            # A process of its own: nothing of one run is left for the next.
-            with multiprocessing.get_context("spawn").Pool(1) as process:
-                rows.append(process.apply(run, (args, at_once, seed)))
-            print(rows[-1], flush=True)
-            write_runs(args.out, asked, rows)
+    keys = [(at_once, seed) for seed in args.seeds for at_once in args.visits]
+    rows = runs_of(args.out, asked, Row, keys, partial(run, args))
     print("| visits at once |" + "".join(f" seed {seed} |" for seed in args.seeds) + " mean |")
     print("| ---: " * (2 + len(args.seeds)) + "|")
     for at_once in args.visits:
-        by_seed = {row.seed: row.psnr for row in rows if row.at_once == at_once}
-        psnrs = [by_seed[seed] for seed in args.seeds]
+        psnrs = [rows[at_once, seed].psnr for seed in args.seeds]
         told = [f"{psnr:.2f}" for psnr in (*psnrs, sum(psnrs) / len(psnrs))]
         print(f"| {at_once} | {' | '.join(told)} |")
 

@@ -19,18 +19,14 @@ size; bytes do.
 """
 
 import json
-import platform
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import gsplat
-import torch
 import tyro
 
 from abcd_ns.engine.layers.layer_store import LayerStore
@@ -39,12 +35,12 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.machine import describe_versions
 from tests.reference.device_counts import Counts
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE, simulated_device
 
-ROOT = Path(__file__).resolve().parent.parent
 GROWS = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=4, densify_grad_thresh=2e-4)
 """Refines often, so that steps that do are among those counted."""
 MOST_PLACES = 12
@@ -217,15 +213,6 @@ def by_step(counted: list[tuple[str, int]], steps: int) -> dict[str, float]:
     return {name: round(count / max(steps, 1), 2) for name, count in counted if count}
 
 
-def commit() -> str:
-    """Of the working tree; empty where there is no git."""
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
-    except FileNotFoundError:
-        return ""
-
-
 COLUMNS = {
     "waits_per_step": "waits",
     "waits_per_plain_step": "waits where nothing is refined",
@@ -258,9 +245,8 @@ def main(args: Args) -> None:
     for each in runs:
         print(f"\nWaits of a step with {each['blocks']}: {each['waits_per_step_by_operation']}")
         print(f"at: {each['waits_per_step_by_place']}")
-    versions = {"torch": torch.__version__, "gsplat": gsplat.__version__, "python": platform.python_version()}
     scene_of = {"views": args.views, "width": args.width, "gaussians": args.gaussians, "seed": args.seed}
-    result = {"runs": runs, "scene": scene_of, "versions": versions, "commit": commit()}
+    result = {"runs": runs, "scene": scene_of, "versions": asdict(describe_versions())}
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(result, indent=2) + "\n")
 

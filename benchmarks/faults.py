@@ -7,8 +7,6 @@ means: gone on with, it ended with the very bits of a run that nothing disturbed
 means that this was noticed. "Lost" counts steps that the run had said were safe.
 """
 
-import os
-import platform
 import random
 import shutil
 import signal
@@ -27,6 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
+from benchmarks.runs import print_machine
 from tests.nerfstudio.crash_training import Trainings, gaussians, run_folder
 from tests.reference.colmap_scene import write_scene
 from tests.reference.crash_runs import DISK_FULL, Kill, Runs, digest, lost_steps, points_reached
@@ -347,7 +346,7 @@ def main(args: Args) -> int:
             if args.trainings:
                 trials += TrainingBench(args, Path(name) / "trainings").trials()
         rows = carry_out(trials, console)
-    print(f"{platform.system()}, {os.cpu_count()} cores, torch {torch.__version__}, seed {args.seed}\n")
+    print_machine(f"seed {args.seed}\n")
     print(table(rows))
     return int(any(row.survived < row.tried or row.lost for row in rows))
 

@@ -6,20 +6,15 @@ Rules that mend what is no number are always on: without them such a run is lost
 Every run has a process and one thread of its own. Runs of ns-train's trainer.
 """
 
-import json
-import multiprocessing
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 import tyro
 
 from abcd_ns.engine.train.health import health
 from abcd_ns.lab.runs.evaluate import mean_psnr
-from benchmarks import workers
-from benchmarks.records import write_runs
+from benchmarks.runs import runs_of, trainer_alone
 
 
 def _without_undo() -> None:
@@ -78,50 +73,36 @@ class Row:
     """Of held-out views, merged, dB."""
 
 
-def run(args: Args, data: Path, arm: str, seed: int) -> Row:
-    """Train and look at held-out views."""
-    torch.set_num_threads(1)
-    ARMS[arm]()
-    row = Row(data.name, arm, seed)
-    with tempfile.TemporaryDirectory() as folder:
-        one = workers.Args(data, args.downscale, blocks=args.blocks, steps=args.steps, seed=seed)
-        config = workers.config_of(one, 0, Path(folder))
-        config.pipeline.training.processes, config.machine.device_type = 1, "cpu"
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        trainer.train()
-        coordinator = trainer.pipeline.coordinator
-        records = coordinator.state.health.values()
-        row.giants = sum(record.giants for record in records)
-        row.undone = sum(record.undone for record in records)
-        row.gaussians, row.psnr = coordinator.count(), mean_psnr(trainer.pipeline)
-    return row
+@dataclass
+class Runs:
+    """Makes a row: trains, and looks at held-out views."""
+
+    args: Args
+
+    def __call__(self, scene: str, arm: str, seed: int) -> Row:
+        ARMS[arm]()
+        data = next(path for path in self.args.data if path.name == scene)
+        asked = {"downscale": self.args.downscale, "blocks": self.args.blocks, "steps": self.args.steps}
+        with trainer_alone(data, seed=seed, **asked) as trainer:
+            trainer.train()
+            coordinator = trainer.pipeline.coordinator
+            records = coordinator.state.health.values()
+            giants, undone = (sum(getattr(r, name) for r in records) for name in ("giants", "undone"))
+            return Row(scene, arm, seed, giants, undone, coordinator.count(), mean_psnr(trainer.pipeline))
 
 
 def main(args: Args) -> None:
     """Make the runs that are missing, write the file after each, print the table."""
     asked = {"downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
-    rows = []
-    if args.out is not None and args.out.exists():
-        found = json.loads(args.out.read_text())
-        rows = [Row(**row) for row in found["runs"] if asked.items() <= found.items()]
-    made = {(row.scene, row.arm, row.seed): row for row in rows}
-    for seed in args.seeds:
-        for data in args.data:
-            for arm in ARMS:
-                if (data.name, arm, seed) in made:
-                    continue
-                with multiprocessing.get_context("spawn").Pool(1) as process:
-                    row = process.apply(run, (args, data, arm, seed))
-                print(row, flush=True)
-                made[row.scene, row.arm, row.seed] = row
-                write_runs(args.out, asked, list(made.values()))
+    scenes = [data.name for data in args.data]
+    keys = [(scene, arm, seed) for seed in args.seeds for scene in scenes for arm in ARMS]
+    rows = runs_of(args.out, asked, Row, keys, Runs(args))
     print("| scene, seed | " + " | ".join(ARMS) + " |")
     print("| --- |" + " ---: |" * len(ARMS))
-    for data in args.data:
+    for scene in scenes:
         for seed in args.seeds:
-            psnrs = [f"{made[data.name, arm, seed].psnr:.2f}" for arm in ARMS]
-            print(f"| {data.name}, {seed} | {' | '.join(psnrs)} |")
+            psnrs = [f"{rows[scene, arm, seed].psnr:.2f}" for arm in ARMS]
+            print(f"| {scene}, {seed} | {' | '.join(psnrs)} |")
 
 
 if __name__ == "__main__":

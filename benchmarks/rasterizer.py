@@ -7,7 +7,6 @@ first touches of memory come before the clock starts.
 """
 
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -39,6 +38,7 @@ from abcd_ns.engine.render.cpu.torch_kernels import (
 from abcd_ns.engine.render.projection import project
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.types import Gaussians, View
+from benchmarks.runs import print_machine
 
 SIZES = ((160, 106), (320, 213))
 TILES = 1080
@@ -230,10 +230,7 @@ def main(args: Args) -> None:
     if args.threads > 0:
         torch.set_num_threads(args.threads)
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
-    print(
-        f"torch {torch.__version__} {platform.machine()}, threads {torch.get_num_threads()} seed {args.seed}"
-    )
-    print(f"load average at the start: {load:.1f}")
+    print_machine(f"seed {args.seed}", f"load average at the start {load:.1f}")
     measure_kernels(args)
     for width, height in SIZES:
         measure_steps(args, width, height)

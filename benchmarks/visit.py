@@ -8,8 +8,6 @@ waits for its helpers, that is part of the loss and of backward. On a CUDA devic
 device has done its work, which makes steps slower than they are: their sum is no training time.
 """
 
-import os
-import platform
 import tempfile
 import time
 from collections import Counter
@@ -47,6 +45,7 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import views_of
+from benchmarks.runs import print_machine
 
 STAGES = (
     "plan and attach",
@@ -268,9 +267,7 @@ def main(args: Args) -> None:
     with tempfile.TemporaryDirectory() as folder:
         one = run(capture, 1, args, Path(folder) / "one")
         several = run(capture, args.blocks, args, Path(folder) / "several")
-    model = platform.processor() or platform.machine()
-    print(f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} threads, torch {torch.__version__}")
-    print(f"{args.data.name}, {len(capture.views)} views, {args.seconds:g} s a run; ms a view\n")
+    print_machine(f"{args.data.name}, {len(capture.views)} views, {args.seconds:g} s a run; ms a view\n")
     print(f"| stage | 1 block | {args.blocks} blocks |\n| --- | ---: | ---: |")
     for stage in STAGES:
         print(

@@ -10,8 +10,6 @@ long as the program makes it: layers drawn once, and each view used as often as 
 for that, by `passes_for_layers`.
 """
 
-import os
-import platform
 import tempfile
 import time
 from collections import Counter
@@ -40,6 +38,7 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import passes_for_layers
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop
+from benchmarks.runs import print_machine
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 STAGES = ("survey", "attach", "layers", "steps", "end")
@@ -146,8 +145,7 @@ def main(args: Args) -> None:
     views, drawn, passes = known["views"], known["drawn"], known["passes"]
     each = {stage: seconds[stage] / (drawn if stage == "steps" else views) for stage in STAGES}
     rows = "".join(f"| {stage} | {seconds[stage]:.2f} | {1e3 * each[stage]:.1f} |\n" for stage in STAGES)
-    model = platform.processor() or platform.machine()
-    print(f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} threads, torch {torch.__version__}")
+    print_machine()
     print(f"{args.blocks} blocks of {args.gaussians:,} Gaussians, {views} views {args.width} px wide\n")
     print("| stage | s | ms a view (steps: a view drawn) |\n| --- | ---: | ---: |\n" + rows)
     around = sum(each[stage] for stage in STAGES if stage != "steps")

@@ -23,13 +23,14 @@ from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cpu.binning import bin_splats
+from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from benchmarks.records import write_runs
+from benchmarks.runs import whole, write_runs
 from benchmarks.visit import Capture, begin, read
 
 COUNTED = 10
@@ -99,10 +100,8 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
         options = {"steps": args.steps, "seed": seed, "processes": 1, "rasterizer": rasterizer}
         coordinator = begin(capture, args.blocks, Path(folder), **options)
         train(coordinator, capture, rasterizer, counts)
-        scene = coordinator.scene
-        parts = [scene.gaussians(block) for block in range(scene.tree.num_blocks)]
-        gaussians, tree = Gaussians.cat(parts), scene.tree
-        scene.store.close()
+        gaussians, tree = whole(coordinator), coordinator.scene.tree
+        coordinator.close()
     painter = Painter(
         MemoryScene(tree, gaussians), capture.held_out, rasterizer, ownership="fragments", pass_gaussians=0
     )
@@ -111,14 +110,14 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
         with torch.no_grad():
             merged = rasterizer(gaussians, view, sh_degree=3).color.clamp(0, 1)
         composited = painter.picture(view, PaintSettings(3)).color.clamp(0, 1)
-        errors.append(_psnr(merged, capture.held_out_photo(view.index, view.full)))
-        gaps.append(_psnr(merged, composited))
+        errors.append(psnr(merged, capture.held_out_photo(view.index, view.full)))
+        gaps.append(psnr(merged, composited))
     drawn = max(counts.own + counts.frozen, 1)
     return Row(
         side=side,
         seed=seed,
-        psnr=sum(errors) / len(errors),
-        gap=sum(gaps) / len(gaps),
+        psnr=float(torch.stack(errors).mean()),
+        gap=float(torch.stack(gaps).mean()),
         frozen_share=counts.frozen / drawn,
         ms_per_view=1e3 * counts.seconds / max(counts.views, 1),
         gaussians=len(gaussians),
@@ -139,10 +138,6 @@ def train(coordinator: Coordinator, capture: Capture, rasterizer: TorchRasterize
         if amid:
             counts.seconds += time.perf_counter() - began
             counts.views += coordinator.batch
-
-
-def _psnr(a: torch.Tensor, b: torch.Tensor) -> float:
-    return float(-10 * (a - b).square().mean().clamp_min(1e-20).log10())
 
 
 def main(args: Args) -> None:

@@ -9,10 +9,7 @@ equal shares of the steps that workers take, each when the last one's visit is l
 what each cost. Of a run with a budget of steps nobody can tell from its scene that any was.
 """
 
-import copy
-import multiprocessing
 import os
-import platform
 import random
 import signal
 import sys
@@ -24,15 +21,13 @@ from pathlib import Path
 
 import torch
 import tyro
-from nerfstudio.engine.trainer import TrainerConfig
 
-from abcd_ns import methods
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.lease import Lease
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded, WorkerLost, WorkersSeen
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio.run import STATE
-from benchmarks.records import write_runs
+from benchmarks.runs import apart, config_of, print_machine, write_runs
 from tests.reference.crash_runs import digest
 
 
@@ -149,27 +144,10 @@ class Watch:
             self._row.kills[-1].seconds_to_lend = time.perf_counter() - self._killed_at
 
 
-def config_of(args: Args, workers: int, out: Path) -> TrainerConfig:
-    """ns-train's, with nothing but training in it."""
-    config = copy.deepcopy(methods.abcd.config)
-    config.pipeline.datamanager.data = args.data
-    config.pipeline.datamanager.dataparser.downscale_factor = args.downscale
-    config.pipeline.blocks, config.pipeline.workers = args.blocks, max(workers, 1)
-    config.pipeline.cluster = None
-    config.pipeline.training.seed = config.machine.seed = args.seed
-    config.pipeline.max_seconds = args.seconds
-    config.max_num_iterations = args.steps or 10**9
-    config.output_dir, config.experiment_name, config.vis = out, "run", "tensorboard"
-    config.logging.local_writer.enable = False
-    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
-    config.steps_per_save = 0
-    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
-    return config
-
-
 def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     """One run."""
-    config = config_of(args, workers, out)
+    options = {name: getattr(args, name) for name in ("downscale", "blocks", "seed", "steps", "seconds")}
+    config = config_of(args.data, out, workers=max(workers, 1), **options)
     if workers == 1:
         config.pipeline.training.processes = 1
         torch.set_num_threads(1)
@@ -218,19 +196,14 @@ def main(args: Args) -> None:
     if (args.seconds is None) == (args.steps is None) or (args.kills and args.steps is None):
         sys.exit("give --seconds or --steps; with --kills it must be --steps")
     budget = f"{args.seconds:g} s" if args.seconds else f"{args.steps:,} steps"
-    print(f"{args.data.name}, downscale {args.downscale}, {args.blocks} blocks, {budget}, seed {args.seed}")
-    print(f"{platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}\n")
+    print_machine(f"{args.data.name}, downscale {args.downscale}, {args.blocks} blocks, {budget}\n")
     print("| workers | kills | visits | visits/s | steps | seconds | driver waits | MB lent a visit | PSNR |")
     print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     rows = []
     for workers in args.workers:
         for kills in dict.fromkeys((0, args.kills if workers > 1 else 0)):
-            # A process of its own: nothing of one run is left for the next.
-            with (
-                tempfile.TemporaryDirectory() as out,
-                multiprocessing.get_context("spawn").Pool(1) as process,
-            ):
-                row = process.apply(measure, (args, workers, kills, Path(out)))
+            with tempfile.TemporaryDirectory() as out:
+                row = apart(measure, args, workers, kills, Path(out))
             rows.append(row)
             lent, rate = row.lent / max(row.visits, 1) / 1e6, row.visits / row.seconds
             print(

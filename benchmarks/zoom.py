@@ -9,14 +9,16 @@ cameras: at twice the size pixels are half as large, as if the camera stood at h
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 
 import torch
 import tyro
 
 from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from benchmarks.records import write_runs
+from benchmarks.runs import whole, write_runs
 from benchmarks.visit import Capture, begin, read
 
 
@@ -59,12 +61,10 @@ def run(captures: dict[int, Capture], antialiased: bool, seed: int, args: Args) 
         coordinator = begin(capture, args.blocks, Path(folder), rasterizer=rasterizer, **options)
         while not coordinator.finished:
             train_step(coordinator, capture.photo)
-        scene = coordinator.scene
-        gaussians = Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)])
+        gaussians = whole(coordinator)
         coordinator.close()
-        scene.store.close()
-    psnr = {size: score(gaussians, captures[size], rasterizer, antialiased) for size in args.drawn}
-    return Row(antialiased, seed, psnr, len(gaussians))
+    scores = {size: score(gaussians, captures[size], rasterizer, antialiased) for size in args.drawn}
+    return Row(antialiased, seed, scores, len(gaussians))
 
 
 @torch.no_grad()
@@ -73,9 +73,8 @@ def score(gaussians: Gaussians, capture: Capture, rasterizer: TorchRasterizer, a
     errors = []
     for view in capture.held_out:
         drawn = rasterizer(gaussians, view, sh_degree=3, antialiased=antialiased).color.clamp(0, 1)
-        error = (drawn - capture.held_out_photo(view.index, view.full)).square().mean()
-        errors.append(float(-10 * error.clamp_min(1e-20).log10()))
-    return sum(errors) / len(errors)
+        errors.append(float(psnr(drawn, capture.held_out_photo(view.index, view.full))))
+    return fmean(errors)
 
 
 def main(args: Args) -> None:

@@ -14,8 +14,8 @@ from abcd_ns.lab.results.run import Failure, Footing, Run
 from abcd_ns.lab.results.tables import notes, rows, write_table
 from abcd_ns.lab.scale.charts import draw_scale
 from abcd_ns.lab.scale.command import make_plan, scale
-from abcd_ns.lab.scale.land import Land, color_of
 from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings, run
+from abcd_ns.lab.world.land import Land, color_of
 from tests.lab.compare.records import made_up, made_up_run
 from tests.lab.in_process import jobs_in_this_process
 
@@ -49,7 +49,7 @@ def test_a_tile_does_not_depend_on_how_large_the_land_is():
 def test_a_photo_shows_the_lands_colour_where_the_ray_meets_it():
     land = Land(4, 10)
     for view in land.cameras()[::5]:
-        photo = land.photo(view, view.full)
+        photo = land.crop(view, view.full)
         to_world = torch.linalg.inv(view.viewmat)
         for u, v in ((3, 5), (80, 60), (150, 110)):
             pixel = torch.tensor([u + 0.5, v + 0.5, 1.0])
@@ -59,7 +59,7 @@ def test_a_photo_shows_the_lands_colour_where_the_ray_meets_it():
             expected = color_of(torch.tensor(x), torch.tensor(y)) if inside else torch.zeros(3)
             assert torch.allclose(photo[v, u], expected, atol=1e-3)
         crop = Crop(16, 32, 48, 16)
-        assert torch.equal(land.photo(view, crop), photo[crop.slices])
+        assert torch.equal(land.crop(view, crop), photo[crop.slices])
 
 
 def test_cameras_see_their_own_tile():

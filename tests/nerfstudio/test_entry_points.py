@@ -17,7 +17,7 @@ from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 from tests.test_house_rules import PACKAGE_FILES, PYPROJECT
 
 NEEDED = ("viser", "cv2", "fcntl", "safetensors", "pytorch_msssim")
-NOT_NEEDED = ("embreex", "trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray")
+NOT_NEEDED = ("trimesh", "pycolmap", "matplotlib", "jinja2", "markupsafe", "ray")
 
 
 def discovered(*missing: str) -> tuple[object, str, bool]:
@@ -82,16 +82,6 @@ def test_what_training_does_not_need_may_be_missing(without):
     assert has_parser
 
 
-def test_synthetic_scenes_say_what_they_need(monkeypatch):
-    for module in [name for name in sys.modules if name.startswith("abcd_ns.lab.synth")]:
-        monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    from abcd_ns.errors import UserError
-
-    with pytest.raises(UserError, match="pip install embreex"):
-        __import__("abcd_ns.lab.synth.world")
-
-
 def normal(distribution: str) -> str:
     return distribution.lower().replace("_", "-")
 
@@ -107,8 +97,3 @@ def test_what_is_imported_is_declared():
     wanted = [*project["dependencies"], *(name for names in extras for name in names)]
     declared = {normal(re.match(r"[\w.-]+", requirement).group()) for requirement in wanted}
     assert {name for name in names if not declared & set(map(normal, installed[name]))} == set()
-
-
-def test_development_installs_what_tests_need():
-    extras = PYPROJECT["project"]["optional-dependencies"]
-    assert set(extras["demo"]) <= set(extras["dev"])

@@ -26,7 +26,7 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop, Gaussians, View
-from abcd_ns.lab.stability.world import look_at
+from abcd_ns.lab.world.world import look_at
 
 
 def cell_windows(tree: BlockTree, view: View, grid: TileGrid, nodes, device="cpu") -> tuple[ZWindow, ...]:

@@ -30,4 +30,4 @@ def test_the_benchmark_counts_and_writes(tmp_path, capsys):
     assert one["layer_copies_per_visit"] == two["layer_copies_per_visit"] == 0
     printed = capsys.readouterr().out
     assert "| a step | 1 block | 2 blocks |" in printed
-    assert {"torch", "gsplat", "python"} == set(found["versions"])
+    assert {"torch", "gsplat", "python"} <= set(found["versions"])

@@ -27,7 +27,7 @@ from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.job import Job
 from abcd_ns.lab.results.run import Footing, Run
 from abcd_ns.lab.runs.work import memory_of_run, work
-from abcd_ns.lab.scale.land import Land
+from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 
 STORE = "store"
@@ -82,7 +82,7 @@ def run(job: LandJob, folder: Path) -> Run:
     # The visit to a single block lasts as long as the run.
     wanted = WHOLE_STEPS if job.tiles == 1 or whole else None
     while len(watch.visits) < job.settings.visits if wanted is None else coordinator.state.step < wanted:
-        train_step(coordinator, lambda view, crop: land.photo(cameras[view], crop))
+        train_step(coordinator, lambda view, crop: land.crop(cameras[view], crop))
     memory = memory_of_run()
     coordinator.close()
     visits = watch.visits[1:] or watch.visits  # the first one's time holds the planning of the sweep

@@ -34,7 +34,7 @@ from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
-from abcd_ns.lab.stability.world import TABLE, World, ring
+from abcd_ns.lab.world.world import TABLE, World, ring
 from abcd_ns.nerfstudio.metrics import corrected_psnr
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]

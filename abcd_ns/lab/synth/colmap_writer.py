@@ -7,29 +7,29 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from abcd_ns.lab.synth.cameras import Camera, Lens
+from abcd_ns.engine.types import View
 from abcd_ns.lab.synth.sparse_points import SparsePoints
 
 _PINHOLE = 1
 _CAMERA_ID = 1
 
 
-def write_model(folder: Path, cameras: list[Camera], lens: Lens, points: SparsePoints) -> None:
+def write_model(folder: Path, cameras: dict[str, View], points: SparsePoints) -> None:
     """Write cameras.bin, images.bin and points3D.bin of a model with one shared pinhole camera.
 
-    Ids count from 1: image i is `cameras[i - 1]`, point j is row j - 1 of `points`.
+    Ids count from 1: image i is the i-th of `cameras`, by its file's name; point j is row j - 1 of `points`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     order = np.lexsort((points.point, points.camera))
     rows = np.searchsorted(points.camera[order], np.arange(len(cameras) + 1))
     slot = np.empty(len(order), np.int64)
     slot[order] = np.arange(len(order)) - rows[points.camera[order]]
-    (folder / "cameras.bin").write_bytes(_cameras(lens))
+    (folder / "cameras.bin").write_bytes(_camera(next(iter(cameras.values()))))
     with open(folder / "images.bin", "wb") as file:
         file.write(struct.pack("<Q", len(cameras)))
-        for i, camera in enumerate(cameras):
+        for i, (name, view) in enumerate(cameras.items()):
             mine = order[rows[i] : rows[i + 1]]
-            file.write(_image(i + 1, camera, points.xy[mine], points.point[mine] + 1))
+            file.write(_image(i + 1, name, view, points.xy[mine], points.point[mine] + 1))
     with open(folder / "points3D.bin", "wb") as file:
         file.write(struct.pack("<Q", len(points.xyz)))
         by_point = np.lexsort((points.camera, points.point))
@@ -39,19 +39,18 @@ def write_model(folder: Path, cameras: list[Camera], lens: Lens, points: SparseP
             file.write(_point(j + 1, points.xyz[j], points.rgb[j], points.camera[track] + 1, slot[track]))
 
 
-def _cameras(lens: Lens) -> bytes:
-    shape = struct.pack("<iiQQ", _CAMERA_ID, _PINHOLE, lens.width, lens.height)
-    return struct.pack("<Q", 1) + shape + struct.pack(
-        "<4d", lens.focal, lens.focal, lens.width / 2, lens.height / 2
-    )  # fmt: skip
+def _camera(view: View) -> bytes:
+    shape = struct.pack("<iiQQ", _CAMERA_ID, _PINHOLE, view.width, view.height)
+    (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
+    return struct.pack("<Q", 1) + shape + struct.pack("<4d", fx, fy, cx, cy)
 
 
-def _image(number: int, camera: Camera, xy: NDArray, point_ids: NDArray) -> bytes:
-    x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat(canonical=True)
-    pose = struct.pack("<i7di", number, w, x, y, z, *camera.translation, _CAMERA_ID)
+def _image(number: int, name: str, view: View, xy: NDArray, point_ids: NDArray) -> bytes:
+    x, y, z, w = Rotation.from_matrix(view.viewmat[:3, :3].numpy()).as_quat(canonical=True)
+    pose = struct.pack("<i7di", number, w, x, y, z, *view.viewmat[:3, 3].tolist(), _CAMERA_ID)
     seen = np.empty(len(xy), [("xy", "<f8", 2), ("id", "<i8")])
     seen["xy"], seen["id"] = xy, point_ids
-    return pose + camera.name.encode() + b"\0" + struct.pack("<Q", len(seen)) + seen.tobytes()
+    return pose + name.encode() + b"\0" + struct.pack("<Q", len(seen)) + seen.tobytes()
 
 
 def _point(number: int, xyz: NDArray, rgb: NDArray, images: NDArray, slots: NDArray) -> bytes:

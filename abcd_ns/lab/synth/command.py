@@ -1,8 +1,6 @@
 """`abcd synth OUT`: draw a scene of walled courts into a COLMAP data set."""
 
-import os
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -14,15 +12,12 @@ from rich.console import Console
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_json, write_json
 from abcd_ns.lab.runs.runner import take_folder
-from abcd_ns.lab.synth.cameras import Camera, Lens, court_cameras
 from abcd_ns.lab.synth.colmap_writer import write_model
-from abcd_ns.lab.synth.court import Layout, Site
-from abcd_ns.lab.synth.render import render
 from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points
-from abcd_ns.lab.synth.world import World
+from abcd_ns.lab.world.court import Layout, Site, build_world, court_cameras
 from abcd_ns.progress_bar import ProgressBar
 
-FORMAT = 2
+FORMAT = 3
 """Raised whenever the same settings would draw another scene."""
 MARKER = "synth.json"
 LIMITS = {
@@ -102,43 +97,40 @@ def synth(
         console.print(f"{out} already holds this scene; nothing to do.", highlight=False, soft_wrap=True)
         return
     write_json(out / MARKER, _marker(settings, complete=False))
-    cameras, points = _draw(out, settings, console)
-    (out / "SOURCE.md").write_text(_source(settings, len(cameras), len(points.xyz)), encoding="utf-8")
+    pictures, points = _draw(out, settings, console)
+    (out / "SOURCE.md").write_text(_source(settings, pictures, points), encoding="utf-8")
     write_json(out / MARKER, _marker(settings, complete=True))
     console.print(
-        f"{out}: {len(cameras)} pictures and {len(points.xyz)} points of {settings.courts} courts.",
+        f"{out}: {pictures} pictures and {points} points of {settings.courts} courts.",
         highlight=False,
         soft_wrap=True,
     )
 
 
-def _draw(out: Path, settings: Settings, console: Console) -> tuple[list[Camera], SparsePoints]:
-    """Render and write everything, one court at a time."""
+def _draw(out: Path, settings: Settings, console: Console) -> tuple[int, int]:
+    """Render and write everything, one court at a time; the numbers of pictures and points."""
     site = Site.plan(settings.courts, settings.layout, settings.seed)
-    lens = Lens(settings.width, settings.height)
-    world = World(site)
-    count = settings.views_per_court
-    cameras = [c for k in range(settings.courts) for c in court_cameras(site, k, count)]
+    world, count, size = build_world(site), settings.views_per_court, (settings.width, settings.height)
+    views = [view for k in range(settings.courts) for view in court_cameras(site, k, count, size)]
+    names = [f"court{k // count:03d}_view{k % count:03d}.png" for k in range(len(views))]
     (out / "images").mkdir(exist_ok=True)
-
-    def draw(camera: Camera) -> None:
-        picture = render(world, camera, lens, settings.supersample)
-        Image.fromarray(picture).save(out / "images" / camera.name, optimize=False)
-
-    parts, bar = [], ProgressBar("Drawing", len(cameras), console)
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool, bar:
+    parts: list[SparsePoints] = []
+    with ProgressBar("Drawing", len(views), console) as bar:
         for court in range(settings.courts):
             own = range(court * count, (court + 1) * count)
-            for _ in pool.map(draw, (cameras[c] for c in own)):
+            for k in own:
+                picture = (255 * world.photo(views[k], settings.supersample)).round().byte().numpy()
+                Image.fromarray(picture).save(out / "images" / names[k], optimize=False)
                 bar.advance()
             around = sorted([court, *site.neighbors(court)])
             nearby = [c for k in around for c in range(k * count, (k + 1) * count)]
-            parts.append(court_points(world, cameras, own, nearby, lens, settings.points_per_court))
+            rng = site.rng("points", court)
+            parts.append(court_points(world, views, own, nearby, settings.points_per_court, rng))
     points = SparsePoints.cat(parts)
     if not len(points.xyz):
         raise UserError("No point is seen by two views; raise --views-per-court or --points-per-court.")
-    write_model(out / "sparse" / "0", cameras, lens, points)
-    return cameras, points
+    write_model(out / "sparse" / "0", dict(zip(names, views, strict=True)), points)
+    return len(views), len(points.xyz)
 
 
 def _prepare(out: Path, settings: Settings, overwrite: bool) -> bool:
@@ -166,7 +158,7 @@ def _marker(settings: Settings, complete: bool) -> dict:
 def _source(settings: Settings, pictures: int, points: int) -> str:
     return f"""# Source
 
-{pictures} pictures of a procedural scene of {settings.courts} walled courts, drawn by ray casting (Embree),
+{pictures} pictures of a procedural scene of {settings.courts} walled courts, drawn by ray casting,
 and a COLMAP model in `sparse/0` with {points} points whose observations are exact projections.
 
 - Made by `{settings.command}` (abcd-ns, scene format {FORMAT}); the same command draws the same bytes.

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from abcd_ns.lab.synth.cameras import Camera, Lens
-from abcd_ns.lab.synth.render import camera_rays, pixel_angle, to_bytes
-from abcd_ns.lab.synth.world import World
+from abcd_ns.engine.types import View
+from abcd_ns.lab.world.sunlight import SunlitWorld
+from abcd_ns.lab.world.world import project, rays_through
 
 _SKY_SHARE = 0.1
 """At most this share of the points lies on the dome."""
@@ -36,67 +38,62 @@ class SparsePoints:
     def cat(parts: list["SparsePoints"]) -> "SparsePoints":
         """All parts in one, points numbered through."""
         starts = np.cumsum([0] + [len(p.xyz) for p in parts[:-1]])
-        return SparsePoints(
-            np.concatenate([p.xyz for p in parts]),
-            np.concatenate([p.rgb for p in parts]),
-            np.concatenate([p.point + s for p, s in zip(parts, starts, strict=True)]),
-            np.concatenate([p.camera for p in parts]),
-            np.concatenate([p.xy for p in parts]),
-        )
+        columns = {
+            name: np.concatenate([getattr(p, name) for p in parts]) for name in ("xyz", "rgb", "camera", "xy")
+        }
+        points = np.concatenate([p.point + s for p, s in zip(parts, starts, strict=True)])
+        return SparsePoints(point=points, **columns)
 
 
 def court_points(
-    world: World, cameras: list[Camera], own: range, nearby: list[int], lens: Lens, count: int
+    world: SunlitWorld,
+    views: list[View],
+    own: range,
+    nearby: list[int],
+    count: int,
+    rng: np.random.Generator,
 ) -> SparsePoints:
     """About `count` points that the cameras `own` of one court see, each in at least two cameras.
 
     Args:
-        cameras: all cameras of the scene.
+        views: all cameras of the scene.
         own: indices of the court's cameras, through whose pixels the points are drawn.
         nearby: indices of every camera that may observe them, `own` included.
         count: wanted number of points; fewer where the views overlap too little.
     """
-    rng = world.site.rng("points", cameras[own[0]].court)
-    tries = 1.6 * count / len(own)
-    drawn = [_through_pixels(world, cameras[c], lens, int(np.ceil(tries)), rng) for c in own]
-    xyz, rgb, is_sky = (np.concatenate(column) for column in zip(*drawn, strict=True))
-    seen = [_observe(world, cameras[c], lens, xyz) for c in nearby]
-    views = np.sum([visible for visible, _ in seen], axis=0)
+    tries = int(np.ceil(1.6 * count / len(own)))
+    drawn = [_through_pixels(world, views[c], tries, rng) for c in own]
+    xyz, rgb, is_sky = (torch.cat(column) for column in zip(*drawn, strict=True))
+    seen = [_observe(world, views[c], xyz) for c in nearby]
     order = rng.permutation(len(xyz))
-    order = order[views[order] >= 2]
-    sky_rank = np.cumsum(is_sky[order])
-    order = order[~is_sky[order] | (sky_rank <= _SKY_SHARE * count)][:count]
-    points, at, where = [], [], []
-    for c, (visible, xy) in zip(nearby, seen, strict=True):
-        mine = np.flatnonzero(visible[order])
-        points.append(mine)
-        at.append(np.full(len(mine), c))
-        where.append(xy[order][mine])
+    order = order[np.sum([visible for visible, _ in seen], axis=0)[order] >= 2]
+    sky_rank = np.cumsum(is_sky.numpy()[order])
+    order = order[~is_sky.numpy()[order] | (sky_rank <= _SKY_SHARE * count)][:count]
+    found = [np.flatnonzero(visible[order]) for visible, _ in seen]
     return SparsePoints(
-        xyz[order], rgb[order], np.concatenate(points), np.concatenate(at), np.concatenate(where)
+        xyz.numpy()[order],
+        rgb.numpy()[order],
+        np.concatenate(found),
+        np.concatenate([np.full(len(mine), c) for c, mine in zip(nearby, found, strict=True)]),
+        np.concatenate([xy[order][mine] for (_, xy), mine in zip(seen, found, strict=True)]),
     )
 
 
 def _through_pixels(
-    world: World, camera: Camera, lens: Lens, count: int, rng: np.random.Generator
-) -> tuple[NDArray, NDArray, NDArray]:
+    world: SunlitWorld, view: View, count: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
     """Points on what a camera sees: positions [n, 3], true colours [n, 3], and whether of the sky [n]."""
-    span = np.array([lens.width, lens.height]) - 2 * _MARGIN
-    xy = _MARGIN + rng.uniform(size=(count, 2)) * span
-    origins, directions = camera_rays(camera, lens, xy)
-    sight = world.look(origins, directions, pixel_angle(lens, 1))
-    xyz = camera.center + directions.astype(np.float64) * sight.distance.astype(np.float64)[:, None]
-    return xyz, to_bytes(sight.radiance), sight.is_sky
+    span = np.array([view.width, view.height]) - 2 * _MARGIN
+    rays = rays_through(view, torch.from_numpy(_MARGIN + rng.uniform(size=(count, 2)) * span))
+    seen = world.look(view.center, rays, 1 / float(view.K[0, 0]))
+    return seen.places, (255 * seen.colors).round().byte(), ~seen.hit
 
 
-def _observe(world: World, camera: Camera, lens: Lens, xyz: NDArray) -> tuple[NDArray, NDArray]:
+def _observe(world: SunlitWorld, view: View, xyz: Tensor) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Whether a camera sees each point, by a ray to it [n], and where in the image [n, 2]."""
-    xy, z = camera.project(xyz, lens)
-    low, high = _MARGIN, np.array([lens.width, lens.height]) - _MARGIN
-    visible = (z > 0.05) & (xy > low).all(axis=1) & (xy < high).all(axis=1)
-    candidates = np.flatnonzero(visible)
-    ray = (xyz[candidates] - camera.center).astype(np.float32)
-    start = np.broadcast_to(camera.center.astype(np.float32), ray.shape)
-    reach = np.full(len(ray), 1 - _SLACK, np.float32)
-    visible[candidates] = ~world.caster.blocked(start, ray, reach)
-    return visible, xy
+    xy, z = project(view, xyz)
+    high = torch.tensor([view.width, view.height]) - _MARGIN
+    visible = (z > 0.05) & (xy > _MARGIN).all(dim=1) & (xy < high).all(dim=1)
+    rays = (xyz[visible] - view.center).T.float()
+    visible[visible.clone()] = ~world.blocked(view.center.float()[:, None], rays, 1 - _SLACK)
+    return visible.numpy(), xy.numpy()

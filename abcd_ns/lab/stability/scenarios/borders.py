@@ -14,14 +14,14 @@ from abcd_ns.engine.train.health.health_rules import SHOWS
 from abcd_ns.engine.types import View
 from abcd_ns.lab.stability.lab import BUDGET, LIMITED, METHODS, Lab, Stage, Trained, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
-from abcd_ns.lab.stability.world import Wall, World, camera
+from abcd_ns.lab.world.world import Surfaces, Wall, World, camera
 
 BAND = 4
 """Pixels to either side of a border."""
 SEAM = 1.2
 """The error in the band, in errors of the interior, at most."""
-FLOOR = World((Wall(2, 0.0, 0.8, 0.8),))
-BACK = World((Wall(1, 0.6, 1.2),))
+FLOOR = Surfaces((Wall(2, 0.0, 0.8, 0.8),))
+BACK = Surfaces((Wall(1, 0.6, 1.2),))
 AIR = (-0.5, 0.2)
 """Where along y nothing is, between cameras at -1.2 and the wall."""
 FLOATERS = 60

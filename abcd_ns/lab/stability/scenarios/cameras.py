@@ -16,7 +16,7 @@ from abcd_ns.engine.train.health.health_rules import unsound
 from abcd_ns.lab.stability.lab import Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.scenarios.emptiness import equal
-from abcd_ns.lab.stability.world import TABLE, camera, ring
+from abcd_ns.lab.world.world import TABLE, camera, ring
 
 SIZES = ((1, 1), (7, 5), (33, 17), (101, 67), (48, 36), (16, 64))
 RAYS = 300

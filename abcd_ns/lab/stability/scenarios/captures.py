@@ -12,7 +12,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.types import View
 from abcd_ns.lab.stability.lab import BUDGET, METHODS, Lab, Method, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
-from abcd_ns.lab.stability.world import TABLE, Ball, World
+from abcd_ns.lab.world.world import TABLE, Ball, Surfaces
 
 FEW = 3
 TURN_DEGREES, SHIFT = 0.5, 0.01
@@ -169,5 +169,5 @@ def refined(lab: Lab, stage: Stage, noisy: Stage) -> Finding:
 )
 def far_shell(lab: Lab) -> Finding:
     """A16: half of each picture is a shell 50 times as far away as the cameras stand."""
-    world = World((*TABLE.surfaces[:-1], Ball((0.0, 0.0, 0.0), FAR)))
+    world = Surfaces((*TABLE.surfaces[:-1], Ball((0.0, 0.0, 0.0), FAR)))
     return lost(lab, {"a far shell": make_stage(world)})

@@ -11,7 +11,7 @@ from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.stability.lab import STILL, Lab, Stage, make_stage, merged
 from abcd_ns.lab.stability.outcome import Finding, scenario
-from abcd_ns.lab.stability.world import TABLE, Ball, World, camera, ring
+from abcd_ns.lab.world.world import TABLE, Ball, Surfaces, camera, ring
 
 CLUSTERS = ((-20.0, 0), (-30.0, 1), (-40.0, 2))
 """How deep under the table balls lie, and how many cameras stand there."""
@@ -32,7 +32,7 @@ def equal(a: Gaussians, b: Gaussians) -> bool:
 )
 def nobody_left(lab: Lab) -> Finding:
     """A4: a block that is empty from the start, a view of nothing, and a block that loses all it has."""
-    world = World(TABLE.surfaces[:-1])
+    world = Surfaces(TABLE.surfaces[:-1])
     away = camera((0.0, 0.0, 3.0), (0.0, 0.01, 9.0), 12)
     stage = make_stage(world, [*ring(12), away], points=300)
     tree = build_kd(stage.start().means, 3)
@@ -75,7 +75,7 @@ def _prune_a_visit(coordinator: Coordinator, stage: Stage) -> tuple[bool, int]:
 def few_cameras() -> tuple[Stage, BlockTree]:
     """A table that 12 cameras see, and deep below it balls that 0, 1 and 2 cameras see, each a block."""
     balls = [Ball((0.0, 0.0, depth), 0.2) for depth, _ in CLUSTERS]
-    world, views = World((*TABLE.surfaces[:-1], *balls)), ring(12)
+    world, views = Surfaces((*TABLE.surfaces[:-1], *balls)), ring(12)
     for depth, count in CLUSTERS:
         for k in range(count):
             views.append(camera((0.9 * (1 - 2 * k), -0.5, depth), (0.0, 0.0, depth), len(views)))

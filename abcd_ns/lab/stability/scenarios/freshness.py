@@ -12,7 +12,7 @@ from abcd_ns.lab.stability.lab import BUDGET, STILL, Lab, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.stability.scenarios.captures import table
 from abcd_ns.lab.stability.scenarios.stale import stale_coordinator
-from abcd_ns.lab.stability.world import ring
+from abcd_ns.lab.world.world import ring
 
 BLOCKS = (1, 2, 4, 8, 27)
 CLIFF_DB = 0.5

@@ -11,7 +11,7 @@ from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_visit
 from abcd_ns.lab.stability.lab import Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
-from abcd_ns.lab.stability.world import ring
+from abcd_ns.lab.world.world import ring
 
 CAP = 300
 CAMERAS = (1, 2, 3, 10, 100, 1000, 2900, 15_000)

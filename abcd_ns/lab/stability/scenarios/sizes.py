@@ -19,7 +19,7 @@ from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE, SHOWS
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.lab.stability.lab import STILL, Lab, Stage, Trained, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
-from abcd_ns.lab.stability.world import ring
+from abcd_ns.lab.world.world import ring
 
 SIGMAS = (1.0, 3.0, 10.0)
 """Of the giants that are put in, in extents of their cell."""

@@ -30,7 +30,7 @@ from abcd_ns.lab.stability.lab import (
     merged,
 )
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
-from abcd_ns.lab.stability.world import TABLE, Ball, World, ring
+from abcd_ns.lab.world.world import TABLE, Ball, Surfaces, ring
 
 ONE_IN = 200
 POINTS = {
@@ -152,7 +152,9 @@ def bright_and_hidden(lab: Lab) -> Finding:
 
 def hidden_block(lab: Lab) -> tuple[Coordinator, int]:
     """Two sweeps over a scene in which an opaque ball hides a block; the block's number."""
-    stage = make_stage(World((Ball((0.0, 0.0, 0.0), 0.3), Ball((0.0, 0.0, 0.0), 4.0))), ring(6), ring(2), 300)
+    stage = make_stage(
+        Surfaces((Ball((0.0, 0.0, 0.0), 0.3), Ball((0.0, 0.0, 0.0), 4.0))), ring(6), ring(2), 300
+    )
     draw = {"generator": torch.Generator().manual_seed(1)}
     shell = torch.nn.functional.normalize(torch.randn((900, 3), **draw), dim=1) * 0.3
     wall = gaussians_from_points(shell, torch.full((900, 3), 128.0), sh_degree=SH_DEGREE)

@@ -1,7 +1,9 @@
-"""Small worlds of textured balls and walls, seen along exact rays: a truth that owes nothing to Gaussians."""
+"""Worlds seen along exact rays, their cameras, and small ones of textured balls and walls."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -10,11 +12,13 @@ from torch import Tensor
 
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions
-from abcd_ns.engine.types import View
+from abcd_ns.engine.types import Crop, View
 
 WAVES = 5
 """Sines that a texture is the sum of, for each colour."""
 FAR = 1e9
+RAYS_AT_ONCE = 1 << 17
+"""So many fit into a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -56,34 +60,44 @@ class Wall:
         return torch.where((t > 1e-6) & (place[:, others].abs().amax(dim=1) <= self.half), t, FAR)
 
 
-@dataclass(frozen=True)
-class World:
-    """Surfaces that look the same from everywhere. What no ray meets is black."""
+class Seen(NamedTuple):
+    """What n rays see."""
 
-    surfaces: tuple[Ball | Wall, ...]
-    seed: int = 0
+    places: Float[Tensor, "n 3"]
+    """Where they end, world; the origin of a ray that meets nothing."""
+    hit: Bool[Tensor, "n"]
+    """Whether anything near is there."""
+    colors: Float[Tensor, "n 3"]
+    """0..1."""
 
-    def first(self, view: View) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"], Float[Tensor, "n 3"]]:
-        """Of each pixel's ray, row by row: where it ends, whether it meets anything there, and the colour."""
-        origin = view.center.double()
+
+class World(ABC):
+    """What looks the same from everywhere."""
+
+    @abstractmethod
+    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:
+        """Along rays.
+
+        Args:
+            pixel_angle: radians that a ray stands for; textures may be no finer.
+        """
+
+    def first(self, view: View, crop: Crop | None = None) -> Seen:
+        """Along each pixel's ray, row by row."""
         exact = view.to(torch.float64)
-        directions = ray_directions(exact, TileGrid(exact.full, 1)).T
-        t = torch.stack([surface.meet(origin, directions) for surface in self.surfaces])
-        nearest, which = t.min(dim=0)
-        hit = nearest < FAR / 2
-        places = origin + torch.where(hit, nearest, 0.0)[:, None] * directions
-        colors = torch.zeros_like(places)
-        for number, surface in enumerate(self.surfaces):
-            mine = hit & (which == number)
-            colors[mine] = self._texture(number, surface, places[mine])
-        return places, hit, colors
+        directions = ray_directions(exact, TileGrid(crop or exact.full, 1)).T
+        return self.look(view.center.double(), directions, 1 / float(view.K[0, 0]))
 
     def photo(self, view: View, fine: int = 2) -> Float[Tensor, "h w 3"]:
-        """The picture, 0..1: the mean of `fine` x `fine` rays in each pixel."""
+        """The picture: the mean of `fine` x `fine` rays in each pixel."""
         scale = view.K.new_tensor([[fine], [fine], [1.0]])
         larger = replace(view, K=view.K * scale, width=fine * view.width, height=fine * view.height)
-        colors = self.first(larger)[2].reshape(larger.height, larger.width, 3)
-        return F.avg_pool2d(colors.permute(2, 0, 1), fine).permute(1, 2, 0).float().contiguous()
+        rows, bands = max(1, RAYS_AT_ONCE // (fine * larger.width)), []
+        for top in range(0, view.height, rows):
+            height = fine * min(rows, view.height - top)
+            band = self.first(larger, Crop(0, fine * top, larger.width, height)).colors
+            bands.append(F.avg_pool2d(band.reshape(height, larger.width, 3).permute(2, 0, 1), fine))
+        return torch.cat(bands, dim=1).permute(1, 2, 0).float().contiguous()
 
     def points(
         self, views: list[View], count: int, seed: int = 0
@@ -99,6 +113,26 @@ class World:
             colors.append(color[chosen])
         return torch.cat(places), 255 * torch.cat(colors).float()
 
+
+@dataclass(frozen=True)
+class Surfaces(World):
+    """Balls and walls with textures of random waves. What no ray meets is black."""
+
+    surfaces: tuple[Ball | Wall, ...]
+    seed: int = 0
+
+    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:  # noqa: ARG002 - waves are broad
+        """As World.look."""
+        t = torch.stack([surface.meet(origin, directions) for surface in self.surfaces])
+        nearest, which = t.min(dim=0)
+        hit = nearest < FAR / 2
+        places = origin + torch.where(hit, nearest, 0.0)[:, None] * directions
+        colors = torch.zeros_like(places)
+        for number, surface in enumerate(self.surfaces):
+            mine = hit & (which == number)
+            colors[mine] = self._texture(number, surface, places[mine])
+        return Seen(places, hit, colors)
+
     def _texture(self, number: int, surface: Ball | Wall, places: Float[Tensor, "n 3"]) -> Tensor:
         generator = torch.Generator().manual_seed(1000 * self.seed + number)
         draw = {"generator": generator, "dtype": torch.float64}
@@ -110,6 +144,19 @@ class World:
             places = places / surface.radius  # a far shell is as finely textured, as it looks
         waves = torch.sin(surface.fineness * torch.einsum("nk,cwk->ncw", places, turns) + phase)
         return (base + 0.12 * waves.sum(dim=-1)).clamp(0.02, 0.98)
+
+
+def rays_through(view: View, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+    """World directions through pixel positions, scaled to unit camera z; in the view's dtype."""
+    at = (xy - view.K[:2, 2]) / view.K.diagonal()[:2]
+    return torch.cat([at, torch.ones_like(at[:, :1])], dim=1) @ view.viewmat[:3, :3]
+
+
+def project(view: View, places: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+    """Pixel positions of places, and their camera z."""
+    at = places @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    z = torch.where(at[:, 2].abs() > 1e-9, at[:, 2], 1e-9)
+    return at[:, :2] / z[:, None] * view.K.diagonal()[:2] + view.K[:2, 2], at[:, 2]
 
 
 def look_at(eye: Tensor, target: Tensor) -> Float[Tensor, "4 4"]:
@@ -151,7 +198,7 @@ def ring(
     return views
 
 
-TABLE = World(
+TABLE = Surfaces(
     (
         Ball((0.0, 0.0, 0.02), 0.17),
         Ball((0.3, 0.1, -0.06), 0.11),

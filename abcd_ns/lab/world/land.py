@@ -5,18 +5,17 @@ scene of more tiles is larger and nothing else.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
-from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.lab.world.world import Seen, World, camera
 
 HEIGHT = 1.1
 """Of the cameras over the land, in sides of a tile."""
@@ -27,7 +26,7 @@ WAVES = ((3.1, 1.7, 0.2), (-2.3, 4.1, 1.1), (7.9, -5.3, 2.0), (11.3, 13.7, 0.7))
 
 
 @dataclass(frozen=True)
-class Land:
+class Land(World):
     """`tiles` of them, a power of 2, in rows as long as possible up to a square."""
 
     tiles: int
@@ -85,28 +84,29 @@ class Land:
 
     def cameras(self) -> list[View]:
         """All cameras, tile by tile, looking down and a little across the tile's middle."""
-        focal = 0.9 * self.width
-        K = torch.tensor([[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1.0]])
         found = []
         for tile in range(self.tiles):
             x, y = self.corner(tile)
             for k in range(self.views):
                 angle = 2 * math.pi * (k + 0.5) / self.views
-                eye = (x + 0.5 + SHIFT * math.cos(angle), y + 0.5 + SHIFT * math.sin(angle), HEIGHT)
-                found.append(
-                    View(_looking_down(eye, angle), K, self.width, self.height, len(found), near=0.2)
-                )
+                across = math.cos(angle), math.sin(angle)
+                eye = (x + 0.5 + SHIFT * across[0], y + 0.5 + SHIFT * across[1], HEIGHT)
+                target = (x + 0.5 - 0.1 * SHIFT * across[0], y + 0.5 - 0.1 * SHIFT * across[1], 0.0)
+                found.append(replace(camera(eye, target, len(found), (self.width, self.height)), near=0.2))
         return found
 
-    def photo(self, view: View, crop: Crop) -> Float[Tensor, "h w 3"]:
-        """What `view` sees; black beyond the land's border."""
-        direction = ray_directions(view, TileGrid(crop, 1)).view(3, crop.height, crop.width)
-        center = view.center
-        depth = -center[2] / direction[2]
-        x, y = center[0] + depth * direction[0], center[1] + depth * direction[1]
-        rows = self.tiles // self.columns
-        inside = (x >= 0) & (x < self.columns) & (y >= 0) & (y < rows) & (depth > 0)
-        return torch.where(inside[..., None], color_of(x, y), 0.0)
+    def crop(self, view: View, crop: Crop) -> Float[Tensor, "h w 3"]:
+        """What `view` sees in a part of its picture."""
+        return self.first(view, crop).colors.view(crop.height, crop.width, 3)
+
+    def look(self, origin: Float[Tensor, "3"], directions: Float[Tensor, "n 3"], pixel_angle: float) -> Seen:  # noqa: ARG002 - waves are broad
+        """As World.look; black beyond the land's border."""
+        t = -origin[2] / directions[:, 2]
+        places = origin + t[:, None] * directions
+        sides = places.new_tensor([self.columns, self.tiles // self.columns])
+        hit = (t > 0) & ((places[:, :2] >= 0) & (places[:, :2] < sides)).all(dim=1)
+        colors = color_of(*places.float().T[:2])
+        return Seen(places, hit, torch.where(hit[:, None], colors, 0.0))
 
 
 def color_of(x: Float[Tensor, "*s"], y: Float[Tensor, "*s"]) -> Float[Tensor, "*s 3"]:
@@ -116,16 +116,3 @@ def color_of(x: Float[Tensor, "*s"], y: Float[Tensor, "*s"]) -> Float[Tensor, "*
         waves = (torch.sin(a * x + b * y + phase + 2.1 * channel) for a, b, phase in WAVES)
         channels.append(0.5 + 0.45 * sum(waves) / len(WAVES))
     return torch.stack(channels, dim=-1)
-
-
-def _looking_down(eye: tuple[float, float, float], angle: float) -> Float[Tensor, "4 4"]:
-    """World to camera: z down and a little away from `angle`."""
-    across = torch.tensor([-0.25 * math.cos(angle), -0.25 * math.sin(angle), -1.0])
-    z = across / across.norm()
-    right = torch.linalg.cross(z, torch.tensor([-math.cos(angle), -math.sin(angle), 0.0]))
-    x = right / right.norm()
-    rotation = torch.stack([x, torch.linalg.cross(z, x), z])
-    matrix = torch.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[:3, 3] = -rotation @ torch.tensor(eye)
-    return matrix

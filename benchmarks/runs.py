@@ -1,0 +1,116 @@
+"""What benchmarks share: runs of ns-train's trainer, in processes of their own, and results, as JSON."""
+
+import copy
+import json
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+
+from abcd_ns import methods
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.machine import describe_machine, describe_versions
+
+
+def write_runs(out: Path | None, asked: Mapping[str, Any], runs: Sequence[Any]) -> None:
+    """Write what was found beside what was asked for, the machine and the versions; nothing without `out`.
+
+    Args:
+        runs: a dataclass each.
+    """
+    if out is None:
+        return
+    told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
+    found = {**told, **asked, "runs": [asdict(run) for run in runs]}
+    out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def runs_of(
+    out: Path | None, asked: Mapping[str, Any], kind: Callable, keys: Sequence[tuple], run: Callable
+) -> dict[tuple, Any]:
+    """By key a row: those that `out` has of the same question, and the others made, each in a process of its
+    own, so that nothing of one run is left for the next; `out` is written after each.
+
+    Args:
+        kind: class of a row, whose first fields are the key.
+        run: makes the row of a key; anything that can be pickled.
+    """
+    found = json.loads(out.read_text()) if out is not None and out.exists() else {"runs": []}
+    rows = [kind(**row) for row in found["runs"] if asked.items() <= found.items()]
+    made = {tuple(asdict(row).values())[: len(keys[0])]: row for row in rows}
+    for key in keys:
+        if key not in made:
+            made[key] = apart(run, *key)
+            print(made[key], flush=True)
+            write_runs(out, asked, list(made.values()))
+    return made
+
+
+def apart(work: Callable, *args: Any) -> Any:
+    """What a function returns, called in a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as process:
+        return process.apply(work, args)
+
+
+def config_of(
+    data: Path,
+    out: Path,
+    *,
+    downscale: int,
+    blocks: int,
+    seed: int,
+    workers: int = 1,
+    steps: int | None = None,
+    seconds: float | None = None,
+) -> TrainerConfig:
+    """ns-train's, with nothing but training in it."""
+    config = copy.deepcopy(methods.abcd.config)
+    config.pipeline.datamanager.data = data
+    config.pipeline.datamanager.dataparser.downscale_factor = downscale
+    config.pipeline.blocks, config.pipeline.workers = blocks, workers
+    config.pipeline.cluster = None
+    config.pipeline.training.seed = config.machine.seed = seed
+    config.pipeline.max_seconds = seconds
+    config.max_num_iterations = steps or 10**9
+    config.output_dir, config.experiment_name, config.vis = out, "run", "tensorboard"
+    config.logging.local_writer.enable = False
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    config.steps_per_save = 0
+    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    return config
+
+
+@contextmanager
+def trainer_alone(data: Path, **options: Any) -> Iterator[Trainer]:
+    """A trainer that is set up, on the CPU and by one thread: neither the machine nor how busy it is has a
+    part in what comes of it.
+
+    Args:
+        options: of `config_of`.
+    """
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        config = config_of(data, Path(folder), **options)
+        config.pipeline.training.processes, config.machine.device_type = 1, "cpu"
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        yield trainer
+
+
+def whole(coordinator: Any) -> Gaussians:
+    """All blocks of a scene in one list."""
+    scene = coordinator.scene
+    return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)])
+
+
+def print_machine(*more: str) -> None:
+    """A line that says where this was measured, and `more`."""
+    machine = f"{describe_machine().cpu}, {os.cpu_count()} cores, {torch.get_num_threads()} threads"
+    print(", ".join([machine, f"torch {torch.__version__}", *more]))

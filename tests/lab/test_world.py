@@ -1,0 +1,133 @@
+"""The procedural world: exact, and the same from everywhere."""
+
+import pytest
+import torch
+
+from abcd_ns.lab.world.solids import Thing, ball, block, tube
+from abcd_ns.lab.world.sunlight import tone_map
+from abcd_ns.lab.world.textures import KINDS, Material
+from abcd_ns.lab.world.world import FAR, TABLE, Ball, Surfaces, Wall, camera, project, rays_through, ring
+
+
+def test_rays_end_on_the_surface_that_is_nearest():
+    world = Surfaces((Ball((0.0, 0.0, 0.0), 0.5), Ball((0.0, 0.0, 0.0), 4.0)))
+    view = camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), 0)
+    places, hit, _ = world.first(view)
+    radii = places.norm(dim=1)
+    assert bool(hit.all())
+    on_ball = (radii - 0.5).abs() < 1e-9
+    assert bool((on_ball | ((radii - 4.0).abs() < 1e-9)).all())
+    assert bool((places[on_ball][:, 1] < 0).all())
+    assert 0.05 < float(on_ball.double().mean()) < 0.5
+
+
+def test_a_wall_has_edges():
+    wall = Wall(1, 1.0, 0.5)
+    directions = torch.tensor([[0.0, 1, 0], [0.4, 1, 0], [0.6, 1, 0], [0, -1, 0]], dtype=torch.float64)
+    assert wall.meet(torch.zeros(3, dtype=torch.float64), directions).tolist() == [1.0, 1.0, FAR, FAR]
+
+
+def test_what_no_ray_meets_is_black():
+    view = camera((0.0, -2.0, 0.0), (0.0, -4.0, 0.0), 0)
+    assert float(Surfaces((Ball((0.0, 0.0, 0.0), 0.5),)).photo(view).abs().max()) == 0.0
+
+
+def test_points_have_the_colours_of_the_photos():
+    views = ring(3)
+    points, colors = TABLE.points(views, 90)
+    assert points.shape == colors.shape == (90, 3)
+    photo = TABLE.photo(views[0], fine=1)
+    local = points[:30].float() @ views[0].viewmat[:3, :3].T + views[0].viewmat[:3, 3]
+    pixels = (local @ views[0].K.T)[:, :2] / local[:, 2:]
+    rows, columns = pixels[:, 1].long(), pixels[:, 0].long()
+    assert torch.allclose(photo[rows, columns], colors[:30] / 255, atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_textures_vary_and_are_within_range(seed):
+    photo = Surfaces(TABLE.surfaces, seed).photo(ring(1)[0])
+    assert 0 < float(photo.min()) < float(photo.max()) < 1
+    assert float(photo.std()) > 0.08
+
+
+STONE = Material("clouds", *[(0.5, 0.5, 0.5)] * 3)
+SOLIDS = {
+    "ball": ball((0, 0, 0), 1.0, STONE, 0.6),
+    "block": block((-1, -0.5, -0.7), (1, 0.5, 0.7), STONE),
+    "tube": tube(0.8, -0.6, 0.6, STONE),
+}
+
+
+def met(solid, origins, directions):
+    """How far along each ray it is."""
+    t = torch.full((directions.shape[1],), FAR)
+    Thing((solid,)).meet(origins, directions, t, torch.full(t.shape, -1))
+    return t
+
+
+@pytest.mark.parametrize("name", sorted(SOLIDS))
+def test_solids_are_met_where_they_are_and_their_normals_point_out(name):
+    """From outside, rays towards the middle end on the surface; moved on by a hair they are inside."""
+    solid = SOLIDS[name].placed((3.0, -1.0, 0.5), yaw=0.7)
+    middle = torch.tensor(solid.center)[:, None]
+    directions = torch.randn((3, 400), generator=torch.Generator().manual_seed(0))
+    directions = directions / directions.norm(dim=0)
+    origins = middle - 5 * directions
+    t = met(solid, origins, directions)
+    assert bool((t < 5).all())
+    places = origins + t * directions
+    inner, outer = (met(solid, places + step * directions, directions) for step in (1e-2, -1e-2))
+    assert bool((inner <= 1.1e-4).all())
+    assert float((outer - 1e-2).abs().max()) < 1e-3
+    normals, _ = solid.surface(places)
+    assert float((normals.norm(dim=0) - 1).abs().max()) < 1e-5
+    assert bool(((normals * directions).sum(dim=0) < 0).all())
+
+
+def test_what_is_cut_out_is_not_there_and_its_walls_face_inwards():
+    pipe = tube(1.0, -1.0, 1.0, STONE, tube(0.8, -2.0, 2.0, STONE))
+    origins = torch.tensor([[0.0, 0, 5], [0.9, 0, 5], [0, 0, 0]]).T
+    directions = torch.tensor([[0.0, 0, -1], [0, 0, -1], [1, 0, 0]]).T
+    t = met(pipe, origins, directions)
+    assert t.tolist() == pytest.approx([FAR, 4.0, 0.8])
+    normals, _ = pipe.surface(origins[:, 1:] + t[1:] * directions[:, 1:])
+    assert torch.allclose(normals.T, torch.tensor([[0.0, 0, 1], [-1, 0, 0]]), atol=1e-6)
+
+
+def test_a_thing_gives_the_first_of_its_solids():
+    parts = tuple(SOLIDS[name].placed((4.0 * k, 0, 0)) for k, name in enumerate(sorted(SOLIDS)))
+    thing = Thing((parts[0], Thing(parts[1:])))
+    origins = torch.tensor([[-9.0, 0, 0], [20.0, 0, 0], [4.0, 0, 9], [0.0, 0, 9]]).T
+    directions = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, -1], [0, 1, 0]]).T
+    t, which = torch.full((4,), FAR), torch.full((4,), -1)
+    thing.meet(origins, directions, t, which)
+    assert which.tolist() == [0, 2, 1, -1]
+    assert t.tolist() == pytest.approx([8.0, 11.2, 8.3, FAR])
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_textures_fade_where_they_cannot_be_resolved(kind):
+    """Seen with a large footprint, every texture is smoother than close up, and about as bright."""
+    material = Material(kind, (0.5, 0.4, 0.3), (0.2, 0.2, 0.2), (0.6, 0.5, 0.4), (0.3, 0.2), 5.0)
+    position = 6 * torch.rand((3, 4000), generator=torch.Generator().manual_seed(1))
+    fine, coarse = (material.albedo(position[:2], position, torch.full((4000,), f)) for f in (0.001, 1.0))
+    assert float(fine.min()) >= 0.01
+    assert float(fine.max()) <= 0.95
+    assert float(coarse.std()) <= float(fine.std()) + 1e-6
+    assert float(coarse.mean()) == pytest.approx(float(fine.mean()), rel=0.35)
+
+
+def test_projection_is_the_inverse_of_the_rays():
+    view = camera((1.0, -2.0, 1.5), (0.0, 3.0, 1.0), 0).to(torch.float64)
+    xy = 36 * torch.rand((20, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    depth = torch.linspace(0.5, 40, 20, dtype=torch.float64)
+    back, z = project(view, view.center + depth[:, None] * rays_through(view, xy))
+    assert torch.allclose(back, xy, atol=1e-4)
+    assert torch.allclose(z, depth, rtol=1e-6)
+
+
+def test_tone_map_keeps_order_and_range():
+    shown = tone_map(torch.linspace(0, 20, 1000))
+    assert shown[0] == 0
+    assert bool((shown.diff() >= 0).all())
+    assert float(shown.max()) <= 1
