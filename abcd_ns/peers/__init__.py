@@ -1,1 +1,4 @@
-"""What ABCD is compared with, built from the same engine: exact gradients, and blocks that train alone."""
+"""What ABCD is compared with, built from the same engine.
+
+`exact` trains all blocks at once by exact gradients, `independent` each block alone.
+"""

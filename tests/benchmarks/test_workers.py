@@ -8,6 +8,7 @@ from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.lease import Lost
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.training_loop import train
+from benchmarks import workers
 from benchmarks.workers import Args, Row, Watch, main, table_of_kills
 from tests.cluster.conftest import in_process
 from tests.reference.colmap_scene import write_scene
@@ -82,7 +83,8 @@ def test_what_is_lost_or_there_twice_is_told():
         assert "MISSING" in table_of_kills(Row(2, ended=ended, digest="a"), calm)
 
 
-def test_a_run_of_one_worker_is_measured(tmp_path, capsys):
+def test_a_run_of_one_worker_is_measured(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(workers, "apart", lambda work, *args: work(*args))
     out = tmp_path / "out.json"
     scene = write_scene(tmp_path / "scene")
     main(Args(data=scene, downscale=1, workers=(1,), blocks=2, steps=12, kills=2, out=out))

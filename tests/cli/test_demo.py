@@ -19,7 +19,6 @@ from abcd_ns.errors import UserError
 
 STAND_IN = """#!{python}
 import json, os, pathlib, sys
-from PIL import Image
 name, words = pathlib.Path(sys.argv[0]).name, sys.argv[1:]
 here = pathlib.Path(sys.argv[0]).parent
 with open(here / "calls.jsonl", "a") as file:
@@ -36,6 +35,7 @@ if name == "ns-train":
     run.mkdir(parents=True)
     (run / "config.yml").write_text("")
 elif name == "ns-eval":
+    from PIL import Image
     assert given("--load-config").is_file()
     folder = given("--render-output-path")
     folder.mkdir(parents=True, exist_ok=True)
@@ -47,6 +47,8 @@ elif name == "ns-eval":
 elif name == "ns-export":
     header = b"ply\\nformat binary_little_endian 1.0\\nelement vertex 1234\\nproperty float x\\nend_header\\n"
     (given("--output-dir") / given("--output-filename")).write_bytes(header)
+elif name == "abcd-synth":
+    pathlib.Path(words[0]).mkdir(exist_ok=True)
 elif name == "abcd-report":
     assert (pathlib.Path(words[0]) / "config.yml").is_file()
     given("--out").write_text("a page")
@@ -59,7 +61,7 @@ class StandIns:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir()
-        for name in ("ns-train", "ns-eval", "ns-export", "abcd-report"):
+        for name in ("ns-train", "ns-eval", "ns-export", "abcd-synth", "abcd-report"):
             path = folder / name
             path.write_text(STAND_IN.format(python=sys.executable))
             path.chmod(path.stat().st_mode | stat.S_IXUSR)
@@ -73,17 +75,18 @@ class StandIns:
 def commands(tmp_path, monkeypatch) -> StandIns:
     stand_ins = StandIns(tmp_path / "bin")
     monkeypatch.setattr(demo_module, "_tool", lambda name: str(stand_ins.folder / name))
-    real = demo_module._abcd
-    stand_in = {"report": [str(stand_ins.folder / "abcd-report")]}
-    monkeypatch.setattr(demo_module, "_abcd", lambda command: stand_in.get(command) or real(command))
+    monkeypatch.setattr(demo_module, "_abcd", lambda command: [str(stand_ins.folder / f"abcd-{command}")])
     small = {"courts": 1, "views_per_court": 2, "width": 32, "height": 24, "points_per_court": 50}
     monkeypatch.setattr(demo_module, "SCENE", small)
     monkeypatch.setenv("COLUMNS", "200")
     return stand_ins
 
 
-def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capfd):
-    out = tmp_path / "demo"
+def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capfd, monkeypatch):
+    """Here the scene is a real one."""
+    out, stand_in = tmp_path / "demo", demo_module._abcd
+    real = [sys.executable, "-m", "abcd_ns.cli.main", "synth"]
+    monkeypatch.setattr(demo_module, "_abcd", lambda name: real if name == "synth" else stand_in(name))
 
     assert demo(out=out, seconds=5.0, blocks=3) == 0
 
@@ -108,6 +111,7 @@ def test_demo_runs_its_steps_and_says_what_came_of_them(commands, tmp_path, capf
     assert "output of ns-train" in printed
     assert "output of ns-eval" not in printed
     assert "output of ns-eval" in (out / "logs" / "ns-eval.log").read_text()
+    check_pictures(out, printed)
 
 
 def count_pixels(path: Path, colour: tuple[int, int, int]) -> int:
@@ -115,17 +119,15 @@ def count_pixels(path: Path, colour: tuple[int, int, int]) -> int:
         return int((np.asarray(image.convert("RGB")) == colour).all(axis=2).sum())
 
 
-@pytest.mark.usefixtures("commands")
-def test_pictures_are_of_views_far_apart_and_a_large_one_of_average_quality(tmp_path, capfd):
-    demo(out=tmp_path / "demo", seconds=1.0)
-    paths = sorted((tmp_path / "demo" / "pictures").iterdir())
+def check_pictures(out: Path, printed: str) -> None:
+    """They are of views far apart, and a large one is of average quality."""
+    paths = sorted((out / "pictures").iterdir())
     assert [path.name for path in paths] == ["view-0000.png", "view-0002.png", "view-0004.png"]
-    printed = capfd.readouterr().out
     for path, row in zip(paths, (0, 2, 4), strict=True):
         assert str(path) in printed
         for colour in ((200, 100, 50), (100 + 20 * row, 100, 50)):
             assert count_pixels(path, colour) > 10_000
-    closing = tmp_path / "demo" / "court.png"
+    closing = out / "court.png"
     assert str(closing) in printed
     for colour in ((200, 100, 50), (140, 100, 50)):  # the third of five renderings, by how far they are off
         assert count_pixels(closing, colour) > 200_000

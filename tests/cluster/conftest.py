@@ -14,7 +14,7 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 
 @pytest.fixture(scope="session")
 def views():
-    return ring_of_views(8)
+    return ring_of_views(8, width=32, height=24)
 
 
 @pytest.fixture(scope="session")

@@ -95,7 +95,7 @@ def test_with_no_room_pictures_are_drawn_when_they_are_asked_for(make, photos):
             target = lambda s: (photos(s.view.index, s.crop), None)  # noqa: E731
             return InProcessWorkers(VisitWorker(setup, TorchRasterizer(), target), 3)
 
-        run = make(name, workers=workers, lag=3, density=STILL)
+        run = make(name, workers=workers, lag=3, density=STILL, steps=30)
         train(run, photos)
         return whole_scene(run)
 

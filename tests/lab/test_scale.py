@@ -170,9 +170,8 @@ def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are
     assert "--device-limit-mb 512" in found.command
 
 
-@pytest.mark.cli
 def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):
-    jobs_in_this_process(monkeypatch, first_is_real=True)
+    jobs_in_this_process(monkeypatch)
     out = tmp_path / "out"
     assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
     first = read_json(out / "results.json")

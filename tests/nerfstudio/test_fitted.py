@@ -1,8 +1,5 @@
 """What a run chose by the device's memory, it keeps: through training, on disk, and when it goes on."""
 
-from pathlib import Path
-
-import pytest
 import torch
 
 from abcd_ns.engine.store import ParameterStore
@@ -11,15 +8,9 @@ from abcd_ns.nerfstudio.datamanager import AbcdDataManager
 from abcd_ns.nerfstudio.fit import GB, Fit
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
-from tests.reference.colmap_scene import write_scene
 
 STEPS = 16
 FIT = Fit(blocks=3, limit=5000, sole=5000, budget=GB, gaussians=300, batch=2, crop_pixels=600)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "wall")
 
 
 def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_path, monkeypatch, capsys):

@@ -1,7 +1,5 @@
 """Pictures of a scene that the device could not draw at once: unit by unit, and still the merged picture."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
@@ -12,15 +10,9 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.trainer import AbcdTrainer
 from tests.nerfstudio.test_training import configure, run
-from tests.reference.colmap_scene import write_scene
 
 CLOSE = 5e-4
 """Drawing stops where 1e-4 of the light is left, and a unit knows nothing of the others."""
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "wall")
 
 
 @pytest.fixture(scope="module", params=["fragments", "means"])

@@ -17,14 +17,8 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run.resuming import MadeFor
 from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
 from tests.nerfstudio.test_training import STEPS, configure, run
-from tests.reference.colmap_scene import write_scene
 from tests.reference.crash_runs import Kill
 from tests.reference.scenes import ring_of_views
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "wall")
 
 
 @pytest.fixture(scope="module")

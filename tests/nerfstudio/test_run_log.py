@@ -15,7 +15,6 @@ from abcd_ns.nerfstudio.run import run_log
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE, Meter, RunLog
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE, flat_options
 from tests.nerfstudio.test_training import STEPS, configure, run
-from tests.reference.colmap_scene import write_scene
 
 
 @dataclass
@@ -49,11 +48,6 @@ def take_steps(log: RunLog, coordinator: FakeCoordinator, count: int, seconds: f
         coordinator.step += 1
         coordinator.seconds += seconds
         log(StepTaken(coordinator.step, 0, coordinator.step, psnr))
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "wall")
 
 
 @pytest.fixture(scope="module")

@@ -31,14 +31,9 @@ from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.model import AbcdModel
 from tests.data.test_layouts import write_blender
 from tests.nerfstudio.test_training import configure, run
-from tests.reference.colmap_scene import HEIGHT, HELD_OUT, VIEWS, WIDTH, write_scene
+from tests.reference.colmap_scene import HEIGHT, HELD_OUT, VIEWS, WIDTH
 
 STEPS = 24
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "wall")
 
 
 class Events(writer.Writer):

@@ -18,14 +18,9 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
-from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH, write_scene
+from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
 
 STEPS = 36
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("data") / "wall")
 
 
 def configure(data: Path, out: Path, method=methods.abcd, *, steps: int = STEPS, blocks: int = 3, **options):

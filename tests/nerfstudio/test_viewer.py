@@ -19,7 +19,6 @@ from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Show
 from tests.nerfstudio.test_training import configure, run
-from tests.reference.colmap_scene import write_scene
 from tests.viewer.client import CAMERA, Browser, ask, free_port, status
 
 STEPS, BLOCKS = 60, 3
@@ -75,11 +74,6 @@ def covered(picture: np.ndarray) -> float:
     """Share of a picture that is neither nearly black nor nearly the viewer's background."""
     background = np.array([38, 42, 55])
     return float(((np.abs(picture - background).max(axis=2) > 25) & (picture.max(axis=2) > 25)).mean())
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("data") / "wall")
 
 
 @pytest.fixture(scope="module")

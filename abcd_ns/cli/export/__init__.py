@@ -1,1 +1,4 @@
-"""`abcd export`: a trained scene as .ply files, whole or in parts."""
+"""`abcd export`: a trained scene as files for other programs, whole or in parts.
+
+`formats` knows the suffixes; `ply` and `glb` are written block by block, `packed` all at once.
+"""

@@ -1,1 +1,4 @@
-"""`abcd poses`: camera poses and points for a folder of photos, by pycolmap."""
+"""`abcd poses`: camera poses and points for a folder of photos.
+
+`mapping` runs pycolmap in a process of its own, which can be stopped.
+"""

@@ -1,1 +1,4 @@
-"""Training runs, each in a process of its own, under one protocol; for `abcd compare` and `abcd study`."""
+"""Training runs, each in a process of its own, under one protocol.
+
+`experiment` carries out a plan, `runner` starts its jobs, `worker` is what runs in the process.
+"""

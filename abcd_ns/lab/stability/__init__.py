@@ -1,1 +1,4 @@
-"""Where methods fail: small scenes that make them, and what ABCD does there."""
+"""`abcd stability`: where methods fail, small scenes that make them, and what ABCD does there.
+
+`lab` trains, `scenarios` has the ways to fail, `curves` varies one thing at a time.
+"""

@@ -1,1 +1,4 @@
-"""A procedural scene of walled courts, drawn by an independent ray caster into a COLMAP data set."""
+"""`abcd synth`: the courts of the procedural world as a COLMAP data set.
+
+`sparse_points` has points with their observations, `colmap_writer` writes the model.
+"""

@@ -56,14 +56,15 @@ def translucent(count: int, size: float = 0.1, dtype=torch.float64) -> Gaussians
     return gaussians
 
 
-@pytest.mark.parametrize("tree", ["kd", "grid", "thin"])
 @pytest.mark.parametrize(
-    ("dtype", "tolerance", "side"),
+    ("dtype", "tolerance", "side", "tree"),
     [
-        (torch.float64, 1e-12, 1),
-        (torch.float64, 1e-12, 4),
-        (torch.float64, 1e-12, 16),
-        (torch.float32, 1e-6, 4),
+        (torch.float64, 1e-12, 1, "kd"),
+        (torch.float64, 1e-12, 4, "kd"),
+        (torch.float64, 1e-12, 4, "grid"),
+        (torch.float64, 1e-12, 4, "thin"),
+        (torch.float64, 1e-12, 16, "thin"),
+        (torch.float32, 1e-6, 4, "kd"),
     ],
 )
 @BOTH
@@ -106,7 +107,7 @@ def test_the_gradient_through_folded_cells_is_that_of_the_merged_picture(primiti
         assert relative_error(found[name], expected[name]) < 1e-10, name
 
 
-@pytest.mark.parametrize("pass_gaussians", [0, 60, 130, 1000])
+@pytest.mark.parametrize("pass_gaussians", [60, 1000])
 def test_how_many_blocks_share_a_pass_changes_nothing_by_fragments(pass_gaussians):
     gaussians = translucent(200)
     views = views_in_and_out(torch.float64)
@@ -142,7 +143,7 @@ def test_units_hold_every_block_but_the_active_one_exactly_once(ownership):
             assert sorted(held) == [b for b in range(11) if b != active]
 
 
-@pytest.mark.parametrize(("pass_gaussians", "side"), [(0, 4), (60, 4), (10_000, 4), (60, 16)])
+@pytest.mark.parametrize(("pass_gaussians", "side"), [(0, 4), (10_000, 4), (60, 16)])
 @BOTH
 def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pass_gaussians, side):
     """Wherever the window lies, and however many units share the frozen blocks."""
