@@ -1,4 +1,4 @@
-"""The rules of the house (CONTRIBUTING.md), as far as a machine can check them.
+"""The rules of the house (CONTRIBUTING.md), as far as a machine can check them and ruff does not.
 
 Every rule is a function from source text to complaints, so that each is first shown to notice an offence.
 """
@@ -45,34 +45,6 @@ def function_length(source: str) -> Iterator[str]:
             yield f"{node.lineno}: {node.name} has {node.end_lineno - node.lineno + 1} lines"
 
 
-def public_docstrings(source: str) -> Iterator[str]:
-    """A module and its public functions and classes say what they are for."""
-    module = ast.parse(source)
-    if module.body and not ast.get_docstring(module):
-        yield "1: the module has no docstring"
-    for node in module.body:
-        public = isinstance(node, (*_FUNCTION, ast.ClassDef)) and not node.name.startswith("_")
-        if public and not ast.get_docstring(node):
-            yield f"{node.lineno}: {node.name} has no docstring"
-
-
-def no_shortcuts(source: str) -> Iterator[str]:
-    """Nothing is put off, and no check is silenced wholesale."""
-    for number, line in enumerate(source.splitlines(), 1):
-        for shortcut in re.findall(r"#\s*type:\s*ignore|#.*\b(?:TODO|FIXME|XXX)\b|#\s*noqa(?!:)", line):
-            yield f"{number}: {shortcut}"
-
-
-def no_swallowed_errors(source: str) -> Iterator[str]:
-    """Whoever catches everything raises it again."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.ExceptHandler):
-            caught = ast.unparse(node.type) if node.type else "everything"
-            raises = any(isinstance(inner, ast.Raise) for inner in ast.walk(node))
-            if caught in ("everything", "Exception", "BaseException") and not raises:
-                yield f"{node.lineno}: catches {caught}"
-
-
 def skips_have_reasons(source: str) -> Iterator[str]:
     """A skipped or expected failure says why; a skipif is given its condition."""
     tree = ast.parse(source)
@@ -103,13 +75,6 @@ def no_index_hosts(source: str) -> Iterator[str]:
     for number, line in enumerate(source.splitlines(), 1):
         for host in re.findall(hosts, line):
             yield f"{number}: {host}"
-
-
-def no_postponed_annotations(source: str) -> Iterator[str]:
-    """beartype checks the engine's annotations; as strings it could not."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.ImportFrom) and node.module == "__future__":
-            yield f"{node.lineno}: from __future__ import {node.names[0].name}"
 
 
 def no_circular_nerfstudio_imports(source: str) -> Iterator[str]:
@@ -153,13 +118,9 @@ def text_files() -> list[Path]:
     [
         (file_length, [*PACKAGE_FILES, *TEST_FILES]),
         (function_length, [*PACKAGE_FILES, *TEST_FILES]),
-        (public_docstrings, PACKAGE_FILES),
-        (no_shortcuts, [p for p in [*PACKAGE_FILES, *TEST_FILES] if p != Path(__file__).resolve()]),
-        (no_swallowed_errors, [*PACKAGE_FILES, *TEST_FILES]),
         (skips_have_reasons, TEST_FILES),
         (machine_independent, text_files()),
         (no_index_hosts, config_files()),
-        (no_postponed_annotations, [p for p in PACKAGE_FILES if {"engine", "peers"} & set(p.parts)]),
         (
             no_circular_nerfstudio_imports,
             [p for p in PACKAGE_FILES if not {"cli", "lab"} & set(p.relative_to(ROOT).parts)],
@@ -177,18 +138,11 @@ def test_the_house_is_clean(rule, paths):
     [
         (file_length, "\n" * (MAX_FILE_LINES + 1)),
         (function_length, "def f():\n" + "    1\n" * MAX_FUNCTION_LINES),
-        (public_docstrings, "x = 1"),
-        (public_docstrings, '"""A module."""\nclass Public: pass'),
-        (no_shortcuts, "x = 1  # TODO"),
-        (no_shortcuts, "x = 1  # noqa"),
-        (no_swallowed_errors, "try: f()\nexcept Exception as error: print(error)"),
-        (no_swallowed_errors, "try: f()\nexcept: pass"),
         (skips_have_reasons, "@pytest.mark.skip\ndef test(): pass"),
         (skips_have_reasons, "pytest.skip()"),
         (skips_have_reasons, "pytest.mark.skipif(True)"),
         (machine_independent, "see /home/me/scene"),
         (no_index_hosts, "--index-url https://mirror"),
-        (no_postponed_annotations, "from __future__ import annotations"),
         (no_circular_nerfstudio_imports, "from nerfstudio.configs.method_configs import all_methods"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
@@ -201,8 +155,6 @@ def test_each_rule_notices_an_offence(rule, offence):
     ("rule", "innocent"),
     [
         (function_length, "def f():\n" + "    1\n" * (MAX_FUNCTION_LINES - 1)),
-        (public_docstrings, '"""A module."""\ndef _private(): pass'),
-        (no_swallowed_errors, "try: f()\nexcept BaseException:\n    g()\n    raise"),
         (skips_have_reasons, "pytest.skip('no data'); pytest.mark.skipif(True, reason='no data')"),
         (machine_independent, "https://host/work/page ../work/x ~/root/x"),
         (no_circular_nerfstudio_imports, "def f():\n    from nerfstudio.configs.method_configs import x"),
@@ -225,25 +177,37 @@ def test_imports_keep_to_the_contracts():
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-@pytest.mark.parametrize(
-    ("contract", "module", "statement"),
-    [
-        ("never the other way", "engine/types.py", "import abcd_ns.nerfstudio"),
-        ("never the other way", "engine/types.py", "import abcd_ns.cli.main"),
-        ("never the other way", "nerfstudio/model.py", "from abcd_ns.cli import main"),
-        ("nor any user interface", "engine/types.py", "from nerfstudio.utils import colormaps"),
-        ("nor any user interface", "engine/types.py", "def late():\n    import viser"),
-        ("nor any user interface", "engine/types.py", "import rich.console"),
-        ("nor any user interface", "engine/types.py", "import tyro"),
-        ("nor any user interface", "peers/exact.py", "import viser"),
-        ("a folder uses those below it", "engine/render/base.py", "import abcd_ns.engine.train"),
-        ("density control only", "engine/types.py", "import gsplat"),
-        ("density control only", "nerfstudio/model.py", "from gsplat.strategy import DefaultStrategy"),
-        ("two files about it", "cluster/dispatcher.py", "import ray"),
-        ("No cycles", "engine/types.py", "import abcd_ns.engine.space.tree"),
-    ],
-)
-def test_the_contracts_notice_an_offence(contract, module, statement, tmp_path):
+OFFENCES = [
+    (
+        "engine/types.py",
+        "import abcd_ns.nerfstudio.model",
+        "abcd_ns.engine.types -> abcd_ns.nerfstudio.model",
+    ),
+    ("engine/types.py", "import abcd_ns.cli.main", "abcd_ns.engine.types -> abcd_ns.cli.main"),
+    ("nerfstudio/model.py", "from abcd_ns.cli import main", "abcd_ns.nerfstudio.model -> abcd_ns.cli.main"),
+    (
+        "engine/render/base.py",
+        "import abcd_ns.engine.train",
+        "abcd_ns.engine.render.base -> abcd_ns.engine.train",
+    ),
+    ("engine/types.py", "from nerfstudio.utils import colormaps", "abcd_ns.engine.types -> nerfstudio"),
+    ("engine/types.py", "def late():\n    import viser", "abcd_ns.engine.types -> viser"),
+    ("engine/types.py", "import rich.console", "abcd_ns.engine.types -> rich"),
+    ("engine/types.py", "import tyro", "abcd_ns.engine.types -> tyro"),
+    ("peers/exact.py", "import viser", "abcd_ns.peers.exact -> viser"),
+    ("engine/types.py", "import gsplat", "abcd_ns.engine.types -> gsplat"),
+    (
+        "nerfstudio/model.py",
+        "from gsplat.strategy import DefaultStrategy",
+        "abcd_ns.nerfstudio.model -> gsplat",
+    ),
+    ("cluster/dispatcher.py", "import ray", "abcd_ns.cluster.dispatcher -> ray"),
+    ("engine/types.py", "import abcd_ns.engine.space.tree", ".types -> .space (1 import)"),
+]
+"""What breaks a contract, and how it is told; the last one is a cycle."""
+
+
+def test_the_contracts_notice_every_offence(tmp_path):
     skeleton = {"errors.py": "", "cli/main.py": "import abcd_ns.nerfstudio.model", "nerfstudio/model.py": ""}
     skeleton |= dict.fromkeys(
         ("progress_bar.py", "machine.py", "lab/__init__.py", "data/__init__.py", "peers/exact.py"), ""
@@ -254,7 +218,9 @@ def test_the_contracts_notice_an_offence(contract, module, statement, tmp_path):
     skeleton |= {"engine/types.py": "", "engine/space/tree.py": "import abcd_ns.engine.types"}
     gsplat = ("engine/train/density/control.py", "engine/render/cuda/backend.py")
     skeleton |= dict.fromkeys(gsplat, "import gsplat") | {"engine/events.py": ""}
-    for name, source in {**skeleton, module: statement}.items():
+    for module, statement, _ in OFFENCES:
+        skeleton[module] = f"{skeleton.get(module, '')}\n{statement}"
+    for name, source in skeleton.items():
         path = tmp_path / "abcd_ns" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(source)
@@ -264,7 +230,8 @@ def test_the_contracts_notice_an_offence(contract, module, statement, tmp_path):
     result = lint_imports(tmp_path)
 
     assert result.returncode == 1, result.stdout + result.stderr
-    assert f"{contract} BROKEN" in result.stdout
+    assert "Contracts: 0 kept" in result.stdout
+    assert [edge for *_, edge in OFFENCES if edge not in result.stdout] == []
 
 
 def entry_points() -> list[str]:
