@@ -189,7 +189,7 @@ class Dispatcher(Trainer):
             warm=state.warm,
             views=state.views.get(block, len(active.geometry.views)),
             health=state.health.get(block, BlockHealth()),
-            light={} if self.run.light is None else self.run.light.to_json(),
+            light=self._light_of(active.views),
             poses=self.run.poses.to_json(),
             beside=self._beside(active),
             allowance=self._allowance(),
@@ -199,6 +199,11 @@ class Dispatcher(Trainer):
         own = self.workers.share(state_for_visit(scene, block))
         lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks}))
         return Lent(active, lease, len(mail or ()))
+
+    def _light_of(self, views: Sequence[int]) -> dict[int, Tensor]:
+        """The transforms of these views by now."""
+        light = self.run.light
+        return {} if light is None else {view: light.of(view).detach().cpu() for view in views}
 
     def _as_drawn(self, block: int) -> Callable[[], Gaussians]:
         """What reads a block as it is now; what was shared before stays with the leases that have it."""

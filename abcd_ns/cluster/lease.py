@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from torch import Tensor
+
 from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.tree import BlockTree
@@ -37,10 +39,11 @@ class VisitTask:
     views: int
     """Worth training the block on."""
     health: BlockHealth
-    light: dict[str, str]
-    """As in RunState; the worker applies it, and leaves it as it is."""
+    light: dict[int, Tensor]
+    """By view in use, its transform, on the CPU; the worker applies it and leaves it as it is. Empty for none
+    at all."""
     poses: dict[str, str]
-    """The same."""
+    """As in RunState; likewise."""
     beside: dict[int, float]
     """By view that shows them, which part of the other blocks' weight is out at the same time; see
     shared_residual."""

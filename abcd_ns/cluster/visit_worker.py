@@ -17,6 +17,7 @@ from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.loss import psnrs
 from abcd_ns.engine.store.lent_scene import LentScene
+from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.run import TrainingRun
@@ -177,8 +178,7 @@ class VisitWorker:
             active=copy.deepcopy(task.active),
         )
         if run.light is not None:  # two workers may show one photo: whose transform should stay?
-            run.light.restore(task.light)
-            run.light.learns = False
+            run.light = HeldLight(task.light, run.device)
         run.poses.restore(task.poses)
         run.take_poses()
         run.stopwatch = Stopwatch(task.seconds)

@@ -20,6 +20,33 @@ def upload(tensor: Tensor, device: torch.device) -> Tensor:
     return tensor.to(device, non_blocking=True)
 
 
+class Download:
+    """A tensor of a device on its way to the host, which has it without waiting once the device came by.
+
+    Args:
+        tensor: of a device that has no events, or of the CPU, it is there at once.
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        kind = event_of(tensor.device)
+        self._there = tensor.to("cpu", non_blocking=kind is not None)
+        self._event = kind and kind()
+        if self._event is not None:
+            self._event.record()
+
+    def read(self) -> Tensor:
+        """It; waits until it is there."""
+        if self._event is not None:
+            self._event.synchronize()
+        return self._there
+
+
+def event_of(device: torch.device) -> type | None:
+    """What tells that a device has come to a point; None for one that has no such thing."""
+    module = None if device.type == "cpu" else torch.get_device_module(device)
+    return getattr(module, "Event", None)
+
+
 class StepNumbers:
     """The few numbers that a step leaves on the device, in one copy.
 
@@ -31,31 +58,24 @@ class StepNumbers:
     """
 
     def __init__(self, device: torch.device) -> None:
-        module = None if device.type == "cpu" else torch.get_device_module(device)
-        self._event = getattr(module, "Event", None)
-        self._sent: deque[tuple[Any, dict[str, int], Tensor, Any]] = deque()
+        self._device = device
+        self._sent: deque[tuple[Any, dict[str, int], Download]] = deque()
 
     @property
     def are_late(self) -> bool:
         """Whether they are better not asked for in the step that they are of."""
-        return self._event is not None
+        return event_of(self._device) is not None
 
     def send(self, about: Any, parts: Parts) -> None:
         """Have them copied; `about` is given back with them."""
         flat = [number for part in parts.values() for number in part]
-        if not flat:
-            return
-        there = torch.stack(flat).to("cpu", non_blocking=self.are_late)
-        event = self._event() if self.are_late else None
-        if event is not None:
-            event.record()
-        self._sent.append((about, {name: len(part) for name, part in parts.items()}, there, event))
+        if flat:
+            counts = {name: len(part) for name, part in parts.items()}
+            self._sent.append((about, counts, Download(torch.stack(flat))))
 
     def read(self, all_but: int = 0) -> Iterator[tuple[Any, Numbers]]:
         """Those that were sent and not read yet, but for the last so many: waits until they are there."""
         while len(self._sent) > all_but:
-            about, counts, there, event = self._sent.popleft()
-            if event is not None:
-                event.synchronize()
-            values = iter(there.tolist())
+            about, counts, numbers = self._sent.popleft()
+            values = iter(numbers.read().tolist())
             yield about, {name: [next(values) for _ in range(count)] for name, count in counts.items()}

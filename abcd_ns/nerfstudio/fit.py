@@ -188,8 +188,9 @@ def _fewer(views: int) -> Iterator[int]:
 
 
 def _needs(demand: Demand, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
-    degree, keeps = demand.training.sh_degree, not demand.on_cpu
-    return DeviceNeeds(demand.pixels, batch, degree, crop_pixels, levels, keeps)
+    training, keeps = demand.training, not demand.on_cpu
+    options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive)
+    return DeviceNeeds(demand.pixels, batch, *options)
 
 
 def _fewest(gaussians: int, limit: int, sole: int) -> int:

@@ -17,7 +17,14 @@ from abcd_ns.nerfstudio.workers import check_workers
 
 MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
 """Splatfacto's model options that nerfstudio's tools read; `mirror` sets them."""
-HONOURED = {"random_init", "num_random", "random_scale", "rasterize_mode", "color_corrected_metrics"}
+HONOURED = {
+    "random_init",
+    "num_random",
+    "random_scale",
+    "rasterize_mode",
+    "color_corrected_metrics",
+    "use_bilateral_grid",
+}
 """Splatfacto's model options that are flags of `ns-train abcd` too."""
 TOLERATED = {"eval_num_rays_per_chunk"}
 """ns-render sets it for all methods; pictures of Gaussians are not drawn by rays."""
@@ -39,7 +46,7 @@ SAME = {
 _FIXED = "it is fixed at splatfacto's value"
 _REDUCED = "set --pipeline.training.coarse, a share of the run, instead"
 _GIANTS = "--pipeline.training.heal shrinks giants"
-_LIGHT = "set --pipeline.training.light, a colour transform for each photo, instead"
+_GRIDS = "grids are 16 x 16 x 8, splatfacto's default, and adapt as --pipeline.training.light says"
 _RAYS = "it is about rays, and Gaussians are not drawn by rays"
 UNUSED_OF_MODEL = {
     "warmup_length": "set --pipeline.training.density.refine-start, a share of the run, instead",
@@ -51,7 +58,7 @@ UNUSED_OF_MODEL = {
     **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),
     **dict.fromkeys(("cull_screen_size", "split_screen_size", "stop_screen_size_at"), _GIANTS),
     **dict.fromkeys(("use_scale_regularization", "max_gauss_ratio"), _GIANTS),
-    **dict.fromkeys(("use_bilateral_grid", "grid_shape"), _LIGHT),
+    "grid_shape": _GRIDS,
     "camera_optimizer": "set --pipeline.training.poses SO3xR3 instead",
     "output_depth_during_training": "no loss here needs depth; trained scenes have it",
     **dict.fromkeys(("enable_collider", "collider_params", "eval_num_rays_per_chunk"), _RAYS),
@@ -70,7 +77,7 @@ UNUSED = {
 NOT_CLIPPED = "steps whose gradients are no numbers are skipped, and others are not clipped"
 UNUSED_OF_OPTIMIZERS = {
     "camera_opt": "poses are refined by steps of their own, see --pipeline.training.poses",
-    "bilateral_grid": _LIGHT,
+    "bilateral_grid": _GRIDS,
     "*.scheduler.*": "--pipeline.training.means-lr-decay is the means' rate at the end, and other rates stay",
     "*.optimizer.max_norm": NOT_CLIPPED,
 }
@@ -159,6 +166,13 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         raise UserError(_no_effect(f"pipeline.model.{name}", why))
     if model.rasterize_mode == "antialiased":
         training.antialiased = True
+    if model.use_bilateral_grid:
+        if training.light not in ("none", "bilateral"):
+            raise UserError(
+                f"--pipeline.model.use-bilateral-grid and --pipeline.training.light {training.light} are two "
+                "kinds of light: give one."
+            )
+        training.light = "bilateral"
     if training.light != "none":  # held-out photos have a light of their own, too
         model.color_corrected_metrics = True
     mirrored = {

@@ -111,7 +111,16 @@ def test_the_antialiased_mode_of_splatfacto_is_ours():
     assert pipeline.model.rasterize_mode == "antialiased"
 
 
-@pytest.mark.parametrize("kind", ["none", "exposure", "affine"])
+def test_the_bilateral_grids_of_splatfacto_are_ours():
+    pipeline = parsed("--pipeline.model.use-bilateral-grid", "True").pipeline
+    mirror(pipeline.training, pipeline.model)
+    assert pipeline.training.light == "bilateral"
+    pipeline.training.light = "affine"
+    with pytest.raises(UserError, match="two kinds of light"):
+        mirror(pipeline.training, pipeline.model)
+
+
+@pytest.mark.parametrize("kind", ["none", "exposure", "affine", "bilateral"])
 def test_where_light_is_compensated_held_out_pictures_are_corrected_too(kind):
     pipeline = parsed("--pipeline.training.light", kind).pipeline
     mirror(pipeline.training, pipeline.model)
@@ -152,7 +161,7 @@ def test_what_has_no_effect_is_refused_from_files_too(change, says):
         ("--pipeline.model.stop-split-at", "training.density.refine-stop"),
         ("--pipeline.model.num_downscales=2", "training.coarse"),
         ("--pipeline.model.camera-optimizer.trans-l2-penalty", "training.poses SO3xR3"),
-        ("--pipeline.model.use-bilateral-grid", "training.light"),
+        ("--pipeline.model.grid-shape", "training.light"),
         ("--pipeline.datamanager.cache-images", "device-budget-gb"),
         ("--gradient-accumulation-steps", "training.batch"),
         ("--mixed-precision", "float32"),

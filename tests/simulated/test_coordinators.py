@@ -67,14 +67,15 @@ def test_blocks_are_trained(tmp_path, start, views, photos, blocks, density, lay
     assert all(bool(value.isfinite().all()) for _, value in scene.items())
 
 
+@pytest.mark.parametrize("light", ["exposure", "bilateral"])
 @pytest.mark.parametrize("together", [0, 1])
 def test_poses_are_refined_by_pictures_of_one_unit_and_of_several(
-    tmp_path, start, views, photos, together, monkeypatch
+    tmp_path, start, views, photos, together, light, monkeypatch
 ):
     monkeypatch.setattr(pose_rounds, "FIRST", 0.0)
     target = lambda sample: (photos(sample.view.index, sample.crop).to(DEVICE), None)  # noqa: E731
     options = {"blocks": 2, "steps": 6, "poses": "SO3xR3", "pass_gaussians": together, "target": target}
-    coordinator = on_device(tmp_path, start, views, **options, light="exposure")
+    coordinator = on_device(tmp_path, start, views, **options, light=light)
     coordinator.poses.take()
     train(coordinator, photos)
     moved = [view for view in views if not torch.equal(coordinator.views[view.index].viewmat, view.viewmat)]

@@ -10,25 +10,27 @@ import gc
 import pytest
 
 from abcd_ns.engine.layers.layer_store import LayerStore
+from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import DeviceNeeds, levels_of
+from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, projected_bytes
 from abcd_ns.engine.train.training_loop import train
-from tests.reference.scenes import Photos, random_gaussians, ring_of_views
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
-from tests.simulated.test_coordinators import on_device
 
 LAVISH = 4.0
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=2)
 
 
-def run_on(folder, *, gaussians: int, width: int, size: float = 0.02, **options):
+def run_on(folder, *, gaussians: int, width: int, size: float = 0.02, primitive: str = "3dgs", **options):
     """A coordinator for square pictures, after two steps, and its photos."""
     gc.collect()  # earlier ones hang in cycles, and would be counted until chance takes them
     views = ring_of_views(4, width=width, height=width)
     photos = Photos(random_gaussians(30, seed=7, size=0.12), views)
     start = random_gaussians(gaussians, seed=1, size=size, sh_degree=3)
-    coordinator = on_device(folder, start, views, steps=40, processes=1, **options)
+    draws = GsplatRasterizer(primitive)
+    options = {"steps": 40, "processes": 1, "primitive": primitive, **options}
+    coordinator = make_coordinator(folder, start, views, device=DEVICE, rasterizer=draws, **options)
     train(coordinator, photos, steps=2)
     return coordinator, photos
 
@@ -41,23 +43,24 @@ def peak_of_steps(counts, folder, **options) -> tuple[int, int]:
     return counts.peak_bytes, coordinator.count()
 
 
-@pytest.mark.parametrize("batch", [1, 2])
-def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch):
+@pytest.mark.parametrize(("batch", "light"), [(1, "none"), (2, "none"), (1, "bilateral")])
+def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch, light):
+    options = {"gaussians": 40, "batch": batch, "density": STILL, "light": light}
     (small, _), (large, _) = (
-        peak_of_steps(simulated_gsplat, tmp_path / str(w), gaussians=40, width=w, batch=batch, density=STILL)
-        for w in (48, 96)
+        peak_of_steps(simulated_gsplat, tmp_path / str(w), width=w, **options) for w in (48, 96)
     )
     model = [DeviceNeeds(width**2, batch, levels=0).step_bytes for width in (48, 96)]
     assert large - small <= model[1] - model[0] <= LAVISH * (large - small)
 
 
+@pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
 @pytest.mark.parametrize("density", [STILL, GROWING], ids=["still", "growing"])
-def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, density):
+def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, density, primitive):
+    options = {"width": 32, "batch": 1, "density": density, "primitive": primitive}
     (small, few), (large, many) = (
-        peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, width=32, batch=1, density=density)
-        for n in (300, 1200)
+        peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, **options) for n in (300, 1200)
     )
-    model = DeviceNeeds(32**2, 1, levels=0).gaussian_bytes * (many - few)
+    model = DeviceNeeds(32**2, 1, levels=0, primitive=primitive).gaussian_bytes * (many - few)
     assert large - small <= model <= LAVISH * (large - small)
 
 
@@ -83,3 +86,26 @@ def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat, b
     ) / huge
     slope = (large - small) / (many - few)
     assert slope <= per_pixel <= LAVISH * slope
+
+
+@pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
+def test_what_a_gaussian_is_in_a_view(tmp_path, simulated_gsplat, primitive):
+    """What each further view of a step adds: a surfel has more rows than an ellipsoid."""
+    peaks = [
+        [
+            peak_of_steps(
+                simulated_gsplat,
+                tmp_path / f"{batch}-{gaussians}",
+                gaussians=gaussians,
+                width=32,
+                batch=batch,
+                density=STILL,
+                primitive=primitive,
+            )[0]
+            for gaussians in (300, 1200)
+        ]
+        for batch in (1, 3)
+    ]
+    (one, one_more), (three, three_more) = peaks
+    slope = (three_more - three - one_more + one) / 2 / 900
+    assert slope <= projected_bytes(primitive) <= LAVISH * slope

@@ -38,6 +38,11 @@ class Primitive:
     """How far from its middle a point may be drawn, px."""
 
     @property
+    def rows(self) -> int:
+        """Of a Gaussian in one view, see Splats."""
+        return self.graded + 4
+
+    @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Those that go by rows."""
         return (self.project, self.project_backward, self.tile_rows, splat_kernels.TILE_COLUMNS)

@@ -17,6 +17,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import AtRest, BlockMemory
 from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
+from abcd_ns.engine.store.table import Table
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
@@ -110,7 +111,7 @@ class StoredScene:
         """What is durable; to be read and written by way of the scene alone while there is one."""
         self.ram_bytes = ram_bytes
         self._memory = BlockMemory(ram_bytes)
-        self._unsaved: dict[BlockName, BlockState] = {}
+        self._unsaved: dict[BlockName, BlockState | Table] = {}
         self._writer = WriteBehind(store, self._saved)
         self._numbers, self._versions = itertools.count(1), dict[BlockName, int]()
         self._bounds: dict[int, tuple[int, Box | None]] = {}
@@ -126,15 +127,15 @@ class StoredScene:
     def rest(
         self,
         tree: BlockTree,
-        blocks: Mapping[BlockName, BlockState],
+        blocks: Mapping[BlockName, BlockState | Table],
         state: dict[str, Any],
         within: float = 0.0,
     ) -> None:
         """Take in the blocks that changed, under `tree`, and the run's state, as one moment of the run.
 
         Args:
-            blocks: on the CPU, by number or special name; they belong to the scene from now on, as `state`
-                does.
+            blocks: on the CPU, by number or special name, and tables of the run's under names of their own;
+                they belong to the scene from now on, as `state` does.
             within: this is written so many seconds after the last write began. With 0 all is durable when
                 this returns, and also where what waits to be written exceeds `ram_bytes`.
 
@@ -175,7 +176,7 @@ class StoredScene:
             for name, block in snapshot.blocks.items():
                 if self._unsaved.get(name) is block:
                     del self._unsaved[name]
-                    if name not in (LIVE, INBOX):  # nobody reads them from here
+                    if isinstance(block, BlockState) and name not in (LIVE, INBOX):  # nobody reads them here
                         self._memory.put(name, block)
             self._memory.shrink(self.unsaved_bytes)
 
@@ -246,6 +247,12 @@ class StoredScene:
                 self._memory.put(name, found)
                 self._memory.shrink(self.unsaved_bytes)
             return found
+
+    def table(self, name: str) -> Table | None:
+        """A table of the run's, at rest; None where there is none of this name."""
+        if not self.has(name):
+            return None
+        return self._unsaved.get(name) or Table(*self.store.load(name))
 
     def read_ahead(self, block: int) -> None:
         """Have `state` of a block at hand soon; returns at once."""

@@ -62,8 +62,9 @@ class TrainingConfig:
     """What lies behind the scene while training."""
     light: LightKind = "none"
     """Makes good for photos that were taken in different light, by a colour transform of each finished
-    picture. exposure: a gain for each channel. affine: a matrix, 3 x 4. Their mean over the photos is the
-    identity, in which held-out views are drawn; these are scored as `cc_psnr`, too."""
+    picture. exposure: a gain for each channel. affine: a matrix, 3 x 4. bilateral: a grid of 16 x 16 x 8 of
+    these, for what differs within a photo. Their mean over the photos is the identity, in which held-out
+    views are drawn; these are scored as `cc_psnr`, too."""
     poses: PosesKind = "off"
     """Refines where photos were taken from, by whole pictures in the warm-up and between visits. SO3xR3: how
     each camera turns and where it is. Held-out views keep the poses that were given. With `workers` poses are

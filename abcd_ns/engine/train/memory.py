@@ -13,14 +13,15 @@ import torch
 
 from abcd_ns.engine.layers.painter import LEAST_PASS
 from abcd_ns.engine.layers.visit_layers import BYTES_PER_PIXEL, PARTS_BYTES
+from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.schedule import views_per_step, views_per_warm_up_step
 from abcd_ns.errors import UserError
 
 FLOAT = 4
 """Bytes."""
-PROJECTED_FLOATS = 50
-"""Of a Gaussian in one view: its splat (11 numbers), copies sorted by tile, the gradients of all these."""
+PROJECTED_FLOATS = 3.6
+"""Of each row of a Gaussian in one view: itself, copies sorted by tile, the gradients of all these."""
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""
 DRAWN_FLOATS = 24
@@ -46,6 +47,7 @@ class DeviceNeeds:
             as many as the tree of blocks is deep, and one. 0 where a block is the whole scene.
         keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
             budget of its own for them.
+        primitive: what a Gaussian is.
     """
 
     pixels: int
@@ -54,6 +56,7 @@ class DeviceNeeds:
     crop_pixels: int = 0
     levels: int = 2
     keeps: bool = True
+    primitive: PrimitiveName = "3dgs"
 
     @property
     def parameter_bytes(self) -> int:
@@ -64,7 +67,7 @@ class DeviceNeeds:
     def gaussian_bytes(self) -> int:
         """Of one Gaussian in training: parameters, gradient, two moments; three of them once more while the
         block is refined; and what its views' drawings hold."""
-        return 7 * self.parameter_bytes + self.batch * PROJECTED_FLOATS * FLOAT
+        return 7 * self.parameter_bytes + self.batch * projected_bytes(self.primitive)
 
     @property
     def step_bytes(self) -> int:
@@ -80,7 +83,7 @@ class DeviceNeeds:
         if self.levels == 0:
             return 0
         parts = max(PARTS_BYTES, self.levels * BYTES_PER_PIXEL * self.pixels)
-        frozen = LEAST_PASS * (self.parameter_bytes + PROJECTED_FLOATS * FLOAT)
+        frozen = LEAST_PASS * (self.parameter_bytes + projected_bytes(self.primitive))
         return parts + self.pixels * DRAWN_FLOATS * FLOAT + frozen
 
     @property
@@ -120,7 +123,8 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
         views_per_step(config.batch, 2, config.limits.batch_limit),
         views_per_warm_up_step(config.batch, config.limits.batch_limit),
     )
-    visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, config.limits.crop_pixels) for n in batches)
+    options = {"crop_pixels": config.limits.crop_pixels, "primitive": config.primitive}
+    visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, **options) for n in batches)
     # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
     room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
     return config.limits.scaffold_gaussians or room // warm_up.gaussian_bytes
@@ -145,10 +149,15 @@ def bytes_for(gaussians: int, sh_degree: int) -> int:
     return gaussians * (11 + 3 * (sh_degree + 1) ** 2) * FLOAT * LIVE_COPIES
 
 
-def drawing_bytes(sh_degree: int) -> int:
+def projected_bytes(primitive: PrimitiveName) -> int:
+    """Of what a Gaussian is in one view: 14 rows of an ellipsoid, 19 of a surfel; see Splats."""
+    return round(PROJECTED_FLOATS * PRIMITIVES[primitive].rows) * FLOAT
+
+
+def drawing_bytes(sh_degree: int, primitive: PrimitiveName) -> int:
     """What a Gaussian takes while it is drawn without gradients: its parameters, once more as the rasterizer
     wants them, and what one view sees of it."""
-    return FLOAT * (2 * (11 + 3 * (sh_degree + 1) ** 2) + PROJECTED_FLOATS)
+    return FLOAT * 2 * (11 + 3 * (sh_degree + 1) ** 2) + projected_bytes(primitive)
 
 
 def free_bytes(device: torch.device) -> int:

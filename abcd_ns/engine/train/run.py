@@ -124,17 +124,16 @@ class TrainingRun:
     def rest(self, tree: BlockTree, updates: dict[BlockName, BlockState], within: float) -> None:
         """Put blocks and the run's state to rest, as one moment; on disk within so many seconds."""
         self.state.seconds = self.stopwatch.seconds
-        if self.light is not None:
-            self.state.light = self.light.to_json()
         self.state.poses = self.poses.to_json()
-        self.scene.rest(tree, updates, self.state.to_json(), within)
+        tables = self.light.changed() if self.light is not None else {}
+        self.scene.rest(tree, {**updates, **tables}, self.state.to_json(), within)
 
     def restore(self) -> None:
         """Stand where the store's newest generation stands."""
         self.state = RunState.from_json(self.scene.store.state)
         self.stopwatch = Stopwatch(self.state.seconds)
-        if self.light is not None and self.state.light:
-            self.light.restore(self.state.light)
+        if self.light is not None:
+            self.light.restore(self.scene.table)
         if self.state.poses:
             self.poses.restore(self.state.poses)
             self.take_poses()

@@ -117,8 +117,6 @@ class RunState:
     """Gaussians of the blocks that were visited in this sweep, when their visits began."""
     frozen: int = 0
     """Gaussians that were drawn around them."""
-    light: dict[str, str] = field(default_factory=dict)
-    """See Light, at rest; empty where there is none."""
     poses: dict[str, str] = field(default_factory=dict)
     """See Poses, at rest; empty where all are as they were given."""
     uses: float = 0.0

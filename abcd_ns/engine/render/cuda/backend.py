@@ -49,7 +49,7 @@ class GsplatRasterizer(Rasterizer):
         """See Rasterizer.project."""
         check_degree(gaussians, sh_degree)
         if len(gaussians) == 0:
-            return Splats(gaussians.means.new_zeros((self.primitive.graded + 4, 0)))
+            return Splats(gaussians.means.new_zeros((self.primitive.rows, 0)))
         return project(self._kind, gaussians, [view], self._cameras, sh_degree, antialiased).splats(0)
 
     @torch.no_grad()

@@ -4,18 +4,25 @@ F, the live block, B and the background are composited first. So no layer hangs 
 valid whatever becomes of it. Transforms belong to the run and not to a block: of each photo there is one.
 """
 
-from collections.abc import Sequence
+import math
+import mmap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.train.capture import per_view
+from abcd_ns.engine.store.table import Table
+from abcd_ns.engine.train.capture import bilateral_grid
+from abcd_ns.engine.transfer import Download, upload
+from abcd_ns.engine.types import Crop, View
+from abcd_ns.errors import UserError
 
-Kind = Literal["none", "exposure", "affine"]
-Uses = Sequence[tuple[int, Tensor]]
-"""(view, its transform [3, 4] or that one's gradient) pairs, one for each picture."""
+Kind = Literal["none", "exposure", "affine", "bilateral"]
+Gradients = Sequence[tuple[int, Tensor]]
+"""(view, the gradient by its transform) pairs, one for each picture."""
 RATE, SETTLES = 0.05, 10.0
 """Adam's at a view's first use, and the uses after which it is halved: it falls as in an average."""
 LAST = 0.03
@@ -23,36 +30,65 @@ LAST = 0.03
 BETAS = (0.9, 0.999)
 AMONG_OTHERS = 0.5
 """Share of the rate where a visit shows only a part of each picture."""
+TABLE_BYTES = 1 << 18
+"""Of what is written together, about, with moments: a grid alone, as a visit has few views; small transforms
+by the thousand."""
+
+
+@dataclass(frozen=True)
+class Use:
+    """A picture that was drawn in its photo's light."""
+
+    view: int
+    transform: Float[Tensor, "3 4"] | Float[Tensor, "12 l r c"]
+    """A leaf, if it learns."""
+    weight: float = 1.0
+    """Of the loss of the whole picture in that of the step."""
 
 
 class Light:
-    """A transform for each view, [3, 4]: colour c becomes M c + o. All begin as the identity, which their
-    mean over the views always is: otherwise the scene's colours would drift, and the transforms with them.
+    """A transform for each view, [3, 4], by which colour c becomes M c + o, or a grid of these. All begin as
+    the identity, which their mean over the views always is: otherwise the scene's colours would drift, and
+    the transforms with them.
+
+    Grids take 0.3 MB a view, with moments, and stay in RAM, from where those of a step's views are copied.
 
     Args:
-        kind: `exposure` leaves a gain for each channel, `affine` everything free.
+        kind: `exposure` leaves a gain for each channel, `affine` everything free, `bilateral` everything in
+            each place of a grid.
         views: their indices.
+        device: where pictures are.
     """
 
     def __init__(self, kind: Kind, views: Sequence[int], device: torch.device | str = "cpu") -> None:
+        self.kind = kind
         self._rows = {view: row for row, view in enumerate(sorted(views))}
-        self.learns = True
-        """Whether steps change it."""
-        self._identity = torch.eye(3, 4, device=device)
-        self._free = self._identity if kind == "exposure" else torch.ones_like(self._identity)
-        # Less the identity. Helpers that are forked see in shared memory what each step makes of it.
-        changes = torch.zeros((len(self._rows), 3, 4), device=device)
-        self._changes = changes.share_memory_() if changes.device.type == "cpu" else changes
-        self._first, self._second = torch.zeros_like(changes), torch.zeros_like(changes)
-        self._uses = changes.new_zeros(len(self._rows), 1, 1)
+        self._device = torch.device(device)
+        is_grid = kind == "bilateral"
+        self._home = torch.device("cpu") if is_grid else self._device
+        shape = (12, *bilateral_grid.SHAPE) if is_grid else (3, 4)
+        identity = torch.eye(3, 4, device=self._home)
+        self._free = identity if kind == "exposure" else torch.ones(shape, device=self._home)
+        self._identity = identity.view(12, 1, 1, 1).expand(shape) if is_grid else identity
+        # Less the identity and what they have in common, which is `_sum` by the number of views: no step
+        # needs to touch more than its own.
+        self._changes = _shared((len(self._rows), *shape), torch.float32, self._home)
+        self._sum = _shared(shape, torch.float64, self._home)
+        self._first, self._second = (torch.zeros_like(self._changes) for _ in BETAS)
+        self._uses = torch.zeros(len(self._rows), device=self._home)
+        self._stepped: set[int] = set()
+        self._pending: tuple[list[int], Download, float] | None = None
 
     @torch.no_grad()
-    def of(self, view: int) -> Float[Tensor, "3 4"]:
-        """The transform of a view: a leaf, whose gradient `step` takes."""
-        return (self._identity + self._changes[self._rows[view]]).requires_grad_(self.learns)
+    def of(self, view: int) -> Float[Tensor, "3 4"] | Float[Tensor, "12 l r c"]:
+        """The transform of a view: a leaf, by whose gradient `step` goes."""
+        self._settle()
+        common = (self._sum / len(self._rows)).float()
+        now = self._identity + (self._changes[self._rows[view]] - common)
+        return upload(now, self._device).requires_grad_()
 
     @torch.no_grad()
-    def step(self, gradients: Uses, damping: float = 1.0) -> None:
+    def step(self, gradients: Gradients, damping: float = 1.0) -> None:
         """Take a step of Adam (Kingma and Ba 2015, algorithm 1), for each view that the step shows its own:
         the others keep their transforms and moments.
 
@@ -60,41 +96,148 @@ class Light:
             gradients: of all pictures of the step; those that are no numbers count as zero.
             damping: share of the rates.
         """
-        if not self.learns or not gradients:
+        if not gradients:
             return
-        device = self._changes.device
-        places = torch.tensor([self._rows[view] for view, _ in gradients], device=device)
-        values = (torch.stack([gradient for _, gradient in gradients]) * self._free).nan_to_num(0.0, 0.0, 0.0)
-        rows = torch.tensor(sorted({self._rows[view] for view, _ in gradients}), device=device)
-        summed = torch.zeros_like(self._changes).index_add_(0, places, values)[rows]
-        self._uses[rows] += 1
-        first = self._first[rows] = self._first[rows].lerp(summed, 1 - BETAS[0])
-        second = self._second[rows] = self._second[rows].lerp(summed.square(), 1 - BETAS[1])
-        first, second = (
-            m / (1 - beta ** self._uses[rows]) for m, beta in zip((first, second), BETAS, strict=True)
-        )
-        rate = damping * RATE / (1 + self._uses[rows] / SETTLES)
-        self._changes[rows] -= rate * first / (second.sqrt() + 1e-15)
-        self._changes -= self._changes.mean(dim=0)
+        self._settle()
+        of_views: dict[int, Tensor] = {}
+        for view, gradient in gradients:
+            row = self._rows[view]
+            of_views[row] = of_views[row] + gradient if row in of_views else gradient
+        rows = sorted(of_views)
+        summed = torch.stack([of_views[row].to(self._device) for row in rows])
+        self._stepped.update(rows)
+        if self._home == self._device:
+            self._adapt(rows, summed, damping)
+        else:  # the device is still at it: whoever asks for a transform next sees to it
+            self._pending = rows, Download(summed), damping
 
-    def to_json(self) -> dict[str, str]:
-        """All of it at rest, bit for bit."""
-        return per_view.to_json(self._tensors())
+    def _settle(self) -> None:
+        """Take the step that waits for its gradients."""
+        if self._pending is not None:
+            (rows, gradients, damping), self._pending = self._pending, None
+            self._adapt(rows, gradients.read(), damping)
 
-    def restore(self, data: dict[str, str]) -> None:
-        """Stand where `to_json` was called."""
-        per_view.restore(self._tensors(), data)
+    @torch.no_grad()
+    def _adapt(self, rows: Sequence[int], gradients: Tensor, damping: float) -> None:
+        places = torch.tensor(rows, device=self._home)
+        summed = (gradients * self._free).nan_to_num(0.0, 0.0, 0.0)
+        self._uses[places] += 1
+        uses = self._uses[places].view(-1, *[1] * (summed.ndim - 1))
+        first = self._first[places] = self._first[places].lerp(summed, 1 - BETAS[0])
+        second = self._second[places] = self._second[places].lerp(summed.square(), 1 - BETAS[1])
+        first, second = (m / (1 - beta**uses) for m, beta in zip((first, second), BETAS, strict=True))
+        before = self._changes[places]
+        after = before - damping * RATE / (1 + uses / SETTLES) * first / (second.sqrt() + 1e-15)
+        self._changes[places] = after
+        self._sum += (after.double() - before.double()).sum(dim=0)
 
-    def _tensors(self) -> dict[str, Tensor]:
-        return {name: getattr(self, f"_{name}") for name in ("changes", "first", "second", "uses")}
+    # -- at rest -------------------------------------------------------------------------------------
+
+    def changed(self) -> dict[str, Table]:
+        """All that has changed since the last call, by the names under which it is to be kept; shares no
+        memory."""
+        self._settle()
+        parts = {row // self._together for row in self._stepped}
+        self._stepped.clear()
+        return {_name(part): self._table(part) for part in sorted(parts | {0})} if parts else {}
+
+    def restore(self, table: Callable[[str], Table | None]) -> None:
+        """Stand where all that `changed` ever gave was kept.
+
+        Args:
+            table: finds it by name; None for nothing.
+
+        Raises:
+            UserError: these are transforms of another kind.
+        """
+        for part in range(-(-len(self._rows) // self._together)):
+            kept = table(_name(part))
+            if kept is None:
+                continue
+            if kept.meta["kind"] != self.kind:
+                raise UserError(
+                    f"The run was begun with --pipeline.training.light {kept.meta['kind']}: go on with that, "
+                    f"not with {self.kind}."
+                )
+            for name, value in self._tensors(part).items():
+                value.copy_(kept.tensors[name])
+
+    @property
+    def _together(self) -> int:
+        """Rows of a table."""
+        return max(1, TABLE_BYTES // (self._changes[:1].nbytes * 3))
+
+    def _table(self, part: int) -> Table:
+        tensors = {name: value.to("cpu", copy=True) for name, value in self._tensors(part).items()}
+        return Table(tensors, {"kind": self.kind})
+
+    def _tensors(self, part: int) -> dict[str, Tensor]:
+        """What is kept together, itself. The first has the sum, too."""
+        rows = slice(part * self._together, (part + 1) * self._together)
+        found = {name: getattr(self, f"_{name}")[rows] for name in ("changes", "first", "second", "uses")}
+        return found | ({"sum": self._sum} if part == 0 else {})
 
 
-def gradients_of(lights: Uses) -> Uses:
-    """What a step's backward has left in the transforms of its pictures."""
-    return [(view, transform.grad) for view, transform in lights if transform.grad is not None]
+class HeldLight:
+    """Transforms that somebody else found, and which stay as they are.
+
+    Args:
+        transforms: by view.
+    """
+
+    def __init__(self, transforms: Mapping[int, Tensor], device: torch.device) -> None:
+        self._transforms = {view: transform.to(device) for view, transform in transforms.items()}
+
+    def of(self, view: int) -> Float[Tensor, "3 4"] | Float[Tensor, "12 l r c"]:
+        """The transform of a view."""
+        return self._transforms[view]
+
+    def step(self, gradients: Gradients, damping: float = 1.0) -> None:
+        """Nothing."""
 
 
-def lit(picture: Float[Tensor, "h w 3"], transform: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
-    """A composited picture in a photo's light, M c + o in each pixel, not clamped."""
+def gradients_of(uses: Sequence[Use]) -> Gradients:
+    """What a step's backward has left in the transforms of its pictures, and by how much grids are to be
+    smoother."""
+    found = []
+    for use in uses:
+        if use.transform.grad is None:
+            continue
+        gradient = use.transform.grad
+        if gradient.ndim > 2:
+            smooth = bilateral_grid.of_total_variation(use.transform)
+            gradient = gradient + bilateral_grid.TV_WEIGHT * use.weight * smooth
+        found.append((use.view, gradient))
+    return found
+
+
+def lit(
+    picture: Float[Tensor, "h w 3"],
+    transform: Float[Tensor, "3 4"] | Float[Tensor, "12 l r c"],
+    part: Crop,
+    view: View,
+) -> Float[Tensor, "h w 3"]:
+    """A composited picture in a photo's light, M c + o in each pixel, not clamped.
+
+    Args:
+        picture: a part of the view's.
+    """
+    if transform.ndim > 2:
+        of_pixels = bilateral_grid.sliced(transform, picture, part, view)
+        return (of_pixels[..., :3] @ picture[..., None])[..., 0] + of_pixels[..., 3]
     matrix = transform.to(picture.dtype)
     return picture @ matrix[:, :3].T + matrix[:, 3]
+
+
+def _shared(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Zeros, which helpers that are forked see change; in RAM, a page takes none before it is written to."""
+    if device.type != "cpu":
+        return torch.zeros(shape, dtype=dtype, device=device)
+    size = math.prod(shape) * dtype.itemsize
+    return torch.frombuffer(mmap.mmap(-1, max(size, mmap.PAGESIZE)), dtype=dtype)[: math.prod(shape)].view(
+        shape
+    )
+
+
+def _name(part: int) -> str:
+    return f"light-{part}"

@@ -15,7 +15,7 @@ from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.train.capture.light import Uses, lit
+from abcd_ns.engine.train.capture.light import Use, lit
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
@@ -68,13 +68,22 @@ class Sample:
         by = self.view.reduction
         return mask if by == 1 or mask is None else _mean_of_squares((~mask).float(), by) == 0
 
-    def picture(self, raster: Raster, light: Float[Tensor, "3 4"] | None = None) -> Float[Tensor, "h w 3"]:
-        """What the rasterizer drew, between the layers and on the background, in its photo's light, 0..1."""
+    def picture(self, raster: Raster, light: Tensor | None = None) -> Float[Tensor, "h w 3"]:
+        """What the rasterizer drew, between the layers and on the background, in its photo's light, 0..1.
+
+        Args:
+            light: the photo's transform, see `lit`.
+        """
         if self.layers is None:
             rgb = raster.color + raster.transmittance[..., None] * self.background
         else:
             rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
-        return (rgb if light is None else lit(rgb, light)).clamp(0, 1)
+        return (rgb if light is None else lit(rgb, light, self.crop, self.view)).clamp(0, 1)
+
+    @property
+    def weight(self) -> float:
+        """Of this picture's loss, in expectation, in that of the whole image, by pixels."""
+        return self.crop.pixels / self.share / self.view.full.pixels
 
     def loss(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig
@@ -123,8 +132,8 @@ class Rendered:
     transmittances: tuple[Float[Tensor, "_h _w"], ...]
     """Of the active block and what was sorted in with it."""
     infos: tuple[dict[str, Any], ...]
-    lights: Uses = ()
-    """The transforms that the pictures were drawn with."""
+    lights: Sequence[Use] = ()
+    """What the pictures were drawn in."""
 
 
 def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "3"]:

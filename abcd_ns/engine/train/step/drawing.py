@@ -12,6 +12,7 @@ from abcd_ns.engine.events import Announcer
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.space.influence import share_shown
+from abcd_ns.engine.train.capture.light import Use
 from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.run import TrainingRun
@@ -218,7 +219,11 @@ class StepDrawing:
         lights = [None if light is None else light.of(sample.view.index) for sample in samples]
         drawn = zip(samples, rasters, lights, strict=True)
         pictures = tuple(sample.picture(raster, transform) for sample, raster, transform in drawn)
-        uses = [] if light is None else [(s.view.index, t) for s, t in zip(samples, lights, strict=True)]
+        uses = [
+            Use(sample.view.index, transform, sample.weight / self.batch)
+            for sample, transform in zip(samples, lights, strict=True)
+            if transform is not None
+        ]
         return Rendered(pictures, tuple(raster.transmittance for raster in rasters), infos, uses)
 
     # -- helpers -------------------------------------------------------------------------------------

@@ -97,7 +97,7 @@ class PoseRounds:
         photo, counts = self._target(sample)
         shown = picture.color.detach().requires_grad_()
         light = self._run.light
-        seen = shown if light is None else lit(shown, light.of(view.index).detach())
+        seen = shown if light is None else lit(shown, light.of(view.index).detach(), view.full, view)
         counted = 1.0 if counts is None else counts.to(seen)
         loss, weight = robust((seen - photo.to(seen)) * counted)
         (gradient,) = torch.autograd.grad(loss, shown)

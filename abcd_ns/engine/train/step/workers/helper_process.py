@@ -17,6 +17,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
+import numpy as np
 import torch
 
 from abcd_ns.engine.train.density.control import COUNTED
@@ -31,7 +32,7 @@ PR_SET_PDEATHSIG = 1
 """Of Linux' prctl: a signal for this process when its parent ends, however that ends."""
 
 
-Given = tuple[bool, list[tuple[int, list[list[float]]]]]
+Given = tuple[bool, list[tuple[int, np.ndarray]]]
 """Whether there were counts, and the gradients of the pictures' transforms."""
 
 
@@ -76,14 +77,14 @@ class Room:
         """Write what a share adds, but for what is small."""
         self.gradients.write(part.gradients)
         self.counts.write(part.counts)
-        return bool(part.counts), [(view, gradient.tolist()) for view, gradient in part.lights]
+        return bool(part.counts), [(view, gradient.numpy()) for view, gradient in part.lights]
 
     def take(self, rows: int, given: Given) -> Contribution:
         """Read it: shared memory, to be used before the next step."""
         gradients = {name: self.gradients.rows(name, rows) for name in PARAM_NAMES}
         counted, lights = given
         counts = {name: self.counts.rows(name, rows) for name in COUNTED} if counted else {}
-        return Contribution(gradients, counts, [(view, torch.tensor(values)) for view, values in lights])
+        return Contribution(gradients, counts, [(view, torch.from_numpy(values)) for view, values in lights])
 
     def leaves(self, rows: int) -> Gaussians:
         """The parameters, to be differentiated by."""

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.train.capture.light import Uses, gradients_of
+from abcd_ns.engine.train.capture.light import Gradients, gradients_of
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.health.health_rules import share_of_picture
@@ -49,7 +49,7 @@ class Contribution:
     """By parameter."""
     counts: dict[str, Tensor]
     """What density control adds up for each Gaussian, by name; may be empty."""
-    lights: Uses = ()
+    lights: Gradients = ()
     """Gradients of the pictures' transforms."""
 
 
