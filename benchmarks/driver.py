@@ -66,7 +66,7 @@ def measure(args: Args, folder: Path) -> tuple[dict[str, float], int, int]:
     for _ in range(args.visits):
         with timed(seconds, "reading, and a copy to lend"):
             state = state_for_visit(scene, 0)
-            lent = {name: tensor.clone() for name, tensor in state.to_tensors()[0].items()}
+            lent = {name: tensor.clone() for name, tensor in state.packed()[0].items()}
         with timed(seconds, "settling the answer by cells"):
             updates = settle(scene, 0, state)
         with timed(seconds, "putting it to rest on disk"):

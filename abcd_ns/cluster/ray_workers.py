@@ -62,7 +62,7 @@ class Shared:
         Raises:
             WorkersError: memory is full, and the disk that stands in for it.
         """
-        tensors, meta = (dict(value.items()), None) if isinstance(value, Gaussians) else value.to_tensors()
+        tensors, meta = (dict(value.items()), None) if isinstance(value, Gaussians) else value.packed()
         try:
             return Shared(ray.put({name: tensor.numpy() for name, tensor in tensors.items()}), meta)
         except FULL as error:
@@ -73,7 +73,7 @@ class Shared:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The given NumPy array is not writable")
             tensors = {name: torch.from_numpy(array) for name, array in ray.get(self.ref).items()}
-        return Gaussians(**tensors) if self.meta is None else BlockState.from_tensors(tensors, self.meta)
+        return Gaussians(**tensors) if self.meta is None else BlockState.unpacked(Packed(tensors, self.meta))
 
 
 class Actor:
@@ -95,7 +95,7 @@ class Actor:
         """Train a block; gives what became of it, its Gaussians apart."""
         self._done, self._psnrs = 0, []
         outcome = self._worker.visit(task, state(), drawn, self._hear)
-        tensors, meta = outcome.state.to_tensors()
+        tensors, meta = outcome.state.packed()
         arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
         return replace(outcome, state=outcome.state.nobody), arrays, meta
 
@@ -265,7 +265,7 @@ class RayWorkers:
         tensors = {
             name: torch.tensor(array) for name, array in arrays.items()
         }  # Ray's memory is for passing on
-        return [Finished(lease.number, replace(outcome, state=BlockState.from_tensors(tensors, meta)))]
+        return [Finished(lease.number, replace(outcome, state=BlockState.unpacked(Packed(tensors, meta))))]
 
     def _replace(self, member: Member, why: str) -> list[Report]:
         """Start another in place of one that is gone."""

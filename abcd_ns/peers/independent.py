@@ -243,4 +243,4 @@ def independent_trainer(run: TrainingRun) -> Coordinator:
 
 def initial_gaussians(scene: StoredScene, block: int) -> Gaussians:
     """A block's Gaussians as they began."""
-    return scene.stored(initial_of(block)).gaussians
+    return scene.stored(initial_of(block))

@@ -12,6 +12,7 @@ from plyfile import PlyData
 from abcd_ns.cli.export.command import TRANSFORMS, export
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -61,8 +62,8 @@ def by_position(vertices) -> np.ndarray:
 def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, tmp_path):
     assert export(run, out=tmp_path / "before.ply") == 0
     with ParameterStore.open(run / "abcd/store") as store:
-        state = BlockState.from_tensors(*store.load(0))
-        store.commit({0: state[3:].to_tensors(), INBOX: state[:3].to_tensors()})
+        state = BlockState.unpacked(Packed(*store.load(0)))
+        store.commit({0: state[3:].packed(), INBOX: state[:3].packed()})
     assert export(run, out=tmp_path / "after.ply") == 0
     before, after = by_position(read(tmp_path / "before.ply")), by_position(read(tmp_path / "after.ply"))
     assert np.array_equal(before, after)
@@ -70,11 +71,11 @@ def test_those_that_wait_for_their_blocks_next_visit_are_exported(run, tmp_path)
 
 def test_those_that_nobody_sees_yet_are_left_out(run, tmp_path):
     with ParameterStore.open(run / "abcd/store") as store:
-        state = BlockState.from_tensors(*store.load(0))
-        store.commit({0: state[3:].to_tensors()})
+        state = BlockState.unpacked(Packed(*store.load(0)))
+        store.commit({0: state[3:].packed()})
     assert export(run, out=tmp_path / "without.ply") == 0
     with ParameterStore.open(run / "abcd/store") as store:
-        store.commit({0: replace(state, waits=torch.arange(len(state)) < 3).to_tensors()})
+        store.commit({0: replace(state, waits=torch.arange(len(state)) < 3).packed()})
     assert export(run, out=tmp_path / "waiting.ply") == 0
     assert (tmp_path / "waiting.ply").read_bytes() == (tmp_path / "without.ply").read_bytes()
 

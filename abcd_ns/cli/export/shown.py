@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.block_state import WAITS
 from abcd_ns.engine.gaussians.frames import Frame
+from abcd_ns.engine.gaussians.packed import DRAWN, WAITS, Packed
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.special_blocks import INBOX
+from abcd_ns.engine.store.special_blocks import INBOX, BlockName
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
@@ -74,14 +74,20 @@ class Shown:
     def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
         """These parameters, the means among them, of the block and of those that left others for it, but for
         those that nobody sees yet."""
-        found = self.store.load_names(block, (*names, WAITS))
+        found = self._columns(block, names)
         seen = ~found.pop(WAITS)
         found = {name: value[seen] for name, value in found.items()}
         if INBOX not in self.store.blocks:
             return found
-        inbox = self.store.load_names(INBOX, names)
+        inbox = self._columns(INBOX, names)
         here = self._tree.assign(inbox["means"]) == block
         return {name: torch.cat([value, inbox[name][here]]) for name, value in found.items()}
+
+    def _columns(self, name: BlockName, names: tuple[str, ...]) -> dict[str, Tensor]:
+        if "features_rest" not in names:
+            return self.store.load_names(name, (*names, WAITS))
+        packed = Packed(self.store.load_names(name, DRAWN), self.store.meta(name))
+        return {**dict(packed.gaussians().items()), WAITS: packed.tensors[WAITS]}
 
     def _placed(self, means: Tensor) -> Tensor:
         return means.double() if self.to is None else self.to.points(means)

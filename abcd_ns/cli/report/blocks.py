@@ -15,6 +15,8 @@ class Block:
     """From 1, as the progress line counts."""
     gaussians: int | None
     """None where there is no checkpoint."""
+    parameters: int | None
+    """Of how many numbers they are; None where it is not known."""
     shed: int | None
     """Gaussians taken out that filled too little of their views; None where it is not known."""
     filled: float | None
@@ -48,6 +50,7 @@ def _describe(run: RunFolder, block: int, gaussians: int | None) -> Block:
     return Block(
         number=block + 1,
         gaussians=gaussians,
+        parameters=run.parameters.get(block),
         shed=None if block not in health else health[block].shed,
         filled=run.filled.get(block),
         views=known.get(block),

@@ -6,7 +6,10 @@ from datetime import timedelta
 from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder
 from abcd_ns.cli.report.story import Story
-from abcd_ns.lab.results.tables import GIB, NOTHING
+from abcd_ns.lab.results.tables import GIB, MIB, NOTHING
+
+FLOAT = 4
+"""Bytes of a number."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
     return [
         *_quality(story, held_out),
         Fact("Gaussians", f"{story.gaussians:,}", more="" if limit is None else f"limit {limit:,}"),
+        *_parameters(run),
         Fact("blocks", f"{story.blocks:,}", more=rounds if visits else ""),
         Fact("steps", f"{story.step:,}"),
         Fact(
@@ -39,6 +43,14 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
         *_workers(story),
         *_memory(run),
     ]
+
+
+def _parameters(run: RunFolder) -> list[Fact]:
+    count = sum(run.parameters.values())
+    if not count or run.checkpoint is None:
+        return []
+    each, nbytes = count / max(len(run.checkpoint.means), 1), FLOAT * count
+    return [Fact("parameters", f"{count:,}", more=f"{each:.1f} a Gaussian, {nbytes / MIB:.1f} MiB")]
 
 
 def _workers(story: Story) -> list[Fact]:

@@ -170,6 +170,7 @@ def _row(block: Block) -> dict[str, Any]:
     return {
         "number": block.number,
         "gaussians": NOTHING if block.gaussians is None else f"{block.gaussians:,}",
+        "parameters": NOTHING if block.parameters is None else f"{block.parameters:,}",
         "shed": NOTHING if block.shed is None else f"{block.shed:,}",
         "filled": NOTHING if block.filled is None else f"{block.filled:.1f} px",
         "views": NOTHING if block.views is None else f"{block.views:,}",

@@ -65,6 +65,8 @@ class RunFolder:
     """Where the planner stood at the checkpoint, or else when the run was last heard of."""
     filled: Mapping[int, float] = field(default_factory=dict)
     """By block, the pixels that a Gaussian fills in all its views, the median, as known then."""
+    parameters: Mapping[int, int] = field(default_factory=dict)
+    """By block, of how many numbers its Gaussians at rest are, as known then."""
 
 
 def find_run(path: Path) -> Path:
@@ -191,18 +193,22 @@ def _newest(folder: Path) -> Checkpoint | None:
         raise UserError(f"{path} cannot be read ({reason}); remove it to use an earlier one.") from None
 
 
-def _read_store(folder: Path, checkpoint: Checkpoint | None) -> tuple[RunState | None, dict[int, float]]:
+def _read_store(
+    folder: Path, checkpoint: Checkpoint | None
+) -> tuple[RunState | None, dict[int, float], dict[int, int]]:
     if not folder.is_dir():
-        return None, {}
+        return None, {}, {}
     try:
         store = ParameterStore.open(folder, read_only=True)
         if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
         state = RunState.from_json(store.state) if store.state else None
         views = {} if state is None else {block: n for block, n in state.views.items() if n}
-        return state, {
-            block: px for block, n in views.items() if (px := _filled(store, block, n)) is not None
+        filled = {block: px for block, n in views.items() if (px := _filled(store, block, n)) is not None}
+        parameters = {
+            block: store.meta(block)["parameters"] for block in store.blocks if isinstance(block, int)
         }
+        return state, filled, parameters
     except StoreError as error:
         raise UserError(str(error)) from None
 

@@ -6,12 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from abcd_ns.engine.gaussians.packed import WAITS, Packed, pack
+from abcd_ns.engine.types import Gaussians
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Adam's running moments, under torch's names."""
-WAITS = "waits"
-"""The column of those who wait, in the store."""
 
 
 @dataclass(frozen=True)
@@ -117,25 +116,25 @@ class BlockState:
             self.waits.to(device),
         )
 
-    def to_tensors(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """As flat tensors by name (parameters under their own names) and JSON-able clocks, for the store."""
-        tensors = {**dict(self.gaussians.items()), WAITS: self.waits}
-        for moment in MOMENTS:
-            tensors |= {f"{moment}.{name}": value for name, value in getattr(self, moment).items()}
-        tensors |= {f"growth.{name}": value for name, value in self.growth.items()}
-        return tensors, {"clocks": vars(self.clocks)}
+    def packed(self) -> Packed:
+        """As it is kept, for the store; clocks as JSON."""
+        parts = {"": self.gaussians, **{f"{moment}.": getattr(self, moment) for moment in MOMENTS}}
+        tensors, known = pack(parts)
+        growth = {f"growth.{name}": value for name, value in self.growth.items()}
+        return Packed({**tensors, WAITS: self.waits, **growth}, {"clocks": vars(self.clocks), **known})
 
     @staticmethod
-    def from_tensors(tensors: dict[str, Tensor], meta: dict[str, Any]) -> "BlockState":
-        """The inverse of `to_tensors`."""
-        growth = {k.removeprefix("growth."): v for k, v in tensors.items() if k.startswith("growth.")}
-        moments = (Gaussians(**{n: tensors[f"{m}.{n}"] for n in PARAM_NAMES}) for m in MOMENTS)
-        gaussians = Gaussians(**{name: tensors[name] for name in PARAM_NAMES})
-        return BlockState(gaussians, *moments, growth, BlockState.clocks_of(meta), tensors[WAITS])
+    def unpacked(packed: Packed) -> "BlockState":
+        """The inverse of `packed`; what need not be unpacked is shared."""
+        columns = packed.tensors.items()
+        growth = {k.removeprefix("growth."): v for k, v in columns if k.startswith("growth.")}
+        moments = (packed.gaussians(f"{moment}.") for moment in MOMENTS)
+        clocks, waits = BlockState.clocks_of(packed.meta), packed.tensors[WAITS]
+        return BlockState(packed.gaussians(), *moments, growth, clocks, waits)
 
     @staticmethod
     def clocks_of(meta: dict[str, Any]) -> Clocks:
-        """Those in the JSON of `to_tensors`."""
+        """Those in the JSON of `packed`."""
         return Clocks(**meta["clocks"])
 
 

@@ -1,78 +1,43 @@
 """Blocks that were read or written lately, in RAM."""
 
 from collections import OrderedDict
-from typing import NamedTuple
 
-from torch import Tensor
-
-from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.packed import DRAWN, Packed
 from abcd_ns.engine.store.special_blocks import BlockName
-from abcd_ns.engine.types import Gaussians
-
-
-class AtRest(NamedTuple):
-    """What others draw of a block at rest, or will."""
-
-    gaussians: Gaussians
-    waits: Tensor
-    """Bool [n]: who is not to be seen before the block's next visit."""
-
-    @property
-    def seen(self) -> Gaussians:
-        """Without those that wait."""
-        return self.gaussians[~self.waits] if bool(self.waits.any()) else self.gaussians
-
-    @property
-    def nbytes(self) -> int:
-        return self.gaussians.nbytes + self.waits.nbytes
-
-
-class _Training(NamedTuple):
-    """What only a visit to the block itself needs."""
-
-    exp_avg: Gaussians
-    exp_avg_sq: Gaussians
-    growth: dict[str, Tensor]
-    clocks: Clocks
-
-    @property
-    def nbytes(self) -> int:
-        growth = sum(value.nbytes for value in self.growth.values())
-        return self.exp_avg.nbytes + self.exp_avg_sq.nbytes + growth
 
 
 class BlockMemory:
-    """Blocks by name, under a limit of bytes: least recently used out first, Gaussians last of all."""
+    """Blocks by name, as they are kept, under a limit of bytes: least recently used out first, Gaussians last
+    of all."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.nbytes = 0
-        self._rest: OrderedDict[BlockName, AtRest] = OrderedDict()
-        self._training: OrderedDict[BlockName, _Training] = OrderedDict()
+        self._drawn: OrderedDict[BlockName, Packed] = OrderedDict()
+        self._training: OrderedDict[BlockName, Packed] = OrderedDict()
 
-    def at_rest(self, name: BlockName) -> AtRest | None:
-        """What is drawn of a block, if it is here."""
-        return _used(self._rest, name)
+    def drawn(self, name: BlockName) -> Packed | None:
+        """What others draw of a block at rest, or will, if it is here."""
+        return _used(self._drawn, name)
 
-    def state(self, name: BlockName) -> BlockState | None:
+    def whole(self, name: BlockName) -> Packed | None:
         """A whole block, if all of it is here."""
-        rest, training = _used(self._rest, name), _used(self._training, name)
-        return None if rest is None or training is None else BlockState(rest.gaussians, *training, rest.waits)
+        drawn, training = _used(self._drawn, name), _used(self._training, name)
+        if drawn is None or training is None:
+            return None
+        return Packed({**drawn.tensors, **training.tensors}, drawn.meta)
 
-    def put(self, name: BlockName, block: BlockState | AtRest) -> None:
-        """Keep a block, or its Gaussians alone, in place of what was here of it; `shrink` afterwards."""
+    def put(self, name: BlockName, block: Packed) -> None:
+        """Keep a block, or what others draw of it, in place of what was here of it; `shrink` afterwards."""
         self.forget(name)
-        if isinstance(block, BlockState):
-            training = _Training(block.exp_avg, block.exp_avg_sq, block.growth, block.clocks)
-            self._training[name] = training
-            self.nbytes += training.nbytes
-            block = AtRest(block.gaussians, block.waits)
-        self._rest[name] = block
+        self._drawn[name] = block.part(set(DRAWN))
+        if training := block.tensors.keys() - set(DRAWN):
+            self._training[name] = block.part(training)
         self.nbytes += block.nbytes
 
     def forget(self, name: BlockName) -> None:
         """Let a block go."""
-        for kept in (self._rest, self._training):
+        for kept in (self._drawn, self._training):
             found = kept.pop(name, None)
             self.nbytes -= 0 if found is None else found.nbytes
 
@@ -82,8 +47,8 @@ class BlockMemory:
         Args:
             spare: bytes that are taken otherwise and count against the limit.
         """
-        while self.nbytes + spare > self.limit and (self._training or len(self._rest) > 1):
-            _, gone = (self._training or self._rest).popitem(last=False)
+        while self.nbytes + spare > self.limit and (self._training or len(self._drawn) > 1):
+            _, gone = (self._training or self._drawn).popitem(last=False)
             self.nbytes -= gone.nbytes
 
 

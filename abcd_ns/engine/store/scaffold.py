@@ -58,7 +58,7 @@ def blocks_at_rest(
     if keep is None:
         at_rest = split_by_block(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
-        return {b: at_rest.get(b, nobody).to_tensors() for b in range(tree.num_blocks)}
+        return {b: at_rest.get(b, nobody).packed() for b in range(tree.num_blocks)}
     scaffold, waiting = split_off(gaussians, keep, seed)
-    reserve = BlockState.fresh(waiting).to_tensors()
+    reserve = BlockState.fresh(waiting).packed()
     return {**blocks_at_rest(tree, scaffold), RESERVE: reserve}

@@ -10,16 +10,18 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from abcd_ns.engine.gaussians.block_state import WAITS, BlockState, Clocks
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.packed import DRAWN, WAITS, Packed
+from abcd_ns.engine.gaussians.sh_degrees import count_parameters
 from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.block_memory import AtRest, BlockMemory
+from abcd_ns.engine.store.block_memory import BlockMemory
 from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
 from abcd_ns.engine.store.table import Table
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
-from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from abcd_ns.engine.types import Gaussians
 
 
 @runtime_checkable
@@ -111,7 +113,7 @@ class StoredScene:
         """What is durable; to be read and written by way of the scene alone while there is one."""
         self.ram_bytes = ram_bytes
         self._memory = BlockMemory(ram_bytes)
-        self._unsaved: dict[BlockName, BlockState | Table] = {}
+        self._unsaved: dict[BlockName, Packed | Table] = {}
         self._writer = WriteBehind(store, self._saved)
         self._numbers, self._versions = itertools.count(1), dict[BlockName, int]()
         self._bounds: dict[int, tuple[int, Box | None]] = {}
@@ -143,10 +145,11 @@ class StoredScene:
             StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
                 written by the next `rest` or `flush`.
         """
+        packed = {n: block if isinstance(block, Table) else block.packed() for n, block in blocks.items()}
         with self._writer.lock:
             header = None if tree is self.tree else {**self.store.header, "tree": tree.to_json()}
             self.tree = tree
-            for name, block in blocks.items():
+            for name, block in packed.items():
                 self._memory.forget(name)
                 self._unsaved[name] = block
                 self._versions[name] = next(self._numbers)
@@ -154,7 +157,7 @@ class StoredScene:
                 self._sort(blocks.get(INBOX, self.inbox))
             self._memory.shrink(self.unsaved_bytes)
             self._rested = time.monotonic()
-            self._writer.put(Snapshot(dict(blocks), header, state), within or math.inf)
+            self._writer.put(Snapshot(packed, header, state), within or math.inf)
         if within <= 0 or self.unsaved_bytes > self.ram_bytes:
             self.flush()
         self._writer.check()
@@ -176,7 +179,7 @@ class StoredScene:
             for name, block in snapshot.blocks.items():
                 if self._unsaved.get(name) is block:
                     del self._unsaved[name]
-                    if isinstance(block, BlockState) and name not in (LIVE, INBOX):  # nobody reads them here
+                    if isinstance(block, Packed) and name not in (LIVE, INBOX):  # nobody reads them here
                         self._memory.put(name, block)
             self._memory.shrink(self.unsaved_bytes)
 
@@ -225,12 +228,15 @@ class StoredScene:
     def rows(self, name: BlockName) -> int:
         """Gaussians at rest under a name, the mail of a block left out; nothing is read."""
         block = self._unsaved.get(name)
-        return self.store.counts(name) if block is None else len(block)
+        return self.store.counts(name) if block is None else block.rows
 
     def clocks(self, name: BlockName) -> Clocks:
         """How far a block had come when it was put to rest; nothing is read."""
+        return BlockState.clocks_of(self._meta(name))
+
+    def _meta(self, name: BlockName) -> dict[str, Any]:
         block = self._unsaved.get(name)
-        return BlockState.clocks_of(self.store.meta(name)) if block is None else block.clocks
+        return self.store.meta(name) if block is None else block.meta
 
     def mail(self, block: int) -> BlockState | None:
         """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
@@ -238,12 +244,15 @@ class StoredScene:
 
     def state(self, name: BlockName) -> BlockState:
         """A block, or what is kept under a special name, at rest and whole, without its mail."""
+        return BlockState.unpacked(self._whole(name))
+
+    def _whole(self, name: BlockName) -> Packed:
         with self._writer.lock:
             if name in self._unsaved:
                 return self._unsaved[name]
-            found = self._memory.state(name)
+            found = self._memory.whole(name)
             if found is None:
-                found = BlockState.from_tensors(*self.store.load(name))
+                found = Packed(*self.store.load(name))
                 self._memory.put(name, found)
                 self._memory.shrink(self.unsaved_bytes)
             return found
@@ -257,8 +266,8 @@ class StoredScene:
     def read_ahead(self, block: int) -> None:
         """Have `state` of a block at hand soon; returns at once."""
         with self._writer.lock:
-            if block not in self._unsaved and self._memory.state(block) is None:
-                self._writer.do(partial(self.state, block))
+            if block not in self._unsaved and self._memory.whole(block) is None:
+                self._writer.do(partial(self._whole, block))
 
     def gaussians(self, block: int) -> Gaussians:
         if self._live is not None and self._live[0] is None:
@@ -266,26 +275,33 @@ class StoredScene:
             return everything[self.tree.assign(everything.means) == block]
         if self._live is not None and self._live[0] == block:
             return self._live[1]().detach()
-        return self._with_mail(block, self.stored(block).seen)
+        return self._with_mail(block, self.stored(block, waiting=False))
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
-        return self._with_mail(block, self.stored(block).gaussians)
+        return self._with_mail(block, self.stored(block))
 
     def _with_mail(self, block: int, stored: Gaussians) -> Gaussians:
         mail = self.mail(block)
         return stored if mail is None else Gaussians.cat([stored, mail.gaussians])
 
-    def stored(self, name: BlockName) -> AtRest:
-        """What is drawn of what is at rest under a name, without mail."""
+    def stored(self, name: BlockName, waiting: bool = True) -> Gaussians:
+        """What is at rest under a name, without mail.
+
+        Args:
+            waiting: also who is not to be seen before the block's next visit.
+        """
+        packed = self._drawn(name)
+        gaussians, waits = packed.gaussians(), packed.tensors[WAITS]
+        return gaussians if waiting or not bool(waits.any()) else gaussians[~waits]
+
+    def _drawn(self, name: BlockName) -> Packed:
         with self._writer.lock:
             if name in self._unsaved:
-                return AtRest(self._unsaved[name].gaussians, self._unsaved[name].waits)
-            found = self._memory.at_rest(name)
+                return self._unsaved[name]
+            found = self._memory.drawn(name)
             if found is None:
-                tensors = self.store.load_names(name, [*PARAM_NAMES, WAITS])
-                waits = tensors.pop(WAITS)
-                found = AtRest(Gaussians(**tensors), waits)
+                found = Packed(self.store.load_names(name, DRAWN), self.store.meta(name))
                 self._memory.put(name, found)
                 self._memory.shrink(self.unsaved_bytes)
             return found
@@ -311,6 +327,20 @@ class StoredScene:
         if self._live is not None and self._live[0] == block:
             return len(self._live[1]())
         return self.rows(block) + len(self.mail(block) or ())
+
+    def parameters(self) -> int:
+        """Of how many numbers all Gaussians are, what is live included; harmonics count up to the degree of
+        each."""
+        counted, live = 0, None
+        if self._live is not None:
+            live, alive = self._live
+            counted = count_parameters(alive().features_rest.detach())
+        for block in range(self.tree.num_blocks) if not self.is_live_as_a_whole else ():
+            if block != live:
+                mail = self.mail(block)
+                counted += self._meta(block)["parameters"]
+                counted += 0 if mail is None else count_parameters(mail.gaussians.features_rest)
+        return counted
 
     def bounds(self, block: int) -> Box | None:
         if self._live is not None and self._live[0] in (None, block):

@@ -1,14 +1,12 @@
 """What a run keeps in its store beside blocks: tensors that belong to no Gaussians."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 
-@dataclass(frozen=True)
-class Table:
-    """Tensors by name, on the CPU, which nobody changes any more."""
+class Table(NamedTuple):
+    """Tensors by name, on the CPU, which nobody changes any more; as a store takes them."""
 
     tensors: dict[str, Tensor]
     meta: dict[str, Any]
@@ -18,7 +16,3 @@ class Table:
     def nbytes(self) -> int:
         """Bytes of all tensors."""
         return sum(value.nbytes for value in self.tensors.values())
-
-    def to_tensors(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """As the store takes it."""
-        return self.tensors, self.meta

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.store.table import Table
@@ -31,7 +31,7 @@ from abcd_ns.engine.store.table import Table
 class Snapshot:
     """What a commit brings: everything as it was at one moment between two steps. Nobody changes it."""
 
-    blocks: dict[BlockName, BlockState | Table]
+    blocks: dict[BlockName, Packed | Table]
     """Those that have changed, and tables of the run's."""
     header: dict[str, Any] | None
     """None where it has not changed."""
@@ -139,9 +139,8 @@ class WriteBehind:
                 return job
 
     def _write(self, snapshot: Snapshot) -> None:
-        blocks = {name: state.to_tensors() for name, state in snapshot.blocks.items()}
         try:
-            self._store.commit(blocks, header=snapshot.header, state=snapshot.state)
+            self._store.commit(snapshot.blocks, header=snapshot.header, state=snapshot.state)
         except BaseException as error:  # whatever it is, it is for the thread that trains
             with self.lock:
                 self._waiting = snapshot if self._waiting is None else self._waiting.after(snapshot)

@@ -113,6 +113,7 @@ class VisitTraining:
             self.live.refine(infos, clock, self.steps.contributions() if infos else ())
             if self.live.is_due_to_shed(taken):
                 self.live.shed()
+                self.live.lower_degrees()
                 self.live.hold_back_giants()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
@@ -139,6 +140,7 @@ class VisitTraining:
         if not active.is_whole:
             if not active.sole:
                 self.live.shed()
+                self.live.lower_degrees()
             self.live.count_visit()
         state = self.run.health.end_visit(active, self.live.detached)
         self.steps.end_visit()

@@ -80,6 +80,9 @@ class Run:
     peak_reserved_bytes: int | None = None
     """The most that torch took from the GPU for what it held, likewise; None in results of versions that
     did not ask."""
+    parameters: int | None = None
+    """Of how many numbers the Gaussians are: harmonics count up to the degree that each has. None in results
+    of versions that gave all the same degree, and of `abcd scale`."""
     memory: "Footing | None" = None
     """What `abcd scale` asks beyond."""
 

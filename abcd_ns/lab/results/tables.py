@@ -50,6 +50,7 @@ MEASURES = (
     Measure("SSIM, merged", lambda run: run.ssim_merged, 3),
     Measure("ordering gap (dB)", lambda run: run.ordering_gap_db, 1),
     Measure("Gaussians", lambda run: run.gaussians, 0),
+    Measure("parameters", lambda run: run.parameters, 0),
     Measure("blocks", lambda run: run.blocks, 0),
     Measure("steps", lambda run: run.steps, 0),
     Measure("training (s)", lambda run: run.train_seconds, 1),
@@ -75,11 +76,12 @@ _QUALITY = (
     "SSIM, merged",
     "PSNR, composited (dB)",
     "Gaussians",
+    "parameters",
     "steps",
     "training (s)",
 )
-_MEMORY = ("peak RAM (GiB)", "peak GPU memory (GiB)")
-_OF_OPTIONS = ("PSNR, merged (dB)", "SSIM, merged", "Gaussians", "steps", "training (s)")
+_MEMORY = ("peak RAM (GiB)", "peak GPU memory (GiB)", "blocks on disk (MiB)")
+_OF_OPTIONS = ("PSNR, merged (dB)", "SSIM, merged", "Gaussians", "parameters", "steps", "training (s)")
 COLUMNS: dict[str, tuple[str, tuple[Measure, ...]]] = {
     "study of blocks": ("blocks", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
     "study of gaussians": ("Gaussians by", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),

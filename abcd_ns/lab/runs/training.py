@@ -138,3 +138,10 @@ class Training:
     def gaussians(self) -> int:
         """In the whole scene."""
         return self.pipeline.model.num_points if self.coordinator is None else self.coordinator.count()
+
+    @property
+    def parameters(self) -> int:
+        """Of how many numbers those are."""
+        if self.coordinator is not None:
+            return self.coordinator.scene.parameters()
+        return sum(values.numel() for values in self.pipeline.model.gauss_params.values())

@@ -117,6 +117,7 @@ def _record(
         ordering_gap_db=gap,
         ordering_gap_note=note,
         gaussians=training.gaussians,
+        parameters=training.parameters,
         **memory,
         store_bytes=disk_bytes(folder / "abcd" / STORE),
         layer_seconds=training.layer_seconds,

@@ -122,12 +122,12 @@ def make_store(land: Land, whole: bool, folder: Path) -> ParameterStore:
         tree = build_kd(torch.zeros(0, 3), 1)
         store = ParameterStore.create(folder, {"tree": tree.to_json()})
         everything = Gaussians.cat([land.make_tile(tile) for tile in range(land.tiles)])
-        store.commit({0: BlockState.fresh(everything).to_tensors()})
+        store.commit({0: BlockState.fresh(everything).packed()})
         return store
     tree = land.tree()
     store = ParameterStore.create(folder, {"tree": tree.to_json()})
     for block, tile in enumerate(land.tile_of(tree)):
-        store.commit({block: BlockState.fresh(land.make_tile(tile)).to_tensors()})
+        store.commit({block: BlockState.fresh(land.make_tile(tile)).packed()})
         print(f"tile {block + 1}/{land.tiles}", flush=True)
     return store
 

@@ -23,6 +23,7 @@ from abcd_ns.cli.report.plan import make_plan, push_apart
 from abcd_ns.cli.report.run_folder import open_run
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.cli.report.svg import DARK
+from abcd_ns.engine.gaussians.sh_degrees import count_parameters
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
@@ -243,12 +244,19 @@ def test_an_unknown_method_is_told_without_defaults():
     assert training_command(settings) == "ns-train my-own --data made-up"
 
 
-def test_blocks_say_what_their_gaussians_fill_and_how_many_were_shed(tmp_path):
+def test_blocks_say_what_their_gaussians_are_and_fill_and_how_many_were_shed(tmp_path):
     state = RunState(health={0: BlockHealth(visits=1, shed=1234), 1: BlockHealth()}, views={0: 4})
-    run = dataclasses.replace(made_up_run(tmp_path), state=state, filled={0: 12.34})
-    cells = Page(render_page(run, None, None, [])).texts["td"][: 3 * 10]
-    first, second, third = (cells[row + 1 : row + 3] for row in range(0, 30, 10))
-    assert (first, second, third) == (["12.3 px", "1,234"], ["-", "0"], ["-", "-"])
+    known = {"filled": {0: 12.34}, "parameters": {0: 5678, 1: 9}}
+    run = dataclasses.replace(made_up_run(tmp_path), state=state, **known)
+    page = Page(render_page(run, None, None, []))
+    cells = page.texts["td"][: 3 * 11]
+    first, second, third = (cells[row + 1 : row + 4] for row in range(0, 33, 11))
+    assert (first, second) == (["5,678", "12.3 px", "1,234"], ["9", "-", "0"])
+    assert third == ["-", "-", "-"]
+    each = 5687 / len(run.checkpoint.means)
+    assert any(
+        fact.value == "5,687" and f"{each:.1f} a Gaussian" in fact.more for fact in headline(run, None)
+    )
 
 
 def test_what_gaussians_fill_is_the_weight_that_was_added_up_over_the_views(tmp_path):
@@ -266,7 +274,9 @@ def test_what_gaussians_fill_is_the_weight_that_was_added_up_over_the_views(tmp_
     write_log(folder / "abcd" / LOG_FILE, log_lines())
     with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
         store.commit(rest, state=RunState(views={0: 4, 1: 4}).to_json())
-    assert open_run(folder).filled == {0: 6.0}
+    found = open_run(folder)
+    assert found.filled == {0: 6.0}
+    assert sum(found.parameters.values()) == count_parameters(scene.features_rest)
 
 
 def test_states_of_blocks_say_why_one_was_not_trained(tmp_path):

@@ -24,7 +24,7 @@ def some_state(count: int, seed: int = 0) -> BlockState:
 
 
 def assert_same(a: BlockState, b: BlockState) -> None:
-    ours, theirs = a.to_tensors(), b.to_tensors()
+    ours, theirs = a.packed(), b.packed()
     assert ours[0].keys() == theirs[0].keys()
     assert ours[1] == theirs[1]
     for name, value in ours[0].items():
@@ -51,7 +51,7 @@ def take_steps(params, optimizers, count: int) -> None:
 @pytest.mark.parametrize("count", [0, 1, 9])
 def test_tensors_and_back(count):
     state = some_state(count)
-    assert_same(BlockState.from_tensors(*state.to_tensors()), state)
+    assert_same(BlockState.unpacked(state.packed()), state)
 
 
 def test_rows_that_part_and_join_again_lose_nothing():

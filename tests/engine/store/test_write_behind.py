@@ -9,6 +9,7 @@ import torch
 
 from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.packed import DRAWN
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore, StoreError, parameter_store
 from abcd_ns.engine.store.block_memory import BlockMemory
@@ -64,7 +65,7 @@ def on_disk(scene: StoredScene) -> dict:
 
 
 def equal(a: BlockState, b: BlockState) -> bool:
-    (first, meta), (second, other) = a.to_tensors(), b.to_tensors()
+    (first, meta), (second, other) = a.packed(), b.packed()
     return meta == other and all(torch.equal(value, second[name]) for name, value in first.items())
 
 
@@ -101,7 +102,7 @@ def test_one_snapshot_is_written_and_one_waits_however_many_come(scene):
 
 def test_what_waits_never_takes_more_ram_than_there_is(scene):
     disk = Disk(scene.store)
-    scene.ram_bytes = scene.state(0).nbytes
+    scene.ram_bytes = scene.state(0).packed().nbytes
     scene.rest(scene.tree, {0: scene.state(0)}, {"step": 1}, within=PATIENCE)
     assert disk.commits == []
     disk.free.clear()
@@ -191,18 +192,20 @@ def test_a_fork_waits_for_the_write_and_the_child_can_read(scene):
 
 
 def test_what_only_its_own_visit_needs_goes_first(scene):
-    states = [scene.state(number) for number in range(3)]
-    rests = [scene.stored(number) for number in range(4)]
+    states = [scene.state(number).packed() for number in range(4)]
+    rests = [state.part(set(DRAWN)) for state in states]
     memory = BlockMemory(3 * rests[0].nbytes)
-    for number, state in enumerate(states):
-        memory.put(number, state)
+    for number in range(3):
+        memory.put(number, states[number])
         memory.shrink()
-    assert [memory.state(number) for number in range(3)] == [None] * 3
-    assert all(memory.at_rest(number).gaussians is state.gaussians for number, state in enumerate(states))
-    memory.at_rest(0)
+    assert [memory.whole(number) for number in range(3)] == [None] * 3
+    assert all(
+        memory.drawn(number).tensors["means"] is states[number].tensors["means"] for number in range(3)
+    )
+    memory.drawn(0)
     memory.put(3, rests[3])
     memory.shrink()
-    assert [memory.at_rest(number) is None for number in range(4)] == [False, True, False, False]
+    assert [memory.drawn(number) is None for number in range(4)] == [False, True, False, False]
     assert memory.nbytes == sum(rests[number].nbytes for number in (0, 2, 3))
 
 

@@ -75,7 +75,7 @@ def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(
     assert sum(event.count for event in told) == 12
     assert sum(record.gradients for record in coordinator.state.health.values()) == 12
     for block in range(blocks):
-        tensors, _ = coordinator.scene.state(block).to_tensors()
+        tensors, _ = coordinator.scene.state(block).packed()
         assert all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values())
 
 

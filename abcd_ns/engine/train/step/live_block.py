@@ -10,6 +10,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.control import DensityClock, Infos, added
+from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.memory import check_room
@@ -25,6 +26,8 @@ class LiveBlock:
         self._run = run
         self.growth: dict[str, Tensor] = {}
         self.clocks = Clocks()
+        self._held: tuple[Tensor, Tensor] | None = None
+        run.optimizers["features_rest"].register_step_pre_hook(self._hold_degrees)
 
     def __len__(self) -> int:
         return len(self._run.params["means"])
@@ -48,9 +51,14 @@ class LiveBlock:
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
         if active.done == 0 and not active.is_whole:
             self.hold_back_giants()
+        if active.done == 0 and not (active.saved or active.is_whole or active.sole):
+            self.lower_degrees()
 
     def detached(self) -> BlockState:
         """The live block, on the CPU; it stays live."""
+        if GONE in self.growth:  # what was mended may have them again
+            rest = self._run.params["features_rest"]
+            rest.data.masked_fill_(are_gone(self.growth[GONE], rest), 0.0)
         return detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
 
     def count_step(self, views: int, taken: int) -> None:
@@ -86,11 +94,32 @@ class LiveBlock:
 
     def shed(self) -> None:
         """Take out Gaussians that fill too little of the block's views; tells how many."""
-        run, active, before = self._run, self._run.active, len(self)
-        views = run.state.views.get(active.geometry.block, len(active.geometry.views))
-        options = {"views": views, "progress": run.share_of_blocks}
+        run, before = self._run, len(self)
+        options = {"views": self._views, "progress": run.share_of_blocks}
         self.growth = run.density.shed(run.params, run.optimizers, self.growth, **options)
         run.health.count_shed(before - len(self))
+
+    def lower_degrees(self) -> None:
+        """Let spherical harmonics go that change too little in the block's views, once it is time."""
+        run, seen = self._run, self._run.active.geometry.views
+        if run.density.weighs and run.share_of_blocks >= START:
+            views, trained = [run.views[view] for view in seen], self._views
+            self.growth = lower(run.params, run.optimizers, self.growth, views, trained)
+
+    def _hold_degrees(self, *_: object) -> None:
+        """Before the optimizer steps: harmonics that are gone get no gradient."""
+        gone, rest = self.growth.get(GONE), self._run.params["features_rest"]
+        if gone is None or rest.grad is None:
+            return
+        if self._held is None or self._held[0] is not gone:
+            self._held = gone, are_gone(gone, rest)
+        rest.grad.masked_fill_(self._held[1], 0.0)
+
+    @property
+    def _views(self) -> int:
+        """That the block is trained on."""
+        run, active = self._run, self._run.active
+        return run.state.views.get(active.geometry.block, len(active.geometry.views))
 
     def is_due_to_shed(self, taken: int) -> bool:
         """Whether the one block of the scene has been drawn often enough since it last shed.
@@ -109,8 +138,7 @@ class LiveBlock:
             batch: views in each step.
             room: Gaussians that may be added.
         """
-        run, active = self._run, self._run.active
-        views = run.state.views.get(active.geometry.block, len(active.geometry.views))
+        run, active, views = self._run, self._run.active, self._views
         blocks = run.scene.tree.num_blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
         if blocks > 1:

@@ -66,7 +66,7 @@ def poison(optimizers: Optimizers, params: dict) -> None:
 def stored_soundly(trained: Trained) -> bool:
     """Whether all that the store holds, moments and statistics included, are numbers."""
     scene = trained.coordinator.scene
-    loaded = [scene.state(block).to_tensors()[0] for block in range(scene.tree.num_blocks)]
+    loaded = [scene.state(block).packed()[0] for block in range(scene.tree.num_blocks)]
     return all(bool(torch.isfinite(value).all()) for tensors in loaded for value in tensors.values())
 
 

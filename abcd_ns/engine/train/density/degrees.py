@@ -1,0 +1,153 @@
+"""Degrees: a Gaussian has no more spherical harmonics than show in its views.
+
+45 of its 59 numbers say how its colour changes with the direction that it is seen from. Cameras see it from
+few directions, often from a narrow cone of them, in which fewer harmonics tell nearly as much. What their
+lack changes in the pictures is the Gaussian's weight, known from shedding, times the mean square, over its
+views, by which its colour changes once the lower harmonics are fitted to the higher ones. Of all degrees that
+one is taken for which this and the price of the numbers are least together; those above do not come back.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.block_state import MOMENTS
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.gaussians.sh_degrees import up_to_degree
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows
+from abcd_ns.engine.train.density.shedding import WEIGHED
+from abcd_ns.engine.types import Gaussians, View
+
+GONE = "gone"
+"""Among a block's statistics: by how many degrees a Gaussian's harmonics end below the highest."""
+START = 0.5
+"""Share of the run, its warm-up left out, from which on degrees go: they have been trained by then."""
+NUMBER_PRICE = 1e-3
+"""What a coefficient, of one channel, must change in the pictures: pixels times a colour's square, 0..1."""
+MOST_VIEWS = 64
+"""As many of a block's views tell from where a Gaussian is seen."""
+RIDGE = 1e-3 / (4 * torch.pi)
+"""Added to the fit: a share of the mean square of a harmonic, so that what no view tells stays as it is."""
+REACH = 3.0
+"""Standard deviations up to which a Gaussian shows, about."""
+AT_ONCE = 1 << 22
+"""Numbers of a tensor, about, where Gaussians are fitted part by part."""
+
+
+class Lowered(NamedTuple):
+    """What Gaussians become."""
+
+    features_dc: Float[Tensor, "n 3"]
+    features_rest: Float[Tensor, "n k 3"]
+    gone: Float[Tensor, "n"]
+    """Degrees that are gone, those before included."""
+
+
+def are_gone(gone: Float[Tensor, "n"], features_rest: Float[Tensor, "n k 3"]) -> Bool[Tensor, "n k 1"]:
+    """Which coefficients are."""
+    coefficients = features_rest.shape[1]
+    return ~up_to_degree(_highest(coefficients) - gone, coefficients)[..., None]
+
+
+@torch.no_grad()
+def lower(
+    params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], seen: int
+) -> dict[str, Tensor]:
+    """Let harmonics of the live block go that do not pay, with their moments; see `lowered`.
+
+    Returns:
+        The block's statistics from now on.
+    """
+    if any(name not in growth for name in WEIGHED):
+        return growth
+    dc, rest = params["features_dc"], params["features_rest"]
+    found = lowered(live_gaussians(params).detach(), growth, views, seen)
+    dc.copy_(found.features_dc)
+    rest.copy_(found.features_rest)
+    adam, gone = optimizers["features_rest"].state.get(rest, {}), are_gone(found.gone, rest)
+    for moment in MOMENTS:
+        if moment in adam:
+            adam[moment].masked_fill_(gone, 0.0)
+    return {**growth, GONE: found.gone}
+
+
+def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View], seen: int) -> Lowered:
+    """Gaussians with the degrees that pay. Nobody is judged before as many drawings as there are views.
+
+    Args:
+        growth: with WEIGHED.
+        views: that see the block.
+        seen: how many of them it is trained on.
+    """
+    weight, looks = (growth[name] for name in WEIGHED)
+    weight = torch.where(looks >= seen, weight * seen / looks.clamp_min(1.0), torch.nan)
+    gone = growth.get(GONE, torch.zeros_like(weight))
+    chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
+    coefficients = gaussians.features_rest.shape[1] + 1
+    step = max(AT_ONCE // (coefficients * max(len(chosen), coefficients)), 1)
+    parts = [slice(start, start + step) for start in range(0, max(len(gaussians), 1), step)]
+    found = [_lowered(gaussians[rows], weight[rows], gone[rows], chosen) for rows in parts]
+    return Lowered(*(torch.cat(values) for values in zip(*found, strict=True)))
+
+
+def _lowered(
+    gaussians: Gaussians, weight: Float[Tensor, "n"], gone: Float[Tensor, "n"], views: Sequence[View]
+) -> Lowered:
+    """As `lowered`, at once.
+
+    Args:
+        weight: pixels in all views; NaN for who is not judged, which no comparison finds to be less.
+    """
+    values = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
+    highest = _highest(gaussians.features_rest.shape[1])
+    gram = _gram(gaussians, views, values.shape[1])
+    before, least = highest - gone, torch.full_like(weight, torch.inf)
+    best, degree = values, before
+    for candidate in range(highest + 1):
+        kept = (candidate + 1) ** 2
+        fitted = _fitted(gram, values, kept)
+        change = fitted - values
+        square = (change * (gram @ change)).sum(dim=(1, 2)) / 3
+        cost = weight * square.clamp_min(0.0) + NUMBER_PRICE * 3 * (kept - 1)
+        pays = (cost < least) & (candidate <= before)
+        best = torch.where(pays[:, None, None], fitted, best)
+        degree, least = torch.where(pays, candidate, degree), torch.where(pays, cost, least)
+    return Lowered(best[:, 0], best[:, 1:], highest - degree)
+
+
+def _fitted(gram: Float[Tensor, "n b b"], values: Float[Tensor, "n b 3"], kept: int) -> Tensor:
+    """The first `kept` coefficients such that they look like all of them, and zeros: [n, b, 3]."""
+    ridge = RIDGE * torch.eye(kept, dtype=gram.dtype, device=gram.device)
+    # Unchecked: what is no number is mended when the visit ends, and pays nothing until then.
+    low, _ = torch.linalg.cholesky_ex(gram[:, :kept, :kept] + ridge)
+    more = torch.cholesky_solve(gram[:, :kept, kept:] @ values[:, kept:], low)
+    return torch.cat((values[:, :kept] + more, torch.zeros_like(values[:, kept:])), dim=1)
+
+
+def _gram(gaussians: Gaussians, views: Sequence[View], bases: int) -> Float[Tensor, "n b b"]:
+    """Mean products of the harmonics in the directions of views. Each counts as it shows a Gaussian: by the
+    square of its size there, and not at all where it is beside the picture. NaN where none shows it."""
+    means, reach = gaussians.means, REACH * gaussians.scales.amax(dim=1).exp()
+    rows, shows = [], []
+    for view in views:
+        view = view.to(means)
+        inside = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        depth = inside[:, 2].clamp_min(view.near)
+        per_unit = view.K[0, 0] / depth
+        pixel, beyond = (inside @ view.K.T)[:, :2] / depth[:, None], (reach * per_unit)[:, None]
+        within = (pixel > -beyond) & (pixel < pixel.new_tensor([view.width, view.height]) + beyond)
+        seen = within.all(dim=1) & (inside[:, 2] > view.near)
+        away = torch.nn.functional.normalize(means - view.center, dim=1)
+        harmonics = sh_basis_rows(*away.unbind(dim=1))[: bases - 1]
+        rows.append(torch.stack((torch.full_like(depth, SH_C0), *harmonics), dim=1))
+        shows.append(torch.where(seen, per_unit.square(), 0.0))
+    basis, counts = torch.stack(rows, dim=1), torch.stack(shows, dim=1)
+    counts = counts / counts.sum(dim=1, keepdim=True)
+    return (basis * counts[..., None]).mT @ basis
+
+
+def _highest(coefficients: int) -> int:
+    return round((coefficients + 1) ** 0.5) - 1

@@ -1,0 +1,190 @@
+"""Harmonics that change less in a Gaussian's views than they cost go, and stay away."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from abcd_ns.engine.gaussians.sh_degrees import count_parameters, degrees_in_use
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows
+from abcd_ns.engine.train.density import degrees
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.density.degrees import GONE, lowered
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import Gaussians, View
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, price=1e-9)
+"""Nothing grows, and nobody is shed that fills anything."""
+COEFFICIENTS = (1, 4, 9, 16)
+
+
+def weighed(count: int, weight: float = 30.0, looks: float = 12.0) -> dict[str, torch.Tensor]:
+    return {"weight": torch.full((count,), weight), "looks": torch.full((count,), looks)}
+
+
+def look(mean: torch.Tensor, size: float, view: View) -> tuple[np.ndarray, float]:
+    """The harmonics in the direction of one Gaussian, and what the view counts for."""
+    x, y, z = (view.viewmat[:3, :3] @ mean + view.viewmat[:3, 3]).tolist()
+    away = (mean - view.center) / (mean - view.center).norm()
+    basis = np.array([SH_C0, *(float(row) for row in sh_basis_rows(*away))])
+    u, v = (float(view.K[i, i]) * p / z + float(view.K[i, 2]) for i, p in ((0, x), (1, y)))
+    over = degrees.REACH * size * float(view.K[0, 0]) / z
+    seen = z > view.near and -over < u < view.width + over and -over < v < view.height + over
+    return basis, float(view.K[0, 0] / z) ** 2 if seen else 0.0
+
+
+def slow(gaussians: Gaussians, row: int, views: list[View], weight: float, price: float):
+    """(degree, coefficients [16, 3]) of one Gaussian, by least squares over a list of views."""
+    mean, size = gaussians.means[row].double(), float(gaussians.scales[row].max().exp())
+    looks = [look(mean, size, view.to(torch.float64)) for view in views]
+    total = sum(count for _, count in looks)
+    A = np.array([math.sqrt(count / total) * basis for basis, count in looks])
+    c = torch.cat((gaussians.features_dc[row][None], gaussians.features_rest[row])).double().numpy()
+    found = []
+    for degree, kept in enumerate(COEFFICIENTS):
+        still = math.sqrt(degrees.RIDGE) * np.eye(kept)
+        system, target = np.vstack((A[:, :kept], still)), np.vstack((A @ c, still @ c[:kept]))
+        fitted = np.zeros_like(c)
+        fitted[:kept] = np.linalg.lstsq(system, target, rcond=None)[0]
+        square = ((A @ (fitted - c)) ** 2).sum() / 3
+        found.append((weight * square + price * 3 * (kept - 1), degree, fitted))
+    return min(found, key=lambda each: each[0])[1:]
+
+
+@pytest.mark.parametrize("price", [1e-5, 3e-3, 3e-2])
+def test_every_gaussian_gets_what_a_list_of_views_says(price, monkeypatch):
+    monkeypatch.setattr(degrees, "NUMBER_PRICE", price)
+    monkeypatch.setattr(degrees, "AT_ONCE", 3 * 16 * 16)  # several parts
+    gaussians, views = random_gaussians(20, seed=3, sh_degree=3), ring_of_views(12)
+    found = lowered(gaussians, weighed(20), views, 12)
+    for row in range(20):
+        degree, expected = slow(gaussians, row, views, 30.0, price)
+        assert int(found.gone[row]) == 3 - degree
+        values = torch.cat((found.features_dc[row][None], found.features_rest[row])).double().numpy()
+        np.testing.assert_allclose(values, expected, atol=1e-3)
+
+
+def test_the_dearer_a_number_the_fewer_there_are(monkeypatch):
+    gaussians, views, before = random_gaussians(50, sh_degree=3), ring_of_views(12), math.inf
+    counts = []
+    for price in (0.0, 1e-3, 1e-2, 1e-1, 10.0):
+        monkeypatch.setattr(degrees, "NUMBER_PRICE", price)
+        found = lowered(gaussians, weighed(50), views, 12)
+        counts.append(count_parameters(found.features_rest))
+        assert counts[-1] <= before
+        before = counts[-1]
+        assert torch.equal(degrees_in_use([found.features_rest]), (3 - found.gone).to(torch.uint8))
+    assert counts[0] == 50 * 59
+    assert counts[-1] == 50 * 14
+
+
+def test_seen_from_one_place_a_colour_is_all_that_there_is():
+    """And it is the colour that was seen there."""
+    (view, *_), gaussians = ring_of_views(4), random_gaussians(30, sh_degree=3)
+    found = lowered(gaussians, weighed(30, looks=1.0), [view], 1)
+    away = torch.nn.functional.normalize(gaussians.means - view.center, dim=1)
+    bases = torch.stack(sh_basis_rows(*away.unbind(1)), dim=1)
+    inside = gaussians.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    pixel = (inside @ view.K.T)[:, :2] / inside[:, 2:]
+    seen = ((pixel >= 0) & (pixel < torch.tensor([view.width, view.height]))).all(dim=1)
+    assert int(seen.sum()) > 10
+    before = SH_C0 * gaussians.features_dc + (bases[..., None] * gaussians.features_rest).sum(1)
+    assert bool((found.gone[seen] == 3).all())
+    torch.testing.assert_close(SH_C0 * found.features_dc[seen], before[seen], atol=5e-3, rtol=0)
+
+
+def test_nobody_is_judged_who_was_not_looked_at_in_every_view():
+    gaussians, growth = random_gaussians(10, sh_degree=2), weighed(10)
+    growth["looks"][4:] = 11.0
+    growth["weight"][:] = 1e-9
+    found = lowered(gaussians, growth, ring_of_views(12), 12)
+    assert found.gone.tolist() == [2.0] * 4 + [0.0] * 6
+    assert torch.equal(found.features_rest[4:], gaussians.features_rest[4:])
+    assert torch.equal(found.features_dc[4:], gaussians.features_dc[4:])
+
+
+def test_what_is_gone_does_not_come_back_by_being_looked_at_again():
+    gaussians, views = random_gaussians(30, sh_degree=3), ring_of_views(12)
+    growth = {**weighed(30, weight=1e6), GONE: torch.arange(30.0) % 4}
+    found = lowered(gaussians, growth, views, 12)
+    assert bool((found.gone >= growth[GONE]).all())
+
+
+def test_numbers_that_are_none_are_left_to_who_mends_them():
+    gaussians = random_gaussians(4, sh_degree=3)
+    gaussians.means[1] = math.nan
+    gaussians.features_rest[2, 5] = math.inf
+    found = lowered(gaussians, weighed(4, weight=1e-9), ring_of_views(12), 12)
+    assert found.gone.tolist() == [3.0, 0.0, 0.0, 3.0]
+    assert torch.equal(found.features_rest[1], gaussians.features_rest[1])
+
+
+def test_a_scene_without_harmonics_has_none_to_lose():
+    gaussians = random_gaussians(5, sh_degree=0)
+    found = lowered(gaussians, weighed(5), ring_of_views(12), 12)
+    assert torch.equal(found.features_dc, gaussians.features_dc)
+    assert found.gone.tolist() == [0.0] * 5
+    assert len(lowered(gaussians[:0], weighed(0), ring_of_views(12), 12).gone) == 0
+
+
+def half_matt(seed: int = 7) -> Gaussians:
+    """Every other one looks alike from everywhere."""
+    truth = random_gaussians(120, seed=seed, size=0.12, sh_degree=2)
+    rest = 3.0 * truth.features_rest
+    rest[::2] = 0.0
+    return replace(truth, features_rest=rest)
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_degrees_go_in_the_later_half_and_stay_away(tmp_path, blocks):
+    views = ring_of_views(6)
+    truth = half_matt()
+    start = replace(truth, features_rest=truth.features_rest + 0.01)
+    options = {"blocks": blocks, "steps": 120, "density": STILL, "batch": 1}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    photos, whole, gone = Photos(truth, views), 120 * (11 + 27), []
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        if coordinator.run.share_of_blocks < degrees.START:
+            assert coordinator.scene.parameters() == whole
+        elif coordinator.state.active is not None and GONE in coordinator.visit.live.growth:
+            live, adam = coordinator.params["features_rest"], coordinator.optimizers["features_rest"]
+            kept = 2 - coordinator.visit.live.growth[GONE]
+            moments = adam.state[live]
+            for value in (live, moments["exp_avg"], moments["exp_avg_sq"]):
+                assert bool((degrees_in_use([value.detach()]) <= kept).all())
+            gone.append(float(kept.mean()))
+    assert len(gone) > 10
+    assert coordinator.scene.parameters() == count_parameters(whole_scene(coordinator).features_rest)
+    assert 120 * 14 < coordinator.scene.parameters() < 0.95 * whole
+    left = degrees_in_use([whole_scene(coordinator).features_rest])
+    assert float(left[1::2].float().mean()) > float(left[::2].float().mean()) + 0.5 or blocks > 1
+
+
+def test_where_nothing_is_weighed_every_degree_stays(tmp_path, views, photos):
+    options = {"blocks": 2, "steps": 60, "density": replace(STILL, price=0.0)}
+    coordinator = make_coordinator(tmp_path, random_gaussians(40, sh_degree=2), views, **options)
+    train(coordinator, photos)
+    assert coordinator.scene.parameters() == 40 * 38
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_a_run_that_was_interrupted_keeps_its_degrees(tmp_path, blocks):
+    views = ring_of_views(6)
+    truth = half_matt()
+    start, photos = replace(truth, features_rest=truth.features_rest + 0.01), Photos(truth, views)
+    options = {"blocks": blocks, "steps": 100, "density": STILL, "batch": 1}
+    through = make_coordinator(tmp_path / "a", start, views, **options)
+    train(through, photos)
+    first = make_coordinator(tmp_path / "b", start, views, **options)
+    while first.progress < 0.8:
+        train_step(first, photos)
+    first.save()
+    first.close()
+    again = make_coordinator(tmp_path / "b", start, views, resume=True, **options)
+    train(again, photos)
+    for name, value in whole_scene(through).items():
+        assert torch.equal(value, getattr(whole_scene(again), name)), name
