@@ -65,7 +65,7 @@ class Row:
 def run(args: Args, at_once: int, seed: int) -> Row:
     """Train and look at held-out views."""
     torch.set_num_threads(1)
-    pipeline.dispatcher_for = lambda local, config, _: Dispatcher(
+    pipeline.dispatcher_for = lambda local, config, *_: Dispatcher(
         local, InProcessWorkers(make_worker(config, setup_of(local, 1, False), 0), at_once), lag=at_once
     )
     row, out = Row(at_once, seed), 0
@@ -82,7 +82,7 @@ def run(args: Args, at_once: int, seed: int) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         one = workers.Args(args.data, args.downscale, blocks=args.blocks, steps=args.steps, seed=seed)
         config = workers.config_of(one, 2, Path(folder))  # any number but 1 asks for a dispatcher
-        config.pipeline.training.processes, config.machine.device_type = 1, "cpu"
+        config.machine.device_type = "cpu"
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         coordinator = trainer.pipeline.coordinator

@@ -86,7 +86,7 @@ def run(args: Args, data: Path, arm: str, seed: int) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         one = workers.Args(data, args.downscale, blocks=args.blocks, steps=args.steps, seed=seed)
         config = workers.config_of(one, 0, Path(folder))
-        config.pipeline.training.processes, config.machine.device_type = 1, "cpu"
+        config.machine.device_type = "cpu"
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.train()

@@ -1,8 +1,11 @@
 """What passes between the one who lends blocks and those who train them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
 
 from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
@@ -67,6 +70,28 @@ class VisitOutcome:
     layer_seconds: float
     seconds: float
     """That the visit took."""
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """An outcome on its way between processes: its tensors as arrays, which pickle hands over as they are."""
+
+    outcome: VisitOutcome
+    """Without its Gaussians."""
+    arrays: dict[str, np.ndarray]
+    meta: dict[str, Any]
+
+    @staticmethod
+    def of(outcome: VisitOutcome) -> "Parcel":
+        """Pack it; no memory is copied."""
+        tensors, meta = outcome.state.to_tensors()
+        arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+        return Parcel(replace(outcome, state=outcome.state.nobody), arrays, meta)
+
+    def opened(self) -> VisitOutcome:
+        """What was packed, in memory of its own: that of the parcel is for passing on."""
+        tensors = {name: torch.tensor(array) for name, array in self.arrays.items()}
+        return replace(self.outcome, state=BlockState.from_tensors(tensors, self.meta))
 
 
 @dataclass(frozen=True)

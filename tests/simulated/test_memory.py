@@ -28,7 +28,7 @@ def run_on(folder, *, gaussians: int, width: int, size: float = 0.02, **options)
     views = ring_of_views(4, width=width, height=width)
     photos = Photos(random_gaussians(30, seed=7, size=0.12), views)
     start = random_gaussians(gaussians, seed=1, size=size, sh_degree=3)
-    coordinator = on_device(folder, start, views, steps=40, processes=1, **options)
+    coordinator = on_device(folder, start, views, steps=40, **options)
     train(coordinator, photos, steps=2)
     return coordinator, photos
 
