@@ -60,7 +60,7 @@ class Row:
 
 def run(args: Args, at_once: int, seed: int) -> Row:
     """Train and look at held-out views."""
-    pipeline.dispatcher_for = lambda local, config, _: Dispatcher(
+    pipeline.dispatcher_for = lambda local, config, *_: Dispatcher(
         local, InProcessWorkers(make_worker(config, setup_of(local, 1, False), 0), at_once), lag=at_once
     )
     row, out = Row(at_once, seed), 0

@@ -98,7 +98,7 @@ def trainer_alone(data: Path, **options: Any) -> Iterator[Trainer]:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         config = config_of(data, Path(folder), **options)
-        config.pipeline.training.processes, config.machine.device_type = 1, "cpu"
+        config.machine.device_type = "cpu"
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         yield trainer

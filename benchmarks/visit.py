@@ -3,8 +3,7 @@
     python -m benchmarks.visit --data DIR --downscale 4
 
 The runs follow each other, by the engine alone. Stages are summed over the second half of each run and
-divided by the views that were drawn to train in it, helpers' views included; where the training process
-waits for its helpers, that is part of the loss and of backward. On a CUDA device each stage ends when the
+divided by the views that were drawn to train in it. On a CUDA device each stage ends when the
 device has done its work, which makes steps slower than they are: their sum is no training time.
 """
 
@@ -72,8 +71,6 @@ class Args:
     """Of the run with several."""
     seconds: float = 30.0
     """Of each run; the first half is not measured."""
-    processes: int = 0
-    """That share a step of a block; 0 as many as torch has threads."""
     seed: int = 0
     """Of the runs."""
 
@@ -142,7 +139,6 @@ def begin(
     folder: Path,
     *,
     seed: int,
-    processes: int,
     steps: int | None = None,
     seconds: float | None = None,
     rasterizer: Rasterizer | None = None,
@@ -155,7 +151,7 @@ def begin(
     keep = None if blocks == 1 else len(capture.gaussians) // blocks
     store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=seed))
     density = for_blocks(DensityConfig(), blocks)
-    config = TrainingConfig(seed=seed, processes=processes, antialiased=antialiased, density=density)
+    config = TrainingConfig(seed=seed, antialiased=antialiased, density=density)
     run = TrainingRun(
         config,
         Budget(steps=steps, seconds=seconds),
@@ -165,7 +161,7 @@ def begin(
         *nothing_live(3, device),
         device=device,
     )
-    return Coordinator(run, target=lambda sample: (_shown(sample, capture.photo), None))
+    return Coordinator(run)
 
 
 def run(
@@ -180,8 +176,7 @@ def run(
     Args:
         afterwards: given the coordinator when the clock has stopped.
     """
-    options = {"seconds": args.seconds, "seed": args.seed, "processes": args.processes}
-    coordinator = begin(capture, blocks, folder, **options)
+    coordinator = begin(capture, blocks, folder, seconds=args.seconds, seed=args.seed)
     scene = coordinator.scene
     clock, layers = StageClock(), 0.0
 

@@ -77,7 +77,6 @@ def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], 
     config = TrainingConfig(
         recipe=Recipe(sh_ramp=0.0, visit_steps=args.steps),
         warmup=0.0,
-        processes=1,
         visit_views=args.views,
         commit_seconds=0.0 if args.commits else 1e9,
         density=DensityConfig(strategy="off"),

@@ -97,7 +97,7 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
     """Train and look at held-out views."""
     rasterizer, counts = TorchRasterizer(window_side=side), Counts()
     with tempfile.TemporaryDirectory() as folder:
-        options = {"steps": args.steps, "seed": seed, "processes": 1, "rasterizer": rasterizer}
+        options = {"steps": args.steps, "seed": seed, "rasterizer": rasterizer}
         coordinator = begin(capture, args.blocks, Path(folder), **options)
         train(coordinator, capture, rasterizer, counts)
         gaussians, tree = whole(coordinator), coordinator.scene.tree

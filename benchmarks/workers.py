@@ -15,6 +15,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -23,8 +24,10 @@ import torch
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.lease import Lease
+from abcd_ns.cluster.lease import Lease, Report, Workers
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded, WorkerLost, WorkersSeen
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio.run import STATE
 from benchmarks.runs import apart, config_of, print_machine, write_runs
@@ -39,7 +42,7 @@ class Args:
     """As of ns-train."""
     downscale: int = 4
     workers: tuple[int, ...] = (1, 2)
-    """Numbers of workers to try; 0 is no worker, but processes that share the views of a step."""
+    """Numbers of workers to try; 1 trains in one process, by one thread."""
     blocks: int = 8
     seconds: float | None = None
     steps: int | None = None
@@ -84,7 +87,7 @@ class Row:
     waited: float = 0.0
     """Share of the driver's time in which it waited for workers."""
     lent: int = 0
-    """Bytes that were put into Ray's store."""
+    """Bytes of blocks that were shared."""
     psnr: float = 0.0
     digest: str = ""
     """Of all that the run has left in its store, but for times."""
@@ -149,7 +152,6 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     options = {name: getattr(args, name) for name in ("downscale", "blocks", "seed", "steps", "seconds")}
     config = config_of(args.data, out, workers=max(workers, 1), **options)
     if workers == 1:
-        config.pipeline.training.processes = 1
         torch.set_num_threads(1)
     else:
         torch.set_num_threads(os.cpu_count() or 1)
@@ -157,7 +159,7 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     trainer.setup()
     row, coordinator = Row(workers), trainer.pipeline.coordinator
     coordinator.announce.subscribe(Watch(row, coordinator, kills, args.seed))
-    waiting = _count_waiting(row) if workers > 1 else [0.0]
+    waiting = _count_waiting(row, coordinator.workers) if workers > 1 else [0.0]
     began = time.perf_counter()
     trainer.train()
     ended = time.perf_counter()
@@ -170,24 +172,22 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     return row
 
 
-def _count_waiting(row: Row) -> list[float]:
-    """From now on count what the driver waits, seconds, and the bytes that it puts into the store."""
-    from abcd_ns.cluster.ray_workers import RayWorkers, Shared  # by now Ray's environment is set
+def _count_waiting(row: Row, workers: Workers) -> list[float]:
+    """From now on count what the driver waits, seconds, and the bytes that it shares."""
+    waiting, wait, share = [0.0], workers.wait, workers.share
 
-    waiting, wait, of = [0.0], RayWorkers.wait, Shared.of
-
-    def timed(self: RayWorkers, seconds: float):
+    def timed(seconds: float) -> list[Report]:
         began = time.perf_counter()
         try:
-            return wait(self, seconds)
+            return wait(seconds)
         finally:
             waiting[0] += (time.perf_counter() - began) * bool(row.began)
 
-    def counted(value) -> object:
+    def counted(value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         row.lent += value.nbytes
-        return of(value)
+        return share(value)
 
-    RayWorkers.wait, Shared.of = timed, staticmethod(counted)
+    workers.wait, workers.share = timed, counted
     return waiting
 
 

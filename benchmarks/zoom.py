@@ -57,7 +57,7 @@ def run(captures: dict[int, Capture], antialiased: bool, seed: int, args: Args) 
     """Train on one size, score all."""
     capture, rasterizer = captures[args.downscale], TorchRasterizer()
     with tempfile.TemporaryDirectory() as folder:
-        options = {"steps": args.steps, "seed": seed, "processes": 1, "antialiased": antialiased}
+        options = {"steps": args.steps, "seed": seed, "antialiased": antialiased}
         coordinator = begin(capture, args.blocks, Path(folder), rasterizer=rasterizer, **options)
         while not coordinator.finished:
             train_step(coordinator, capture.photo)

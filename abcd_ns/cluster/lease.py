@@ -1,13 +1,16 @@
 """What passes between the one who lends blocks and those who train them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from abcd_ns.engine.events import WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.lent_scene import Outlines
 from abcd_ns.engine.train.health_record import BlockHealth
@@ -70,6 +73,28 @@ class VisitOutcome:
     layer_seconds: float
     seconds: float
     """That the visit took."""
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """An outcome on its way between processes: its tensors as arrays, which pickle hands over as they are."""
+
+    outcome: VisitOutcome
+    """Without its Gaussians."""
+    arrays: dict[str, np.ndarray]
+    meta: dict[str, Any]
+
+    @staticmethod
+    def of(outcome: VisitOutcome) -> "Parcel":
+        """Pack it; no memory is copied."""
+        tensors, meta = outcome.state.packed()
+        arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+        return Parcel(replace(outcome, state=outcome.state.nobody), arrays, meta)
+
+    def opened(self) -> VisitOutcome:
+        """What was packed, in memory of its own: that of the parcel is for passing on."""
+        tensors = {name: torch.tensor(array) for name, array in self.arrays.items()}
+        return replace(self.outcome, state=BlockState.unpacked(Packed(tensors, self.meta)))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import ray
@@ -26,9 +26,9 @@ from abcd_ns.cluster.lease import (
     Finished,
     Lease,
     Lost,
+    Parcel,
     Report,
     StepsSeen,
-    VisitOutcome,
     VisitTask,
     WorkersError,
 )
@@ -89,15 +89,10 @@ class Actor:
         self._worker = make()
         return os.getpid()
 
-    def visit(
-        self, task: VisitTask, state: Shared, drawn: dict[int, Shared]
-    ) -> tuple[VisitOutcome, Any, Any]:
-        """Train a block; gives what became of it, its Gaussians apart."""
+    def visit(self, task: VisitTask, state: Shared, drawn: dict[int, Shared]) -> Parcel:
+        """Train a block; gives what became of it."""
         self._done, self._psnrs = 0, []
-        outcome = self._worker.visit(task, state(), drawn, self._hear)
-        tensors, meta = outcome.state.packed()
-        arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-        return replace(outcome, state=outcome.state.nobody), arrays, meta
+        return Parcel.of(self._worker.visit(task, state(), drawn, self._hear))
 
     def _hear(self, step: StepTaken) -> None:
         self._done = step.visit_step
@@ -261,11 +256,7 @@ class RayWorkers:
             return []
         lease, member.lease = member.lease, None
         member.visits += 1
-        outcome, arrays, meta = answer
-        tensors = {
-            name: torch.tensor(array) for name, array in arrays.items()
-        }  # Ray's memory is for passing on
-        return [Finished(lease.number, replace(outcome, state=BlockState.unpacked(Packed(tensors, meta))))]
+        return [Finished(lease.number, answer.opened())]
 
     def _replace(self, member: Member, why: str) -> list[Report]:
         """Start another in place of one that is gone."""

@@ -22,8 +22,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.train.step.batch import Batch, Sample
-from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.train.step.batch import Batch, Sample, Target
 from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians, View
 

@@ -17,8 +17,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from abcd_ns.data.dataset import AbcdDataset
-from abcd_ns.engine.train.step.batch import Sample
-from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
@@ -155,7 +154,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return self._pixels("photo", row, self.train_dataset.photos.image, crop).float() / 255
 
     def target(self, sample: Sample) -> Target:
-        """What a sample is trained on where no model is asked: helpers and workers have none."""
+        """What a sample is trained on where no model is asked: workers have none."""
         photo, mask = self.shown(sample)
         if photo.shape[-1] == 4:  # as splatfacto's model composites
             photo = photo[..., 3:] * photo[..., :3] + (1 - photo[..., 3:]) * sample.background

@@ -106,7 +106,8 @@ def check_options(config: TrainerConfig) -> None:
     if config.is_viewer_legacy_enabled():
         raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
     pipeline.training.check()
-    check_workers(pipeline.workers, pipeline.cluster, pipeline.blocks, pipeline.training.recipe)
+    workers = (pipeline.workers, pipeline.cluster, pipeline.blocks, pipeline.training.recipe)
+    check_workers(*workers, on_gpu=config.machine.device_type == "cuda")
     refuse_changed(config, UNUSED, "")
     refuse_changed(pipeline.datamanager, UNUSED_OF_DATA, "pipeline.datamanager.")
     for name, group in config.optimizers.items():

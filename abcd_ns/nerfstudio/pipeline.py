@@ -44,7 +44,7 @@ from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import MadeFor, RunRequest, new_store, take_over
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import training_views, views_of
-from abcd_ns.nerfstudio.workers import BLOCKS_EACH, dispatcher_for
+from abcd_ns.nerfstudio.workers import BLOCKS_EACH, dispatcher_for, number_of_workers
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from abcd_ns.viewer import guard
@@ -81,9 +81,10 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     ram_budget_gb: float = 0.0
     """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it.
     0 takes 8, or 40% of the machine's memory where that is less."""
-    workers: int = 1
-    """Blocks that are trained at once, each by a process of its own: on a GPU each, or on cores of the CPU.
-    Needs Ray: pip install 'abcd-ns[cluster]'."""
+    workers: int = 0
+    """Blocks that are trained at once, each by a process of its own: on a core each, or on a GPU each, which
+    needs Ray (pip install 'abcd-ns[cluster]'). 0 takes all cores where there is no GPU, as far as there are
+    two blocks for each, and else one."""
     cluster: str | None = None
     """Address (host:port) of the head of a Ray cluster that is to have the workers, instead of this machine;
     --data and --output-dir must be paths that all its machines see."""
@@ -193,13 +194,13 @@ class AbcdPipeline(VanillaPipeline):
     def _begin(self, asked: RunRequest, optimizers: dict[str, Any]) -> Trainer:
         config, views = self.config, self._views()
         # Where there are workers, one of them shares this device, and photos are theirs.
-        keeps_photos = not self._on_cpu and not self._lends
+        keeps_photos = not self._on_cpu and self.config.workers <= 1 and self.config.cluster is None
         self.datamanager.device_photo_bytes = int(PHOTO_SHARE * self._budget) if keeps_photos else 0
         self.model.draws_with().warm_up()
         store, resumed = self._open_store(asked, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
         limits = replace(config.training.limits, **self._fitted(store, resumed))
-        training = replace(config.training, limits=limits, processes=self._processes())
+        training = replace(config.training, limits=limits)
         if resumed:
             state = RunState.from_json(store.state)
             cut_at_rest(scene, state, training.limits.block_limit, training.limits.sole_limit)
@@ -226,14 +227,14 @@ class AbcdPipeline(VanillaPipeline):
             return independent_trainer(run)
         source = LayerSource(run, self._room_for_layers())
         coordinator = Coordinator(run, source=source, target=self.datamanager.target)
-        if self._lends and run.scene.tree.num_blocks > 1:
-            return dispatcher_for(coordinator, asked.config, self._budget)
+        blocks = run.scene.tree.num_blocks
+        # Where RAM is short, one process: each reads blocks for itself.
+        wanted = self.config.workers or int(self.config.ram_budget_gb > 0)
+        workers = number_of_workers(wanted, blocks, run.config, self.device)
+        if blocks > 1 and (workers > 1 or self.config.cluster is not None):
+            target = self.datamanager.target
+            return dispatcher_for(coordinator, asked.config, workers, self._budget, target)
         return coordinator
-
-    @property
-    def _lends(self) -> bool:
-        """Whether workers are to train the blocks."""
-        return self.config.workers > 1 or self.config.cluster is not None
 
     @property
     def _on_cpu(self) -> bool:
@@ -249,11 +250,6 @@ class AbcdPipeline(VanillaPipeline):
         if self._on_cpu:
             return LayerRoom(self._ram.layers)
         return LayerRoom(int(LAYER_SHARE * self._budget), self._ram.layers)
-
-    def _processes(self) -> int:
-        """As asked for; where RAM is short, one, since each reads blocks for itself."""
-        asked = self.config.training.processes
-        return asked or int(self.config.ram_budget_gb > 0)
 
     def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
         """The limits that were fitted to the device: as the run began, unless it goes on with a budget of

@@ -1,7 +1,7 @@
 """Workers of a run: what each reads when it starts, and who lends them blocks."""
 
 import copy
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -10,31 +10,35 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.cluster.connect import check_installed, connect
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.lease import WorkersError
+from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
+from abcd_ns.cluster.lease import Workers, WorkersError
 from abcd_ns.cluster.visit_worker import AdamOptions, RunSetup, VisitWorker
 from abcd_ns.engine.render import make_rasterizer
+from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.memory import PHOTO_SHARE
 from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.errors import UserError
 
 BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one that rests."""
 
 
-def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe) -> None:
+def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe, *, on_gpu: bool) -> None:
     """Look at what is asked for, before anything is written.
 
     Raises:
         UserError: workers are of no use, or cannot be had.
     """
-    if workers < 1:
-        raise UserError(f"--pipeline.workers must be 1 or more, not {workers}.")
-    if workers == 1 and cluster is None:
+    if workers < 0:
+        raise UserError(f"--pipeline.workers must be 0 or more, not {workers}.")
+    if workers <= 1 and cluster is None:
         return
-    check_installed()
-    if recipe.exact or recipe.overlap > 0:
+    if cluster is not None or on_gpu:
+        check_installed()
+    if not _works_at_once(recipe):
         raise UserError(
             "This method trains in one process; leave out --pipeline.workers and --pipeline.cluster."
         )
@@ -45,18 +49,47 @@ def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe
         )
 
 
-def dispatcher_for(local: Coordinator, config: TrainerConfig, budget: int) -> Dispatcher:
-    """Lends the blocks of a run to workers that are started for it.
+def _works_at_once(recipe: Recipe) -> bool:
+    return not recipe.exact and recipe.overlap == 0
+
+
+def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device: torch.device | str) -> int:
+    """`AbcdPipelineConfig.workers`, its 0 resolved.
 
     Args:
+        blocks: of the scene.
+    """
+    if asked:
+        return asked
+    # Workers learn nothing of light and poses: two of them may show one photo.
+    learns = training.light != "none" or training.poses != "off"
+    if learns or not _works_at_once(training.recipe) or not can_fork(torch.device(device)):
+        return 1
+    return max(min(torch.get_num_threads(), blocks // BLOCKS_EACH), 1)
+
+
+def dispatcher_for(
+    local: Coordinator, config: TrainerConfig, count: int, budget: int, target: Callable[[Sample], Target]
+) -> Dispatcher:
+    """Lends the blocks of a run to workers: on the cores of this machine by forking, else by Ray.
+
+    Args:
+        count: of them.
         budget: bytes of each worker's device that training may take.
+        target: gives what a sample is trained on.
 
     Raises:
         WorkersError: they cannot be had.
     """
-    pipeline, count = config.pipeline, config.pipeline.workers
-    on_gpu = config.machine.device_type == "cuda"
+    on_gpu, run = config.machine.device_type == "cuda", local.run
     setup = setup_of(local, count, on_gpu)
+    if config.pipeline.cluster is None and can_fork(run.device):
+        return Dispatcher(local, ForkedWorkers(count, VisitWorker(setup, run.rasterizer, target, run.device)))
+    return Dispatcher(local, _ray_workers(setup, config, count, budget))
+
+
+def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int) -> Workers:
+    pipeline, on_gpu = config.pipeline, config.machine.device_type == "cuda"
     config = copy.deepcopy(config)
     config.pipeline.datamanager.photo_cache_gb = pipeline.datamanager.photo_cache_gb / count
     threads = max(torch.get_num_threads() // count, 1)
@@ -75,14 +108,14 @@ def dispatcher_for(local: Coordinator, config: TrainerConfig, budget: int) -> Di
     CONSOLE.print(f"{count} workers are starting.", highlight=False)
     while not on_gpu and workers.idle < count:  # the warm-up, too, wants the cores that they start on
         workers.wait(1.0)
-    return Dispatcher(local, workers)
+    return workers
 
 
 def setup_of(local: Coordinator, count: int, on_gpu: bool) -> RunSetup:
     """What each of `count` workers needs to know of a run."""
     run, room = local.run, local.source.room
     return RunSetup(
-        replace(run.config, processes=1),
+        run.config,
         run.budget,
         list(run.views.values()),
         {name: AdamOptions.of(optimizer) for name, optimizer in run.optimizers.items()},

@@ -297,7 +297,6 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
         scaffold=40,
         warmup=0.3,
         poses="SO3xR3",
-        processes=1,
         target=lambda sample: (photos(sample.view.index, sample.crop), None),
     )
     given = {index: view.viewmat for index, view in run.views.items()}

@@ -170,25 +170,6 @@ def test_a_run_is_saved_and_gone_on_with(tmp_path, start, views, photos, stop):
     assert third.state.step == 11
 
 
-def test_a_run_that_was_shared_by_a_crew_is_gone_on_with(tmp_path, start, views, photos):
-    """Where there are no helpers' processes: their shares are drawn in turn, on the device."""
-    options = {"steps": 6, "density": GROWING, "blocks": 2, "processes": 2}
-
-    def target(sample):
-        return photos(sample.view.index, sample.crop).to(sample.background.device), None
-
-    first = make_coordinator(tmp_path, start, views, target=target, **options)
-    train(first, photos, steps=1)
-    assert first.state.active.crew == 2
-    first.save()
-    first.visit.steps.crew.dismiss()
-    first.scene.store.close()
-    second = on_device(tmp_path, start, views, resume=True, target=target, **options)
-    train(second, photos, steps=2)
-    assert second.state.step == 3
-    assert_on_device(second)
-
-
 @pytest.mark.parametrize("density", [GROWING, MCMC], ids=["default", "mcmc"])
 def test_blocks_are_trained_jointly(tmp_path, start, views, photos, density):
     coordinator = on_device(tmp_path, start, views, blocks=3, steps=4, density=density, kind=ExactTrainer)

@@ -29,7 +29,7 @@ def run_on(folder, *, gaussians: int, width: int, size: float = 0.02, primitive:
     photos = Photos(random_gaussians(30, seed=7, size=0.12), views)
     start = random_gaussians(gaussians, seed=1, size=size, sh_degree=3)
     draws = GsplatRasterizer(primitive)
-    options = {"steps": 40, "processes": 1, "primitive": primitive, **options}
+    options = {"steps": 40, "primitive": primitive, **options}
     coordinator = make_coordinator(folder, start, views, device=DEVICE, rasterizer=draws, **options)
     train(coordinator, photos, steps=2)
     return coordinator, photos

@@ -33,9 +33,6 @@ class TrainingConfig:
     batch: int = 0
     """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and 4 elsewhere: with
     small blocks a step's overhead would outweigh its work. The warm-up draws 2 at most."""
-    processes: int = 0
-    """Processes that share the views of a step where there is no GPU; 0 takes as many as torch has threads,
-    `batch` at most. Rounding depends on it."""
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""

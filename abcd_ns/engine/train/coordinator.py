@@ -21,10 +21,9 @@ from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample
+from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, Target
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
-from abcd_ns.engine.train.step.workers.share import Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
 
@@ -35,7 +34,7 @@ class Coordinator(Trainer):
     Args:
         visits: decides which; None for ABCD's own.
         source: gives visits their layers; None for the run's scene, and little room.
-        target: gives what a sample is trained on, so that helpers can share a step; None for one process.
+        target: gives what a sample is trained on; needed where poses are refined.
         live: the block in training; None for one that nobody else looks after.
     """
 
@@ -49,7 +48,7 @@ class Coordinator(Trainer):
     ) -> None:
         super().__init__(run)
         self.visits, self.source = visits or Planner(run), source or LayerSource(run)
-        self.visit = VisitTraining(run, self.visits, self.source, target, live)
+        self.visit = VisitTraining(run, self.visits, self.source, live)
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
@@ -71,7 +70,6 @@ class Coordinator(Trainer):
         # Before a step, not after one: a run that stops between two goes on to the same round.
         if self.poses is not None and self.poses.is_due:
             self.poses.take()
-            self.visit.follow_poses()
         if self.state.active is None:
             self.begin_visit()
         return self.visit.next_batch()
@@ -86,7 +84,7 @@ class Coordinator(Trainer):
         pictures: Sequence[Float[Tensor, "_h _w 3"]],
         photos: Sequence[Float[Tensor, "_h _w 3"]],
     ) -> Float[Tensor, ""]:
-        """The loss of a step, helpers' part included, over what says something about the block."""
+        """The loss of a step, over what says something about the block."""
         return self.visit.loss(batch, pictures, photos)
 
     def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
@@ -96,7 +94,7 @@ class Coordinator(Trainer):
             psnrs: of each picture, dB; listeners are told their mean.
         """
         if self.poses is not None:
-            self.poses.count(len(rendered.pictures) * self.run.active.crew)
+            self.poses.count(len(rendered.pictures))
         self.visit.after_step(rendered, psnrs)
         if self.visit.is_over:
             self.end_visit()
@@ -147,7 +145,7 @@ class Coordinator(Trainer):
 
     @property
     def layer_bytes(self) -> int:
-        """Bytes that the layers of the visit that is under way take; helpers' are not among them."""
+        """Bytes that the layers of the visit that is under way take."""
         layers = self.visit.steps.layers
         return layers.nbytes if layers else 0
 

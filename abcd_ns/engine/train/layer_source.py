@@ -60,7 +60,7 @@ class LayerSource:
         )
         layers = VisitLayers(
             painter,
-            LayerStore(run.device, self.room.device // active.crew, self.room.ram // active.crew),
+            LayerStore(run.device, self.room.device, self.room.ram),
             active.geometry,
             run.scene.gaussians_at_rest(active.geometry.block),
             views_in_use,

@@ -48,8 +48,6 @@ class ActiveVisit:
     """Indices of the views in use, of those that see the block."""
     looked_at: tuple[int, ...] = ()
     """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
-    crew: int = 1
-    """Members that share the views of each step, see `crew`."""
     done: int = 0
     saved: bool = False
     """Whether the live block was put to rest in the middle of the visit, see special_blocks.LIVE."""

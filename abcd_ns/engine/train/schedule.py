@@ -138,25 +138,10 @@ def visit_views(views: tuple[int, ...], count: int, visits: int, seed: int) -> t
     return tuple(dict.fromkeys(cycles[offset : offset + count]))
 
 
-def size_of_crew(processes: int, batch: int, views: int) -> int:
-    """How many of the wanted processes can have the same number of a step's views each, and views of their
-    own."""
-    return max(n for n in range(1, batch + 1) if n == 1 or (n <= min(processes, views) and batch % n == 0))
-
-
-def views_of_member(views: tuple[int, ...], member: int, crew: int) -> tuple[int, ...]:
-    """Which of a visit's views one member of a crew draws; the first (0) has the last of all."""
-    return tuple(view for k, view in enumerate(reversed(views)) if k % crew == member)[::-1]
-
-
-def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int, member: int = 0) -> tuple[int, ...]:
-    """The view of each step of a visit: shuffled passes over all views; use differs by at most one.
-
-    Args:
-        member: of the crew, whose views these are.
-    """
+def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tuple[int, ...]:
+    """The view of each step of a visit: shuffled passes over all views; use differs by at most one."""
     shuffled: list[int] = []
-    rng = random.Random(f"views {seed} {visit}" + (f" {member}" if member else ""))
+    rng = random.Random(f"views {seed} {visit}")
     while len(shuffled) < steps:
         one_pass = list(views)
         rng.shuffle(one_pass)

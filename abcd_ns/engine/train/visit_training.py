@@ -1,6 +1,6 @@
 """The training of one visit's block, from its first step to its last: by whoever has the block."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from jaxtyping import Float
 from torch import Tensor
@@ -14,10 +14,9 @@ from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.schedule import exponential_decay
-from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample
+from abcd_ns.engine.train.step.batch import Batch, Rendered
 from abcd_ns.engine.train.step.drawing import StepDrawing
 from abcd_ns.engine.train.step.live_block import LiveBlock
-from abcd_ns.engine.train.step.workers.share import Target
 
 
 class VisitTraining:
@@ -26,7 +25,6 @@ class VisitTraining:
     Args:
         visits: on what terms the block is trained.
         source: gives visits their layers.
-        target: gives what a sample is trained on, so that helpers can share a step; None for one process.
         live: the block in training; None for one that nobody else looks after.
     """
 
@@ -35,11 +33,10 @@ class VisitTraining:
         run: TrainingRun,
         visits: Visits,
         source: LayerSource,
-        target: Callable[[Sample], Target] | None = None,
         live: LiveBlock | None = None,
     ) -> None:
         self.run, self._visits = run, visits
-        self.steps = StepDrawing(run, source, target)
+        self.steps = StepDrawing(run, source)
         self.live = live or LiveBlock(run)
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
 
@@ -50,7 +47,6 @@ class VisitTraining:
 
     def begin(self, active: ActiveVisit) -> None:
         """Begin a visit, which from now on is the run's active one."""
-        active.crew = self.steps.size_of_crew(active)
         self.attach(active)
 
     def attach(self, active: ActiveVisit) -> None:
@@ -76,11 +72,6 @@ class VisitTraining:
         self._pace.set(self.batch, self.live.clocks.adam_views, decay, run.health.damping)
         return self.steps.next_batch()
 
-    def follow_poses(self) -> None:
-        """Views have moved: helpers, who saw them where they were, are gathered anew."""
-        if self.run.state.active is not None:
-            self.steps.gather_anew()
-
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
         return self.steps.render(batch)
@@ -91,7 +82,7 @@ class VisitTraining:
         pictures: Sequence[Float[Tensor, "_h _w 3"]],
         photos: Sequence[Float[Tensor, "_h _w 3"]],
     ) -> Float[Tensor, ""]:
-        """The loss of a step, helpers' part included, over what says something about the block."""
+        """The loss of a step, over what says something about the block."""
         return self.steps.loss(batch, *self._visits.compared(batch, pictures, photos))
 
     def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
@@ -101,7 +92,7 @@ class VisitTraining:
             psnrs: of each picture, dB; listeners are told their mean.
         """
         run, active = self.run, self.run.active
-        taken = len(rendered.pictures) * active.crew
+        taken = len(rendered.pictures)
         self._adapt_light(rendered)
         run.state.step += 1
         active.done += 1
@@ -110,7 +101,7 @@ class VisitTraining:
         if not active.is_whole:
             infos = rendered.infos if sound else ()
             clock = self.live.density_clock(taken, self.batch, self._visits.room())
-            self.live.refine(infos, clock, self.steps.contributions() if infos else ())
+            self.live.refine(infos, clock)
             if self.live.is_due_to_shed(taken):
                 self.live.shed()
                 self.live.lower_degrees()
@@ -121,10 +112,9 @@ class VisitTraining:
         run = self.run
         if run.light is None:
             return
-        helped = [gradient for part in self.steps.contributions() for gradient in part.lights]
         damping = exponential_decay(run.progress, 1.0, LAST)
         share = 1.0 if run.active.is_alone else AMONG_OTHERS
-        run.light.step([*gradients_of(rendered.lights), *helped], share * damping)
+        run.light.step(gradients_of(rendered.lights), share * damping)
 
     @property
     def is_over(self) -> bool:
@@ -135,7 +125,7 @@ class VisitTraining:
         return active.done >= active.steps or out_of_time or is_warm or self.live.has_outgrown
 
     def finish(self) -> BlockState:
-        """What the visit has made of its block, on the CPU; helpers and layers go."""
+        """What the visit has made of its block, on the CPU; its layers go."""
         active = self.run.active
         if not active.is_whole:
             if not active.sole:

@@ -30,8 +30,7 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step, views_per_warm_up_step
-from abcd_ns.engine.train.step.batch import Sample
-from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring

@@ -9,7 +9,6 @@ from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.capture import bilateral_grid
 from abcd_ns.engine.train.capture.light import Light, Use, gradients_of, lit
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.step.workers.helper_process import can_fork
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import PARAM_NAMES, Crop
 from abcd_ns.errors import UserError
@@ -251,34 +250,6 @@ def test_a_run_that_stops_goes_on_with_its_transforms_and_moments(make, drifting
     assert not torch.equal(transforms(whole.run.light), transforms(stopped.run.light))
     for name in PARAM_NAMES:
         assert torch.equal(getattr(whole_scene(went_on), name), getattr(whole_scene(whole), name)), name
-
-
-@pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
-@pytest.mark.parametrize("kind", ["affine", "bilateral"])
-def test_helpers_see_the_transforms_of_each_step_and_send_back_gradients(make, drifting, kind):
-    """The same, whether a helper lives or the training process draws its share."""
-    found = []
-    for name in ("helped", "stood in"):
-        options = {"blocks": 2, "steps": 20, "processes": 2, "light": kind}
-        made = make(name, target=lambda s: (drifting(s.view.index, s.crop), None), **options)
-        made.next_batch()
-        if name == "stood in":
-            made.visit.steps.crew.dismiss()
-        assert bool(made.visit.steps.crew.pids) == (name == "helped")
-        for _ in range(6):
-            batch = made.next_batch()
-            rendered = made.render(batch)
-            made.loss(
-                batch, rendered.pictures, [drifting(s.view.index, s.crop) for s in batch.samples]
-            ).backward()
-            own = {use.view for use in rendered.lights}
-            helped = {view for part in made.visit.steps.contributions() for view, _ in part.lights}
-            made.after_step(rendered)
-            assert helped - own
-        found.append(transforms(made.run.light))
-        made.visit.steps.end_visit()
-    assert torch.equal(*found)
-    assert float((found[0] - IDENTITY[kind]).abs().max()) > 1e-3
 
 
 def test_joint_training_over_blocks_refuses_it():

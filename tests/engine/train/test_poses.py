@@ -59,7 +59,7 @@ def make(tmp_path, photos, monkeypatch):
 
     def made(name: str = "run", views=None, **options):
         (tmp_path / name).mkdir(exist_ok=True)
-        options = {"density": STILL, "poses": "SO3xR3", "background": "black", "processes": 1, **options}
+        options = {"density": STILL, "poses": "SO3xR3", "background": "black", **options}
         views = shaken(RING) if views is None else views
         return make_coordinator(tmp_path / name, TRUTH, views, target=target, **options)
 

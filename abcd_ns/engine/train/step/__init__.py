@@ -1,1 +1,1 @@
-"""One step: what it draws, alone or with helpers, and the live block that it changes."""
+"""One step: what it draws, and the live block that it changes."""

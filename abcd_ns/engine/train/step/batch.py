@@ -21,6 +21,8 @@ from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop, View
 
+Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
+"""What a sample's picture should be, 0..1, and where that counts: [h, w, 1], None for everywhere."""
 BACKGROUNDS = 1024
 """Steps whose backgrounds are copied to a device together."""
 

@@ -1,7 +1,6 @@
 """The block that is being trained: its way in and out of the optimizers, its growth, and its clocks."""
 
 import random
-from collections.abc import Sequence
 from dataclasses import replace
 
 from torch import Tensor
@@ -9,14 +8,13 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
-from abcd_ns.engine.train.density.control import DensityClock, Infos, added
+from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.step.workers.share import Contribution
 
 
 class LiveBlock:
@@ -75,16 +73,13 @@ class LiveBlock:
         """A visit has ended."""
         self.clocks = replace(self.clocks, visits=self.clocks.visits + 1)
 
-    def refine(self, infos: Infos, clock: DensityClock, contributions: Sequence[Contribution] = ()) -> None:
+    def refine(self, infos: Infos, clock: DensityClock) -> None:
         """Grow and prune, where it is time for that.
 
         Args:
             infos: of the step's drawings; none where its gradients were no numbers.
-            contributions: what helpers have counted.
         """
         run = self._run
-        for contribution in contributions:
-            self.growth = added(self.growth, contribution.counts)
         self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock)
         if run.density.resets(clock):
             self.clocks = replace(self.clocks, resets=clock.steps // run.config.density.reset_every)

@@ -11,8 +11,7 @@ from abcd_ns.engine.layers.whole_pictures import WholePicture, WholePictures
 from abcd_ns.engine.train.capture.light import lit
 from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.step.batch import Sample
-from abcd_ns.engine.train.step.workers.share import Target
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.types import View
 
 FIRST = 16.0

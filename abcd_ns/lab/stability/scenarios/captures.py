@@ -146,7 +146,7 @@ def compensated(lab: Lab, stage: Stage) -> Finding:
 def refined(lab: Lab, stage: Stage, noisy: Stage) -> Finding:
     """What noisy poses cost, and how much of it refining them regains."""
     said, numbers, passed = {}, {}, True
-    training = {"poses": "SO3xR3", "processes": 1, "kind": partial(Coordinator, target=noisy.target)}
+    training = {"poses": "SO3xR3", "kind": partial(Coordinator, target=noisy.target)}
     for blocks, drawn in POSED.items():
         usual = {"blocks": blocks, "budget": lab.views_drawn(drawn)}
         clean = lab.compared(stage, "abcd", **usual)

@@ -1,0 +1,227 @@
+"""Workers on the cores of this machine: for each visit a process is forked, which trains it and ends.
+
+Forking hands over everything: options, photos, kernels, and every block as it is at that moment. That works
+where no GPU is in use and no thread pool has to be carried over, so a worker computes in a single thread. A
+step of a small block is some hundred short operations, which a second thread hardly makes faster.
+"""
+
+import ctypes
+import math
+import os
+import signal
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection, wait
+from typing import Any, NoReturn
+
+import torch
+
+from abcd_ns.cluster.lease import Finished, Lease, Lost, Parcel, Report, StepsSeen, WorkersError
+from abcd_ns.cluster.visit_worker import VisitWorker
+from abcd_ns.engine.events import StepTaken, WorkerSeen
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.errors import UserError, is_out_of_memory
+
+SILENCE = 600.0
+"""Seconds without a word after which a worker counts as lost: drawing a visit's layers may take minutes."""
+TELL_EVERY = 0.5
+"""Seconds between two words of a worker's progress."""
+PR_SET_PDEATHSIG = 1
+"""Of Linux' prctl: a signal for this process when its parent ends, however that ends."""
+
+
+def can_fork(device: torch.device) -> bool:
+    """Whether this machine and this process are made for it: on Linux, without a GPU."""
+    return sys.platform == "linux" and device.type == "cpu" and not torch.cuda.is_available()
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A worker's last words."""
+
+    why: str
+    is_loss: bool
+    """Whether another may do better: it had no memory."""
+
+    @staticmethod
+    def of(error: Exception) -> "Failed":
+        """What the user can mend as it is; of all else, one line of the traceback's end."""
+        if isinstance(error, UserError):
+            return Failed(str(error), False)
+        if is_out_of_memory(error):
+            return Failed("out of memory", True)
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{os.path.basename(place.filename)}:{place.lineno}, in {place.name}"
+        what = traceback.format_exception_only(error)[-1].splitlines()[0]
+        return Failed(
+            f"A process that trains a block failed: {what} ({where}). What visits have finished is safe; "
+            "--pipeline.workers 1 trains in one process.",
+            False,
+        )
+
+
+@dataclass
+class Member:
+    """A place for a visit; its process, while there is one."""
+
+    number: int
+    lease: Lease | None = None
+    pid: int = 0
+    pipe: Connection | None = None
+    heard: float = 0.0
+    """When it last said something, or was started; of `time.monotonic`, as the other moments."""
+    done: int = 0
+    visits: int = 0
+    deaths: int = 0
+    free_since: float = 0.0
+    waited: float = 0.0
+
+
+class ForkedWorkers:
+    """So many processes at most at a time.
+
+    Args:
+        worker: trains a visit, in a process of its own.
+    """
+
+    def __init__(self, count: int, worker: VisitWorker) -> None:
+        self._worker, self._owner, self._began = worker, os.getpid(), time.monotonic()
+        self._members = [Member(number, free_since=self._began) for number in range(count)]
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._members)
+
+    @property
+    def idle(self) -> int:
+        """How many could take a visit now."""
+        return sum(member.lease is None for member in self._members)
+
+    @property
+    def pids(self) -> list[int]:
+        """Of those that are at work."""
+        return [member.pid for member in self._members if member.lease is not None]
+
+    def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
+        """The value itself: a fork has it, too, and what is at rest never changes."""
+        return lambda: value
+
+    def submit(self, lease: Lease) -> None:
+        """Fork a process for a visit."""
+        idle = (member for member in self._members if member.lease is None)
+        member = min(idle, key=lambda member: member.free_since)
+        now = time.monotonic()
+        member.waited += now - member.free_since
+        member.lease, member.heard, member.done = lease, now, 0
+        member.pipe, theirs = Pipe()
+        member.pid = os.fork()
+        if member.pid == 0:
+            member.pipe.close()
+            _live(theirs, lambda tell: self._worker.visit(lease.task, lease.state(), lease.drawn, tell))
+        theirs.close()
+
+    def wait(self, seconds: float) -> list[Report]:
+        """What has happened; waits for something so long at most.
+
+        Raises:
+            WorkersError: a visit failed, as it would in any process.
+        """
+        busy = {member.pipe: member for member in self._members if member.lease is not None}
+        reports = [report for pipe in wait(list(busy), seconds) for report in self._hear(busy[pipe])]
+        for member in self._members:
+            if member.lease is not None and time.monotonic() - member.heard > SILENCE:
+                reports.append(self._lose(member, f"silent for {SILENCE:.0f} s"))
+        return reports
+
+    def seen(self) -> Sequence[WorkerSeen]:
+        """What each is doing."""
+        return [self._seen(member) for member in self._members]
+
+    def close(self) -> None:
+        """End them."""
+        for member in self._members:
+            if member.lease is not None:
+                self._end(member)
+
+    def _hear(self, member: Member) -> list[Report]:
+        member.heard = time.monotonic()
+        try:
+            said = member.pipe.recv()
+        except (OSError, EOFError):
+            return [self._lose(member, "it was killed")]
+        match said:
+            case (int(done), float(psnr)):
+                member.done = done
+                return [StepsSeen(member.lease.number, done, psnr)]
+            case Parcel():
+                member.visits += 1
+                return [Finished(self._end(member).number, said.opened())]
+            case Failed(is_loss=True):
+                return [self._lose(member, said.why)]
+        self._end(member)
+        raise WorkersError(said.why)
+
+    def _lose(self, member: Member, why: str) -> Lost:
+        member.deaths += 1
+        return Lost(self._end(member).number, why)
+
+    def _end(self, member: Member) -> Lease:
+        """Its process is no more, and it is idle."""
+        lease, member.lease, member.free_since = member.lease, None, time.monotonic()
+        member.pipe.close()
+        if os.getpid() == self._owner:  # a process that was forked meanwhile knows it, too
+            with suppress(ProcessLookupError):
+                os.kill(member.pid, signal.SIGKILL)
+            with suppress(ChildProcessError):
+                os.waitpid(member.pid, 0)
+        return lease
+
+    def _seen(self, member: Member) -> WorkerSeen:
+        lease, now = member.lease, time.monotonic()
+        waited = member.waited + (now - member.free_since if lease is None else 0.0)
+        block, steps = (lease.task.active.geometry.block, lease.task.active.steps) if lease else (None, 0)
+        share = min(waited / max(now - self._began, 1e-9), 1.0)
+        return WorkerSeen(member.number, block, member.done, steps, member.visits, member.deaths, share)
+
+
+class _Telling:
+    """Tells the driver how far a visit is, now and then."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe, self._told = pipe, time.monotonic()
+        self._psnrs: deque[float] = deque(maxlen=16)
+
+    def __call__(self, step: StepTaken) -> None:
+        if math.isfinite(step.psnr):
+            self._psnrs.append(step.psnr)
+        if time.monotonic() - self._told >= TELL_EVERY:
+            self._told = time.monotonic()
+            mean = sum(self._psnrs) / len(self._psnrs) if self._psnrs else math.nan
+            self._pipe.send((step.visit_step, mean))
+
+
+def _live(pipe: Connection, visit: Callable[[Callable[[StepTaken], None]], Any]) -> NoReturn:
+    """All of a worker's life. Whatever goes wrong in it ends it, and who waits for it is told."""
+    status = 1
+    try:
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the training process decides
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        torch.set_num_threads(1)
+        pipe.send(Parcel.of(visit(_Telling(pipe))))
+        status = 0
+    except Exception as error:
+        with suppress(OSError):
+            pipe.send(Failed.of(error))
+        raise
+    finally:
+        os._exit(status)  # none of the training process' own exits and handlers

@@ -1,1 +1,0 @@
-"""Processes that share the views of a step on a CPU with many cores."""

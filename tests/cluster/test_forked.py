@@ -1,0 +1,173 @@
+"""Workers that are forked for each visit: nobody can tell from the result, whatever befalls them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import pytest
+import torch
+
+from abcd_ns.cluster import forked_workers
+from abcd_ns.cluster.dispatcher import Dispatcher
+from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
+from abcd_ns.cluster.visit_worker import VisitWorker
+from abcd_ns.engine.events import WorkerLost, WorkersSeen
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.errors import UserError
+from tests.cluster.conftest import in_process, setup_of
+from tests.cluster.test_dispatcher import equal
+from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+
+pytestmark = pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+
+
+def make_run(folder, views, workers_of, **options):
+    def kind(run):
+        return Dispatcher(Coordinator(run), workers_of(run), lag=4)
+
+    folder.mkdir(exist_ok=True)
+    options = {"blocks": 6, "steps": 60, "density": GROWING, **options}
+    return make_coordinator(folder, random_gaussians(90, seed=2), views, kind=kind, **options)
+
+
+@pytest.fixture(scope="module")
+def steady(tmp_path_factory, views, photos):
+    """What visits in this very process make of the run."""
+    run = make_run(tmp_path_factory.mktemp("steady"), views, lambda run: in_process(run, photos, 2))
+    train(run, photos)
+    return whole_scene(run)
+
+
+@pytest.fixture
+def make(tmp_path, views, photos):
+    """Makes runs by two workers, which are given photos by `target`."""
+
+    def made(target=lambda _: None, **options):
+        def watched(sample):
+            target(sample)
+            return photos(sample.view.index, sample.crop), None
+
+        def workers_of(run):
+            return ForkedWorkers(2, VisitWorker(setup_of(run), TorchRasterizer(), watched))
+
+        return make_run(tmp_path / "forked", views, workers_of, **options)
+
+    return made
+
+
+def once(folder, act):
+    """Does something in the first process that comes along, and nowhere else."""
+    here, marker = os.getpid(), folder / "done"
+
+    def target(_):
+        if os.getpid() != here:
+            with suppress(FileExistsError):
+                marker.touch(exist_ok=False)
+                act()
+
+    return target
+
+
+def raising(error: Exception):
+    def act():
+        raise error
+
+    return act
+
+
+def is_alive(pid: int) -> bool:
+    with suppress(OSError, ProcessLookupError):
+        os.kill(pid, 0)
+        return True
+    return False
+
+
+def test_a_run_is_the_one_that_a_single_process_makes(make, photos, steady):
+    run, seen = make(), []
+    run.announce.subscribe(lambda event: seen.append(event) if isinstance(event, WorkersSeen) else None)
+    train(run, photos)
+    assert len(steady) > 90  # blocks grew
+    assert equal(steady, whole_scene(run))
+    visits = [worker.visits for worker in seen[-1].workers]
+    assert len(visits) == 2
+    assert all(visits)
+    assert run.workers.idle == 2
+
+
+def test_whoever_is_killed_is_replaced_and_nothing_is_lost(make, photos, steady):
+    run, lost, alive = make(), [], set()
+    run.announce.subscribe(lambda event: lost.append(event) if isinstance(event, WorkerLost) else None)
+    while not run.finished:
+        train_step(run, photos)
+        if len(lost) < 4 and (pids := run.workers.pids):
+            os.kill(pids[0], signal.SIGKILL)
+        alive |= set(run.workers.pids)
+    assert len(lost) >= 2
+    assert equal(steady, whole_scene(run))
+    assert not any(is_alive(pid) for pid in alive)
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+def test_a_visit_that_had_no_memory_is_lent_again(make, photos, steady, tmp_path, error):
+    run = make(once(tmp_path, raising(error)))
+    train(run, photos)
+    assert [worker.deaths for worker in run.workers.seen()].count(1) == 1
+    assert equal(steady, whole_scene(run))
+
+
+def test_so_is_one_that_nothing_is_heard_of(make, photos, steady, tmp_path, monkeypatch):
+    monkeypatch.setattr(forked_workers, "SILENCE", 3.0)
+    run = make(once(tmp_path, lambda: time.sleep(600)))
+    train(run, photos)
+    assert sum(worker.deaths for worker in run.workers.seen()) == 1
+    assert equal(steady, whole_scene(run))
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (KeyError("no photo 3"), r"KeyError: 'no photo 3' \(test_forked\.py:\d+, in act\)\..*workers 1"),
+        (ValueError("two\nlines"), r"ValueError: two \(test_forked"),
+        (UserError("The photo is gone: put it back."), r"^The photo is gone: put it back\.$"),
+    ],
+)
+def test_any_other_error_ends_the_run_in_one_line(make, photos, tmp_path, error, words):
+    run = make(once(tmp_path, raising(error)))
+    with pytest.raises(UserError, match=words) as raised:
+        train(run, photos)
+    assert "\n" not in str(raised.value)
+    pids = run.workers.pids
+    run.workers.close()
+    assert not any(is_alive(pid) for pid in pids)
+
+
+def test_no_worker_outlives_the_training_process(tmp_path):
+    """Not even one that is killed; `kill -9` runs no handler."""
+    script = f"""
+import os, sys, time
+from pathlib import Path
+sys.path.insert(0, {os.getcwd()!r})
+from tests.cluster.test_forked import *
+from tests.reference.scenes import ring_of_views
+worker = lambda run: VisitWorker(setup_of(run), TorchRasterizer(), lambda s: time.sleep(600))
+run = make_run(Path({str(tmp_path)!r}), ring_of_views(8), lambda run: ForkedWorkers(2, worker(run)))
+run._lend()
+print(*run.workers.pids, flush=True)
+time.sleep(600)
+"""
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
+        pids = [int(pid) for pid in process.stdout.readline().split()]
+        assert len(pids) == 2
+        assert all(map(is_alive, pids))
+        process.kill()
+    until = time.monotonic() + 20
+    while any(map(is_alive, pids)) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(map(is_alive, pids))
