@@ -152,9 +152,9 @@ def test_density_controls_clock_starts_when_the_warm_up_is_over(tmp_path, views,
     found = []
     watched = coordinator.density.after_step
 
-    def watch(params, optimizers, growth, infos, clock):
+    def watch(params, optimizers, growth, infos, clock, wide):
         found.append(clock.progress)
-        return watched(params, optimizers, growth, infos, clock)
+        return watched(params, optimizers, growth, infos, clock, wide)
 
     coordinator.density.after_step = watch
     train(coordinator, photos)

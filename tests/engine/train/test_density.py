@@ -14,9 +14,10 @@ from abcd_ns.engine.render.primitive import SURFELS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
+from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
-from tests.reference.scenes import random_gaussians
+from tests.reference.scenes import random_gaussians, ring_of_views
 
 
 def live(gaussians: Gaussians):
@@ -63,6 +64,28 @@ def test_the_default_strategy_clones_where_gradients_are_high():
     assert len(params["means"]) == 16
     assert {name: len(value) for name, value in growth.items()} == {"grad2d": 16, "count": 16}
     assert all(len(optimizers[n].param_groups[0]["params"][0]) == 16 for n in PARAM_NAMES)
+
+
+def test_the_wide_are_split_whatever_their_gradients_say():
+    params, optimizers = live(random_gaussians(8, size=0.1))
+    control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
+    wide, infos = torch.arange(8) < 3, (fake_info(8, gradient=0.0),)
+    before = params["scales"].detach().clone()
+    control.after_step(params, optimizers, {}, infos, clock(), wide)
+    assert len(params["means"]) == 11
+    assert torch.equal(params["scales"][:5], before[3:])  # the others, as they were
+    halves = params["scales"][5:].view(2, 3, 3)
+    assert torch.allclose(halves, (before[:3] - math.log(1.6)).expand(2, 3, 3))
+
+
+def test_wide_is_what_covers_a_twentieth_of_the_nearest_cameras_picture():
+    views = ring_of_views(3)
+    gaussians = random_gaussians(20)
+    nearest = torch.stack([(gaussians.means - view.center).norm(dim=1) for view in views]).amin(dim=0)
+    gaussians.scales[:] = (WIDE_ANGLE * nearest * 0.99).log()[:, None]
+    gaussians.scales[4, 1] += 0.02
+    over, _ = wider_than(WIDE_ANGLE, gaussians.scales, gaussians.means, views)
+    assert over.nonzero().tolist() == [[4, 1]]
 
 
 def test_between_refinements_statistics_add_up():

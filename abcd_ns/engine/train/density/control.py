@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
+from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
@@ -225,12 +226,14 @@ class DensityControl:
         growth: dict[str, Tensor],
         infos: Infos,
         clock: DensityClock,
+        wide: Bool[Tensor, "n"] | None = None,
     ) -> dict[str, Tensor]:
         """Gather statistics and, when it is time, refine. Call after Adam's step.
 
         Args:
             growth: the block's statistics so far, each [n].
             infos: of the step's drawings, after backward.
+            wide: which are to become two whatever their gradients say (`default` strategy).
 
         Returns:
             The block's statistics from now on. The global random generator is left as it was.
@@ -249,7 +252,7 @@ class DensityControl:
             if self.config.strategy == "mcmc":
                 self._step_mcmc(params, optimizers, clock)
                 return {}
-            return self._step_default(params, optimizers, growth, infos, clock)
+            return self._step_default(params, optimizers, growth, infos, clock, wide)
 
     def shed(
         self,
@@ -281,6 +284,7 @@ class DensityControl:
         growth: dict[str, Tensor],
         infos: Infos,
         clock: DensityClock,
+        wide: Bool[Tensor, "n"] | None,
     ) -> dict[str, Tensor]:
         config = self.config
         has_reset = 0 < config.reset_every < clock.steps
@@ -296,6 +300,9 @@ class DensityControl:
         )
         state: dict[str, Any] = {"scene_scale": 1.0, **growth}
         if self.refines(clock, infos):
+            if wide is not None:
+                wanted = torch.where(wide, 2 * config.densify_grad_thresh * growth["count"].clamp_min(1), 0.0)
+                growth = {**growth, "grad2d": torch.maximum(growth["grad2d"], wanted)}
             growth = self._payable(growth, clock.views)
             state |= growth
             strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, clock.room)

@@ -28,6 +28,7 @@ from abcd_ns.engine.train.health.health_rules import (
     loss_rise,
     stand_ins,
     unsound,
+    wider_than,
 )
 from abcd_ns.engine.train.health.step_guard import StepGuard
 from abcd_ns.engine.train.health_record import BlockHealth, Ledger
@@ -130,13 +131,8 @@ class Health:
         """
         if not self._may_act:
             return
-        scales, means = self._params["scales"], self._params["means"]
-        nearest = means.new_full((len(means),), math.inf)
-        for view in views:
-            away = (means - view.center.to(means)).norm(dim=1).clamp_min(view.near)
-            nearest = torch.minimum(nearest, away)
-        allowed = (GIANT_ANGLE * nearest).log()[:, None]
-        over = scales > allowed
+        scales = self._params["scales"]
+        over, allowed = wider_than(GIANT_ANGLE, scales, self._params["means"], views)
         rows = over.any(dim=1).nonzero()[:, 0]
         if len(rows) == 0:
             return

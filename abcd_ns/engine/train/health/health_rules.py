@@ -1,12 +1,13 @@
 """What counts as ill: pure functions of Gaussians and of losses."""
 
 import math
+from collections.abc import Iterable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from abcd_ns.engine.types import Gaussians, Layer
+from abcd_ns.engine.types import Gaussians, Layer, View
 
 SHOWS = 1 / 255
 """Rasterizers skip a Gaussian wherever its alpha is below this: with less opacity it is never drawn."""
@@ -17,6 +18,9 @@ LARGEST_LOG_SCALE = 40.0
 GIANT_ANGLE = 0.3
 """A giant's standard deviation is over this share of its distance to the nearest camera: 3 sigma cover 45
 degrees to either side. What is far away, sky for instance, may be large."""
+WIDE_ANGLE = 0.05
+"""Gaussians that are wider in this measure, a twentieth of a picture say, are split when their block grows,
+whatever their gradients: what lies before and behind such a one cannot be sorted from everywhere."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
 RISE = 0.1
@@ -33,6 +37,24 @@ def unsound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     for _, value in gaussians.items():
         bad = bad | ~torch.isfinite(value).flatten(1).all(dim=1)
     return bad
+
+
+@torch.no_grad()
+def wider_than(
+    angle: float, scales: Float[Tensor, "n 3"], means: Float[Tensor, "n 3"], views: Iterable[View]
+) -> tuple[Bool[Tensor, "n 3"], Float[Tensor, "n 1"]]:
+    """Along which axes a standard deviation is over this share of the distance to the nearest camera, and the
+    logarithm of what would not be.
+
+    Args:
+        scales: logarithms of standard deviations.
+    """
+    nearest = means.new_full((len(means),), math.inf)
+    for view in views:
+        away = (means - view.center.to(means)).norm(dim=1).clamp_min(view.near)
+        nearest = torch.minimum(nearest, away)
+    allowed = (angle * nearest).log()[:, None]
+    return scales > allowed, allowed
 
 
 @torch.no_grad()

@@ -12,6 +12,7 @@ from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.density.splitting import is_full
+from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -80,7 +81,11 @@ class LiveBlock:
             infos: of the step's drawings; none where its gradients were no numbers.
         """
         run = self._run
-        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock)
+        wide = None
+        if run.config.recipe.split_wide and run.density.refines(clock, infos):
+            scales, means = run.params["scales"], run.params["means"]
+            wide = wider_than(WIDE_ANGLE, scales, means, run.views.values())[0].any(dim=1)
+        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock, wide)
         if run.density.resets(clock):
             self.clocks = replace(self.clocks, resets=clock.steps // run.config.density.reset_every)
         if run.density.refines(clock, infos):
