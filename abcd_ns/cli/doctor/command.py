@@ -114,6 +114,8 @@ def _workers(hardware: Hardware, ray: str | None) -> str:
     most, of = (hardware.gpus, "GPU") if hardware.gpu else (hardware.cores, "core")
     if most < 2:
         return f"none here: one {of}"
+    if not hardware.gpu:
+        return f"up to {most}, one for each core, where a scene has two blocks for each"
     said = f"up to {most}, one for each {of}: --pipeline.workers"
     return f"{said}, by Ray {ray}" if ray else f"{said}, after pip install 'abcd-ns[cluster]'"
 
