@@ -1,8 +1,8 @@
 """Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
 
-import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -18,10 +18,12 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.data.ply import GREY
+from abcd_ns.engine.gaussians.block_state import checksum
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, psnr, psnrs, ssim_windows
 from abcd_ns.engine.space.partition import build_kd
@@ -38,8 +40,9 @@ from abcd_ns.nerfstudio.fit import FREE_SHARE
 from abcd_ns.nerfstudio.flags import hidden
 from abcd_ns.nerfstudio.metrics import image_metrics
 from abcd_ns.nerfstudio.options import HIDDEN
+from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
 from abcd_ns.nerfstudio.views import view_of
-from abcd_ns.viewer.pictures import BlockPictures, Choice, Cropped, Show, asked_by_viewer, bounded
+from abcd_ns.viewer import pictures as viewed
 
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
@@ -91,7 +94,7 @@ class AbcdModel(SplatfactoModel):
         self.background_color = (
             torch.tensor(VIEWER_BACKGROUND) if random else get_color(self.config.background_color)
         )
-        self.choice = Choice()
+        self.choice = viewed.Choice()
         self._coordinator: Trainer | None = None
         self._rasterizer: Rasterizer | None = None
         self._loaded_is_too_large = False
@@ -212,36 +215,23 @@ class AbcdModel(SplatfactoModel):
             raise RuntimeError(
                 "a training batch needs the coordinator that it came from: call follow() first"
             )
-        rendered = self._coordinator.render(batch)
-        return {
-            "rgb": list(rendered.pictures),
-            "accumulation": [1 - transmittance[..., None] for transmittance in rendered.transmittances],
-            "background": [sample.background for sample in batch.samples],
-            "batch": batch,
-            "rendered": rendered,
-        }
+        return rendered_outputs(batch, self._coordinator.render(batch))
 
     def _whole_outputs(self, view: View) -> dict[str, Tensor]:
         # ns-render's crop has a background of its own.
         override = renderers.BACKGROUND_COLOR_OVERRIDE
         background = (self.background_color if override is None else override).to(self.device)
-        if asked_by_viewer():
-            view = bounded(view)
+        if viewed.asked_by_viewer():
+            view = viewed.bounded(view)
             raster = self.draw_for_viewer(view)
             layer = raster.layer
         else:
             raster = self.draw_merged(view)
             layer = self.draw_composited(view) if self.config.render == "composited" else raster.layer
-        transmittance = layer.transmittance[..., None]
-        alpha = 1 - raster.transmittance[..., None]
-        # Where nothing is, splatfacto shows the farthest depth of the picture.
-        depth = torch.where(alpha > 0, raster.depth[..., None] / alpha.clamp_min(1e-10), raster.depth.max())
-        return {
-            "rgb": (layer.color + transmittance * background).clamp(0, 1),
-            "depth": depth,
-            "accumulation": 1 - transmittance,
-            "background": background.expand(view.height, view.width, 3),
-        }
+        later = {"normals": partial(self.draw_normals, view), "depth_median": partial(self.draw_median, view)}
+        outputs = Outputs(pictured(layer, raster, background), later)
+        outputs.draw(viewed.chosen_outputs())  # now, while training waits for the viewer
+        return outputs
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """A picture of `get_outputs` without its background, [H, W, 4], alpha not multiplied in: ns-render's
@@ -273,24 +263,51 @@ class AbcdModel(SplatfactoModel):
         pictures = self._by_units(view, self.config.ownership, pass_gaussians=0)
         return pictures.painter.picture(view, pictures.settings)
 
+    @torch.no_grad()
+    def draw_normals(self, view: View) -> Tensor:
+        """Which way what is seen faces in world space, (n + 1) / 2, [H, W, 3]; of what the viewer shows."""
+        paint = partial(colored_by_normal, view=view, flat=self.config.primitive == "2dgs")
+        pictures = self._by_units(view, "fragments", keep=lambda g: paint(self._crop(g)), sh_degree=0)
+        show = self.choice.show if viewed.asked_by_viewer() else viewed.Show.EVERYTHING
+        return (normals_in(pictures.draw(show, self._chosen_block())) + 1) / 2
+
+    @torch.no_grad()
+    def draw_median(self, view: View) -> Tensor:
+        """The depth at which half of each pixel is covered, [H, W, 1]; of the whole scene."""
+        pictures = self._by_units(view, "fragments")
+        return median_depth(pictures.painter, view, pictures.settings)[..., None]
+
     def draw_for_viewer(self, view: View) -> Raster:
         """What the viewer's user chose to see."""
-        choice, block = self.choice, self.choice.block
-        if block is None and self._coordinator is not None:
-            active = self._coordinator.state.active
-            block = None if active is None or active.is_whole else active.geometry.block
-        chosen = choice.show is not Show.EVERYTHING and block is not None and block < self.tree.num_blocks
-        if not chosen:
+        choice, block = self.choice, self._chosen_block()
+        if choice.show is viewed.Show.EVERYTHING or block is None:
             return self.draw_merged(view)
         return self._by_units(view, self.config.ownership).draw(choice.show, block)
 
-    def _by_units(self, view: View, ownership: Ownership, pass_gaussians: int | None = None) -> BlockPictures:
+    def _chosen_block(self) -> int | None:
+        """Which block the viewer's user chose to see; None for none that there is."""
+        block = self.choice.block
+        if block is None and self._coordinator is not None:
+            active = self._coordinator.state.active
+            block = None if active is None or active.is_whole else active.geometry.block
+        return block if block is not None and block < self.tree.num_blocks else None
+
+    def _by_units(
+        self,
+        view: View,
+        ownership: Ownership,
+        *,
+        pass_gaussians: int | None = None,
+        keep: Callable[[Gaussians], Gaussians] | None = None,
+        sh_degree: int | None = None,
+    ) -> viewed.BlockPictures:
+        """Draws the scene by parts: of Gaussians what `keep` gives, or those in the crop box."""
         whole = self.scene()
         if isinstance(whole, StoredScene) and whole.is_live_as_a_whole:
             whole = MemoryScene(
                 whole.tree, self.merged()
             )  # which block holds how many is not known otherwise
-        scene = Cropped(whole, self._crop)
+        scene = viewed.Cropped(whole, keep or self._crop)
         most = min(default_pass(scene), self._most_at_once())
         painter = Painter(
             scene,
@@ -300,9 +317,10 @@ class AbcdModel(SplatfactoModel):
             pass_gaussians=most if pass_gaussians is None else pass_gaussians,
             device=self.device,
         )
-        settings = PaintSettings(self.config.sh_degree, self.config.rasterize_mode == "antialiased")
+        degree = self.config.sh_degree if sh_degree is None else sh_degree
+        settings = PaintSettings(degree, self.config.rasterize_mode == "antialiased")
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
-        return BlockPictures(painter, view, settings, training.window_weight)
+        return viewed.BlockPictures(painter, view, settings, training.window_weight)
 
     def _is_too_large(self) -> bool:
         """Whether the device should not hold the whole scene at once."""
@@ -312,7 +330,8 @@ class AbcdModel(SplatfactoModel):
 
     def _most_at_once(self) -> int:
         """Gaussians that the device could draw at once, beside what it holds."""
-        return int(FREE_SHARE * free_bytes(self.device)) // drawing_bytes(self.config.sh_degree)
+        of_each = drawing_bytes(self.config.sh_degree, self.config.primitive)
+        return int(FREE_SHARE * free_bytes(self.device)) // of_each
 
     def _crop(self, gaussians: Gaussians) -> Gaussians:
         if self.crop_box is None:
@@ -337,8 +356,8 @@ class AbcdModel(SplatfactoModel):
         del metrics_dict
         pictures, photos = self._pairs(outputs, batch)
         if "mask" in batch:
-            masks = _as_list(batch["mask"])
-            pictures, photos = _masked(pictures, masks), _masked(photos, masks)
+            masks = as_list(batch["mask"])
+            pictures, photos = masked(pictures, masks), masked(photos, masks)
         if "batch" in outputs and self._coordinator is not None:
             return {"main_loss": self._coordinator.loss(outputs["batch"], pictures, photos)}
         height, width = pictures[0].shape[:2]
@@ -350,11 +369,9 @@ class AbcdModel(SplatfactoModel):
         """Pictures and their photos, on the same background."""
         photos = [
             self.photo_on(image, background)
-            for image, background in zip(
-                _as_list(batch["image"]), _as_list(outputs["background"]), strict=True
-            )
+            for image, background in zip(as_list(batch["image"]), as_list(outputs["background"]), strict=True)
         ]
-        return _as_list(outputs["rgb"]), photos
+        return as_list(outputs["rgb"]), photos
 
     def photo_on(self, image: Tensor, background: Tensor) -> Tensor:
         """What a picture on this background should be: float32 in 0..1, [h, w, 3]."""
@@ -381,20 +398,3 @@ class AbcdModel(SplatfactoModel):
 
     def _count(self) -> int:
         return len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
-
-
-def checksum(gaussians: Gaussians) -> str:
-    """blake2b of all parameters, hexadecimal."""
-    digest = hashlib.blake2b(digest_size=16)
-    for _, value in gaussians.items():
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _as_list(values: Tensor | list[Tensor]) -> list[Tensor]:
-    return values if isinstance(values, list) else [values]
-
-
-def _masked(pictures: list[Tensor], masks: list[Tensor | None]) -> list[Tensor]:
-    pairs = zip(pictures, masks, strict=True)
-    return [picture if mask is None else picture * mask.to(picture.device) for picture, mask in pairs]

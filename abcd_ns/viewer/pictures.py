@@ -50,6 +50,14 @@ def asked_by_viewer() -> bool:
     return isinstance(threading.current_thread(), RenderStateMachine)
 
 
+def chosen_outputs() -> tuple[str, ...]:
+    """Which outputs of the model the browser is to be shown, where one has asked."""
+    if not asked_by_viewer():
+        return ()
+    panel = threading.current_thread().viewer.control_panel
+    return (panel.output_render, *([panel.split_output_render] if panel.split else []))
+
+
 def bounded(view: View) -> View:
     """The view in as many pixels as a client may ask for, and at least one."""
     times = math.ceil(math.sqrt(view.width * view.height / MOST_PIXELS))

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from abcd_ns.cli.mesh.surface import Piece, weld, without_specks
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
@@ -61,15 +63,18 @@ def sphere(count: int = 20_000) -> Gaussians:
     return surface_of(torch.stack((across * angle.cos(), across * angle.sin(), z), dim=1), 0.015, colors)
 
 
-@pytest.fixture(scope="module")
-def maps(tmp_path_factory) -> DepthMaps:
+@pytest.fixture(scope="module", params=["expected", "median"])
+def maps(request, tmp_path_factory) -> DepthMaps:
     """The sphere from around it, drawn from two blocks, one after the other."""
     scene, views = sphere(), ring_of_views(8, width=96, height=72)
     parted = MemoryScene(build_kd(scene.means, 2), scene)
     painter = Painter(parted, views, TorchRasterizer(), ownership="fragments", pass_gaussians=0)
     assert len(painter.units()) == 2
-    pictures = WholePictures(painter, PaintSettings(sh_degree=3))
-    return draw(pictures, views, tmp_path_factory.mktemp("maps"), lambda: None)
+    settings = PaintSettings(sh_degree=3)
+    median = None if request.param == "expected" else partial(median_depth, painter, settings=settings)
+    return draw(
+        WholePictures(painter, settings), views, tmp_path_factory.mktemp("maps"), lambda: None, median
+    )
 
 
 def fused(maps: DepthMaps, part_boxes: int) -> tuple[Fusion, Piece]:

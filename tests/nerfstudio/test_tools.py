@@ -119,6 +119,22 @@ def test_a_camera_path_is_rendered_with_depth_and_accumulation(rendered):
     assert all((frames[name][:, :WIDTH] == photos[name]).all() for name in photos)
 
 
+def test_normals_and_median_depth_are_rendered_when_asked_for(rendered, monkeypatch):
+    asked = []
+    for name in ("draw_normals", "draw_median"):
+        draws = getattr(AbcdModel, name)
+        watched = lambda self, view, name=name, draws=draws: (asked.append(name), draws(self, view))[1]  # noqa: E731
+        monkeypatch.setattr(AbcdModel, name, watched)
+    rendered(["rgb", "depth"])
+    assert asked == []
+    frames = rendered(["normals", "depth_median"])
+    assert asked == 3 * ["draw_normals", "draw_median"]
+    for frame in frames.values():
+        assert frame.shape == (HEIGHT, 2 * WIDTH, 3)
+        assert frame[:, :WIDTH].std() > 1
+        assert frame[:, WIDTH:].std() > 1
+
+
 def test_a_crop_box_leaves_what_is_in_it_on_its_own_background(rendered):
     whole = rendered(["rgb"])["00001.png"]
     crop = {"crop_bg_color": {"r": 255, "g": 0, "b": 255}, "crop_center": [9.0, 9.0, 9.0]}
@@ -156,7 +172,7 @@ def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
         load_config=trained / "config.yml", output_path=tmp_path, image_format="png", split="train+test"
     ).main()
     found = pictures(tmp_path)
-    kinds = ("gt-rgb", "rgb", "depth", "accumulation", "background")
+    kinds = ("gt-rgb", "rgb", "depth", "accumulation", "background", "normals", "depth_median")
     assert len(found) == len(kinds) * VIEWS
     names = [name.split("/")[-1] for name in found if name.startswith("test/rgb/")]
     assert len(names) == HELD_OUT

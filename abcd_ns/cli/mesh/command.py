@@ -14,11 +14,12 @@ import tyro
 from abcd_ns.cli.export.command import check_request, open_store, tell_rounding, to_data
 from abcd_ns.cli.export.formats import GENERATOR
 from abcd_ns.cli.export.shown import Box, check_trained
-from abcd_ns.cli.mesh.depth_maps import draw
+from abcd_ns.cli.mesh.depth_maps import DepthMaps, draw
 from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
 from abcd_ns.cli.report.run_folder import find_run, pipeline_config, read_settings
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.space.tree import BlockTree
@@ -51,6 +52,7 @@ def mesh(
     voxel: Annotated[float | None, tyro.conf.arg(metavar="SIDE", help_behavior_hint="")] = None,
     box: Annotated[Box | None, tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="")] = None,
     frame: Literal["data", "nerfstudio"] = "data",
+    depth: Literal["median", "expected"] = "median",
 ) -> int:
     """Write a trained scene's surface as a mesh: a .ply of triangles with a colour at each corner.
 
@@ -69,6 +71,8 @@ def mesh(
         box: Only what lies in this box, in the coordinates of `frame`.
         frame: "data" is that of the photos' poses, as COLMAP or transforms.json have them, with its scale;
             "nerfstudio" is that of the run, its viewer and `ns-export`.
+        depth: Of a pixel: "median" is where half of it is covered, "expected" the mean of what it shows,
+            which a little that floats before a wall moves off the wall.
 
     Raises:
         UserError: there is no run, it has nothing to show yet, the data is not the run's, there is no
@@ -77,11 +81,10 @@ def mesh(
     _check(out, voxel, box)
     run = find_run(run)
     to = to_data(run) if frame == "data" else STAY
-    wanted = Wanted(out, voxel and voxel / to.scale, box, to)
+    wanted = Wanted(out, voxel and voxel / to.scale, box, to, depth == "median")
     try:
         with open_store(run / STATE / STORE) as store:
-            pictures, views = _pictures(store, pipeline_config(run, read_settings(run), data))
-            fused, side = _surface(pictures, views, wanted)
+            fused, side = _surface(_seen(store, pipeline_config(run, read_settings(run), data)), wanted)
         partial = out.with_name(out.name + ".part")
         try:
             write_ply(partial, fused, GENERATOR)
@@ -107,6 +110,7 @@ class Wanted:
     """World units of the run."""
     box: Box | None
     to: Frame
+    median: bool
 
     def within(self, piece: Piece) -> Piece:
         """The faces whose middles are in the box."""
@@ -131,13 +135,28 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
         ) from None
 
 
-def _surface(pictures: WholePictures, views: list[View], wanted: Wanted) -> tuple[Piece, float]:
+@dataclass(frozen=True)
+class Seen:
+    """A scene, and the training views that see it."""
+
+    painter: Painter
+    settings: PaintSettings
+    views: list[View]
+
+    def draw(self, folder: Path, median: bool, advance: Callable[[], None]) -> DepthMaps:
+        """Depth and colour of all views, kept in `folder`."""
+        found = (lambda view: median_depth(self.painter, view, self.settings)) if median else None
+        return draw(WholePictures(self.painter, self.settings), self.views, folder, advance, found)
+
+
+def _surface(seen: Seen, wanted: Wanted) -> tuple[Piece, float]:
     """The mesh in the frame that is asked for, and the side of its voxels there."""
     from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
 
+    views = seen.views
     with tempfile.TemporaryDirectory(prefix=".abcd-mesh-", dir=wanted.out.absolute().parent) as folder:
         with _bar("drawing", len(views)) as advance:
-            maps = draw(pictures, views, Path(folder), advance)
+            maps = seen.draw(Path(folder), wanted.median, advance)
         footprints = maps.footprints()
         if not len(footprints):
             raise UserError("There is no surface: what the training views show is too transparent.")
@@ -156,7 +175,7 @@ def _surface(pictures: WholePictures, views: list[View], wanted: Wanted) -> tupl
     return replace(found, vertices=vertices), side * wanted.to.scale
 
 
-def _pictures(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[WholePictures, list[View]]:
+def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> Seen:
     """What draws the scene, and its training views. Where these were refined is of no account: the depth
     that they see is the scene's, wherever they stand."""
     check_trained(store)
@@ -168,7 +187,8 @@ def _pictures(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[WholeP
         raise UserError(f"--data {config.datamanager.data} is not what the run was made for: {different}.")
     ram = share_out(ram_budget(config.ram_budget_gb))
     scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, ram.blocks)
-    room = int(FREE_SHARE * free_bytes(device)) // drawing_bytes(config.training.sh_degree)
+    of_each = drawing_bytes(config.training.sh_degree, config.training.primitive)
+    room = int(FREE_SHARE * free_bytes(device)) // of_each
     painter = Painter(
         scene,
         views,
@@ -178,7 +198,7 @@ def _pictures(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[WholeP
         device=device,
     )
     settings = PaintSettings(config.training.sh_degree, config.training.antialiased)
-    return WholePictures(painter, settings), views
+    return Seen(painter, settings, views)
 
 
 @contextmanager

@@ -18,10 +18,15 @@ SAMPLES = 1000
 """Pixels of a view by which footprints are known."""
 
 
-def depth_of(picture: WholePicture) -> Float[Tensor, "h w"]:
-    """Camera z of what each pixel shows, world units: the expected one. 0 where it shows too little."""
+def depth_of(picture: WholePicture, median: Float[Tensor, "h w"] | None = None) -> Float[Tensor, "h w"]:
+    """Camera z of what each pixel shows, world units. 0 where it shows too little.
+
+    Args:
+        median: taken where it is given; else the expected one.
+    """
     opacity = 1 - picture.transmittance
-    return torch.where(opacity >= LEAST_OPACITY, picture.depth / opacity.clamp_min(1e-6), 0.0)
+    depth = picture.depth / opacity.clamp_min(1e-6) if median is None else median
+    return torch.where(opacity >= LEAST_OPACITY, depth, 0.0)
 
 
 @dataclass
@@ -31,11 +36,11 @@ class DepthMaps:
     folder: Path
     views: list[View] = field(default_factory=list)
 
-    def add(self, view: View, picture: WholePicture) -> None:
+    def add(self, view: View, picture: WholePicture, depth: Float[Tensor, "h w"]) -> None:
         """Keep what a view sees."""
         color = picture.color / (1 - picture.transmittance).clamp_min(LEAST_OPACITY)[..., None]
         number = len(self.views)
-        np.save(self._file("depth", number), depth_of(picture).float().cpu().numpy())
+        np.save(self._file("depth", number), depth.float().cpu().numpy())
         np.save(self._file("color", number), (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
         self.views.append(view)
 
@@ -61,11 +66,19 @@ class DepthMaps:
 
 
 def draw(
-    pictures: WholePictures, views: Sequence[View], folder: Path, advance: Callable[[], None]
+    pictures: WholePictures,
+    views: Sequence[View],
+    folder: Path,
+    advance: Callable[[], None],
+    median: Callable[[View], Float[Tensor, "h w"]] | None = None,
 ) -> DepthMaps:
-    """Draw the views, as many at a time as there is room for, into files of `folder`."""
+    """Draw the views, as many at a time as there is room for, into files of `folder`.
+
+    Args:
+        median: draws a view's median depth, to be taken in the expected one's place.
+    """
     maps = DepthMaps(folder)
     for view, picture in zip(views, pictures.draw(views), strict=True):
-        maps.add(view, picture)
+        maps.add(view, picture, depth_of(picture, median and median(view)))
         advance()
     return maps

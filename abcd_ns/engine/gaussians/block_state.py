@@ -1,5 +1,6 @@
 """All that belongs to one block: its Gaussians, their Adam moments, growth statistics and clocks."""
 
+import hashlib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -136,6 +137,14 @@ class BlockState:
     def clocks_of(meta: dict[str, Any]) -> Clocks:
         """Those in the JSON of `packed`."""
         return Clocks(**meta["clocks"])
+
+
+def checksum(gaussians: Gaussians) -> str:
+    """blake2b of all parameters, hexadecimal."""
+    digest = hashlib.blake2b(digest_size=16)
+    for _, value in gaussians.items():
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _statistic(state: BlockState, name: str) -> Tensor:

@@ -145,7 +145,7 @@ def test_drifting_light_costs_next_to_nothing_once_it_is_compensated(
     assert left < 0.5 * cost
 
 
-@pytest.mark.parametrize(("blocks", "steps"), [(1, 80), (4, 120)])
+@pytest.mark.parametrize(("blocks", "steps"), [(1, 240), (4, 240)])
 def test_grids_make_good_for_light_that_differs_within_a_photo(error, ring, blocks, steps):
     """A matrix for each photo cannot."""
     options, shaded = {"blocks": blocks, "steps": steps}, Shaded(TRUTH, ring)
@@ -154,8 +154,8 @@ def test_grids_make_good_for_light_that_differs_within_a_photo(error, ring, bloc
     with_matrices = error("matrices", shaded, "affine", **options) - steady
     with_grids = error("grids", shaded, "bilateral", **options) - steady
     assert cost > steady
-    assert with_matrices > 0.8 * cost
-    assert with_grids < 0.4 * cost
+    assert with_matrices > 0.9 * cost
+    assert with_grids < 0.7 * cost
 
 
 def test_a_part_of_a_picture_has_its_part_of_the_grid(ring):

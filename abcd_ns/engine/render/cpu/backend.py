@@ -12,7 +12,7 @@ from torch import Tensor
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu.binning import Candidates, find_candidates
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels, CompilePolicy
-from abcd_ns.engine.render.cpu.compositing_function import Composite, Job, pair_weights
+from abcd_ns.engine.render.cpu.compositing_function import Composite, Job, deepen, pair_weights
 from abcd_ns.engine.render.image_size import image_size
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree, pack, project_packed
@@ -196,6 +196,32 @@ class TorchRasterizer(Rasterizer):
             held, again = grid.holding(drawn_in, tile[own].long() - firsts[k]).sort(stable=True)
             found.append(showing(grid, held, z[own][again], weight[own][again], visible))
         return found
+
+    @torch.no_grad()
+    def deepened(
+        self,
+        gaussians: Gaussians,
+        view: View,
+        window: ZWindow | None,
+        in_front: tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]],
+        *,
+        antialiased: bool = False,
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """Transmittance, right where above a half, and median depth with these Gaussians behind others.
+
+        Args:
+            window: where in each tile fragments count; None for everywhere.
+            in_front: the same of the others; for none 1 and 0.
+        """
+        seen = [self.project(gaussians, view, antialiased=antialiased)]
+        splats, candidates = self._candidates(seen, [view.full])
+        candidates = candidates if window is None else candidates.within([window])
+        drawn = splats.planes[: self.primitive.graded].index_select(1, candidates.rows)
+        left, depth = in_front
+        state = torch.stack((torch.where(left > 0.5, left, -left), depth))
+        tiled = candidates.sheet.to_tiles([state], fill=-1.0)
+        (found,) = candidates.sheet.to_images(deepen(drawn, self._job(candidates, splats.planes), tiled))
+        return found[0].abs(), found[1]
 
     def _candidates(self, seen: Sequence[Splats], crops: Sequence[Crop]) -> tuple[Splats, Candidates]:
         """What several views see, as one drawing; splats are numbered through, view by view."""

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.render.cpu.binning import Level, TileLists
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels
-from abcd_ns.engine.render.cpu.torch_kernels import STATE_PLANES, gather_params
+from abcd_ns.engine.render.cpu.torch_kernels import STATE_PLANES, gather_params, median_chunk
 
 COMPACT = 0.75
 """Tiles whose pixels are all finished are dropped once fewer than this share is left."""
@@ -198,6 +198,21 @@ def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
 
     _walk(lists, _initial_state(lists, table.dtype)[:1], weigh)
     return per_slot[lists.slots]
+
+
+def deepen(drawn: Float[Tensor, "d m"], job: Job, state: Float[Tensor, "2 p t"]) -> Float[Tensor, "2 p t"]:
+    """Transmittance and median depth of all tiles, see `median_chunk`, behind those of what is in front."""
+    lists, fragments = job.lists, job.kernels.fragments
+    table, origins = _table(drawn, job)
+    table = table[: fragments.opacity + 1]
+
+    def draw(level: Level, columns: Tensor | None, before: Tensor) -> Tensor:
+        params = gather_params(table, _level_ranks(lists, level, columns))
+        return median_chunk(fragments, lists.sheet.side, params, _take(origins, level, columns), before)
+
+    after = state.clone()
+    after[:, :, lists.tiles] = _walk(lists, state.index_select(2, lists.tiles), draw)
+    return after
 
 
 def _table(drawn: Float[Tensor, "d m"], job: Job) -> tuple[Float[Tensor, "c n"], Float[Tensor, "2 a"]]:

@@ -126,6 +126,28 @@ def weigh_chunk(
     return T[None], torch.stack(sums)
 
 
+def median_chunk(
+    fragments: Fragments,
+    side: int,
+    params: Params,
+    origins: Float[Tensor, "2 a"],
+    state: Float[Tensor, "2 p a"],
+) -> Float[Tensor, "2 p a"]:
+    """The depth of the last fragment that is drawn while more than half of the light passes.
+
+    Args:
+        params: rows up to the opacity.
+        state: transmittance, negative where it is a half or less, and that depth so far.
+    """
+    alphas, _ = fragments.alphas(side, params, origins)
+    T, depth = state.unbind(0)
+    for k in range(params.shape[1]):
+        passes = T > 0.5
+        depth = torch.where(passes & (alphas[k] > 0), params[DEPTH, k], depth)
+        T = torch.where(passes, T * (1.0 - alphas[k]), T)
+    return torch.stack((torch.where(T > 0.5, T, -T.abs()), depth))
+
+
 def backward_chunk(
     fragments: Fragments,
     side: int,

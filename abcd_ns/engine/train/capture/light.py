@@ -25,6 +25,8 @@ Gradients = Sequence[tuple[int, Tensor]]
 """(view, the gradient by its transform) pairs, one for each picture."""
 RATE, SETTLES = 0.05, 10.0
 """Adam's at a view's first use, and the uses after which it is halved: it falls as in an average."""
+GRID_RATE = 0.005
+"""Of a grid, at first: it has cells enough to take over what is the scene's."""
 LAST = 0.03
 """Share of it that is left at the end of the run."""
 BETAS = (0.9, 0.999)
@@ -61,7 +63,7 @@ class Light:
     """
 
     def __init__(self, kind: Kind, views: Sequence[int], device: torch.device | str = "cpu") -> None:
-        self.kind = kind
+        self.kind, self._rate = kind, GRID_RATE if kind == "bilateral" else RATE
         self._rows = {view: row for row, view in enumerate(sorted(views))}
         self._device = torch.device(device)
         is_grid = kind == "bilateral"
@@ -127,7 +129,7 @@ class Light:
         second = self._second[places] = self._second[places].lerp(summed.square(), 1 - BETAS[1])
         first, second = (m / (1 - beta**uses) for m, beta in zip((first, second), BETAS, strict=True))
         before = self._changes[places]
-        after = before - damping * RATE / (1 + uses / SETTLES) * first / (second.sqrt() + 1e-15)
+        after = before - damping * self._rate / (1 + uses / SETTLES) * first / (second.sqrt() + 1e-15)
         self._changes[places] = after
         self._sum += (after.double() - before.double()).sum(dim=0)
 

@@ -1,0 +1,95 @@
+"""Which way what a pixel shows faces, and how far away most of it is: of a whole scene, unit by unit.
+
+Nothing of this is drawn unless it is asked for.
+"""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
+from abcd_ns.engine.layers.painter import Painter, PaintSettings
+from abcd_ns.engine.render import Raster, Rasterizer
+from abcd_ns.engine.render.cpu.backend import TorchRasterizer
+from abcd_ns.engine.types import Gaussians, View
+
+UPRIGHT = 2
+"""The axis of a surfel's normal; an ellipsoid's is that of its least scale."""
+
+
+def normals_of(gaussians: Gaussians, center: Float[Tensor, "3"], flat: bool) -> Float[Tensor, "n 3"]:
+    """Unit vectors across Gaussians, world space, on the side of a camera's centre.
+
+    Args:
+        flat: whether they are surfels.
+    """
+    w, x, y, z = F.normalize(gaussians.quats, dim=1).unbind(1)
+    # The rotations' columns, as rows.
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        *(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        *(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+    axes = torch.stack(rows, dim=1).view(-1, 3, 3)
+    which = gaussians.scales.argmin(dim=1)
+    which = torch.full_like(which, UPRIGHT) if flat else which
+    normals = axes[torch.arange(len(which), device=which.device), which]
+    away = ((gaussians.means - center.to(gaussians.means)) * normals).sum(dim=1, keepdim=True)
+    return torch.where(away > 0, -normals, normals)
+
+
+def colored_by_normal(gaussians: Gaussians, view: View, flat: bool) -> Gaussians:
+    """The same in the colours (n + 1) / 2: of their pictures, which any rasterizer draws and any layers fold
+    to, `normals_in` makes normals. To be drawn with harmonics of degree 0.
+
+    Args:
+        view: that they are to face.
+    """
+    shown = normals_of(gaussians, view.center, flat) / (2 * SH_C0)
+    return replace(gaussians, features_dc=shown, features_rest=torch.zeros_like(gaussians.features_rest))
+
+
+def normals_in(raster: Raster) -> Float[Tensor, "h w 3"]:
+    """Unit vectors: the mean normal of what each pixel shows, by weight; 0 where it shows nothing.
+
+    With weights w_i and colours (n_i + 1) / 2, 2 C - (1 - T) is the sum of w_i n_i.
+    """
+    return F.normalize(2 * raster.color - (1 - raster.transmittance)[..., None], dim=-1)
+
+
+@torch.no_grad()
+def median_depth(painter: Painter, view: View, settings: PaintSettings) -> Float[Tensor, "h w"]:
+    """Camera z of the Gaussian at which half of each pixel is covered, world units: the last that is drawn
+    while the transmittance is above a half, as in 2DGS (Huang et al. 2024) and gsplat's `render_median`; 0
+    where nothing is.
+
+    By the torch rasterizer, on whatever device: gsplat's kernels give it for surfels alone, and for all of a
+    ray. Here a unit goes on from the transmittance that those in front leave, so that any division by
+    fragments gives the same.
+    """
+    rasterizer = _torch(painter.rasterizer)
+    like = {"device": painter.device, "dtype": view.viewmat.dtype}
+    left, depth = (
+        torch.ones((view.height, view.width), **like),
+        torch.zeros((view.height, view.width), **like),
+    )
+    seen_by = painter.frusta([(view, view.full)])
+    for unit in painter.order(painter.units(), view):
+        if float(left.max()) <= 0.5:
+            break
+        gaussians = painter.load(unit, seen_by=seen_by).gaussians
+        window = painter.span(unit, view, view.full) if unit else None
+        if len(gaussians):
+            left, depth = rasterizer.deepened(
+                gaussians, view, window, (left, depth), antialiased=settings.antialiased
+            )
+    return depth
+
+
+def _torch(rasterizer: Rasterizer) -> TorchRasterizer:
+    if isinstance(rasterizer, TorchRasterizer):
+        return rasterizer
+    return TorchRasterizer("never", primitive=rasterizer.primitive.name)

@@ -1,0 +1,91 @@
+"""What a model says of a whole picture: what nerfstudio's tools read, and what is drawn when one asks."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.render import Raster
+from abcd_ns.engine.train.step.batch import Batch, Rendered
+from abcd_ns.engine.types import Layer
+
+
+class Outputs(dict[str, Tensor]):
+    """Outputs by name, some of which are drawn when they are first read. Names are there from the start.
+
+    Args:
+        drawn: those that are there.
+        later: what draws the others.
+    """
+
+    def __init__(self, drawn: Mapping[str, Tensor], later: Mapping[str, Callable[[], Tensor]]) -> None:
+        # Last names first: nerfstudio's viewer splits its picture with the last one.
+        super().__init__({**dict.fromkeys(later), **drawn})
+        self._later = dict(later)
+
+    def draw(self, names: Iterable[str]) -> None:
+        """Draw these now, if there are such."""
+        for name in names:
+            if name in self._later:
+                self[name] = self._later.pop(name)()
+
+    def __getitem__(self, name: str) -> Tensor:
+        self.draw([name])
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """As of any dict."""
+        if name not in self:
+            return default
+        return self[name]
+
+    def items(self) -> Iterator[tuple[str, Tensor]]:
+        """All, drawn one after the other."""
+        return ((name, self[name]) for name in list(self))
+
+    def values(self) -> Iterator[Tensor]:
+        """All, drawn one after the other."""
+        return (value for _, value in self.items())
+
+
+def pictured(layer: Layer, raster: Raster, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
+    """A picture under splatfacto's names.
+
+    Args:
+        layer: its colours.
+        raster: its depth.
+    """
+    transmittance = layer.transmittance[..., None]
+    alpha = 1 - raster.transmittance[..., None]
+    # Where nothing is, splatfacto shows the farthest depth of the picture.
+    depth = torch.where(alpha > 0, raster.depth[..., None] / alpha.clamp_min(1e-10), raster.depth.max())
+    return {
+        "rgb": (layer.color + transmittance * background).clamp(0, 1),
+        "depth": depth,
+        "accumulation": 1 - transmittance,
+        "background": background.expand(*layer.color.shape),
+    }
+
+
+def rendered_outputs(batch: Batch, rendered: Rendered) -> dict[str, Any]:
+    """A training batch's pictures under the same names, in lists, and what they came from."""
+    return {
+        "rgb": list(rendered.pictures),
+        "accumulation": [1 - transmittance[..., None] for transmittance in rendered.transmittances],
+        "background": [sample.background for sample in batch.samples],
+        "batch": batch,
+        "rendered": rendered,
+    }
+
+
+def as_list(values: Tensor | list[Tensor]) -> list[Tensor]:
+    """Of one picture or of a batch's."""
+    return values if isinstance(values, list) else [values]
+
+
+def masked(pictures: list[Tensor], masks: list[Tensor | None]) -> list[Tensor]:
+    """Black where a picture has a mask that is false."""
+    pairs = zip(pictures, masks, strict=True)
+    return [picture if mask is None else picture * mask.to(picture.device) for picture, mask in pairs]
