@@ -211,7 +211,6 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
     """training_loop.train_step with a clock."""
     with clock.stage("plan and attach"):
         batch = coordinator.next_batch()
-    crew = coordinator.state.active.crew
     with clock.stage("photos"):
         photos = [_shown(sample, photo).to(coordinator.device) for sample in batch.samples]
     with clock.stage("render"):
@@ -228,7 +227,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
             optimizer.step()
     with clock.stage("density and settling"):
         coordinator.after_step(rendered, psnrs(rendered.pictures, photos))
-    clock.views += len(batch.samples) * crew
+    clock.views += len(batch.samples)
 
 
 def profile(coordinator: Coordinator, photo: PhotoReader, steps: int, top: int = 30) -> list[dict[str, Any]]:

@@ -3,11 +3,10 @@
 A thread does it, which lives as long as there is something to write and no longer. It is a daemon: a process
 that ends takes it along, which is as if the process had been killed.
 
-Crews fork the training process, and a thread does not live on in a fork. So a fork waits until the thread is
-between two jobs, and takes place with the lock held and free on both sides afterwards: no job, and nothing
-that a job holds within torch, the store or the C library, is ever cut in two. The child writes nothing. It
-reads what was in RAM when it was forked, which holds all that was not on disk, and else shards of blocks that
-have not changed since; those stay on disk as long as it lives, for only the end of the visit changes blocks.
+Processes that train a block are forked from this one, and a thread does not live on in a fork. So a fork
+waits until the thread is between two jobs, and takes place with the lock held and free on both sides
+afterwards: no job, and nothing that a job holds within torch, the store or the C library, is ever cut in
+two. The child writes nothing, and reads no store: it was handed all blocks.
 """
 
 import math

@@ -4,8 +4,6 @@ F, the live block, B and the background are composited first. So no layer hangs 
 valid whatever becomes of it. Transforms belong to the run and not to a block: of each photo there is one.
 """
 
-import math
-import mmap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -74,8 +72,8 @@ class Light:
         self._identity = identity.view(12, 1, 1, 1).expand(shape) if is_grid else identity
         # Less the identity and what they have in common, which is `_sum` by the number of views: no step
         # needs to touch more than its own.
-        self._changes = _shared((len(self._rows), *shape), torch.float32, self._home)
-        self._sum = _shared(shape, torch.float64, self._home)
+        self._changes = torch.zeros((len(self._rows), *shape), dtype=torch.float32, device=self._home)
+        self._sum = torch.zeros(shape, dtype=torch.float64, device=self._home)
         self._first, self._second = (torch.zeros_like(self._changes) for _ in BETAS)
         self._uses = torch.zeros(len(self._rows), device=self._home)
         self._stepped: set[int] = set()
@@ -229,16 +227,6 @@ def lit(
         return (of_pixels[..., :3] @ picture[..., None])[..., 0] + of_pixels[..., 3]
     matrix = transform.to(picture.dtype)
     return picture @ matrix[:, :3].T + matrix[:, 3]
-
-
-def _shared(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Zeros, which helpers that are forked see change; in RAM, a page takes none before it is written to."""
-    if device.type != "cpu":
-        return torch.zeros(shape, dtype=dtype, device=device)
-    size = math.prod(shape) * dtype.itemsize
-    return torch.frombuffer(mmap.mmap(-1, max(size, mmap.PAGESIZE)), dtype=dtype)[: math.prod(shape)].view(
-        shape
-    )
 
 
 def _name(part: int) -> str:
