@@ -54,3 +54,11 @@ def _shapes_are_checked(request):
     checks.update("jaxtyping_disable", folder.startswith(TRAIN))
     yield
     checks.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_writer_stays():
+    """nerfstudio keeps its writers in a list of the process; their folders are gone by the next module."""
+    yield
+    if (writer := sys.modules.get("nerfstudio.utils.writer")) is not None:
+        writer.EVENT_WRITERS.clear()

@@ -35,6 +35,7 @@ from abcd_ns.cluster.lease import (
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import StepTaken, WorkerSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, is_out_of_memory
 

@@ -272,7 +272,8 @@ def test_no_result_depends_on_the_ram_budget_and_none_exceeds_it(data, undisturb
     def measure(trainer) -> None:
         coordinator = trainer.pipeline.coordinator
         scene = coordinator.scene
-        blocks = [block.nbytes for block in scene._memory._rest.values()]
+        drawn, training = scene._memory._drawn, scene._memory._training
+        blocks = [drawn[name].nbytes + block.nbytes for name, block in training.items() if name in drawn]
         photos = trainer.pipeline.datamanager.train_dataset.photos.cached_bytes
         peaks.append(photos + coordinator.layer_bytes + scene.cached_bytes)
         largest.append(max(blocks, default=0))

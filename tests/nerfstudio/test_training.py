@@ -119,7 +119,7 @@ def test_composited_and_merged_pictures_of_a_checkpoint_agree(trained):
     merged = pipeline.model.get_outputs_for_camera(camera)
     pipeline.model.config.render = "composited"
     composited = pipeline.model.get_outputs_for_camera(camera)
-    assert set(merged) == {"rgb", "depth", "accumulation", "background"}
+    assert set(merged) == {"rgb", "depth", "accumulation", "background", "normals", "depth_median"}
     assert merged["depth"].shape == (HEIGHT, WIDTH, 1)
     # 1e-4 is what is left of the light where drawing stops.
     assert float((merged["rgb"] - composited["rgb"]).abs().max()) < 5e-4
