@@ -159,7 +159,7 @@ def test_one_who_is_heard_again_after_it_was_given_up_changes_nothing(steady, le
     os.kill(pid, signal.SIGSTOP)
     try:
         train(lent, photos)
-        outcome, _, _ = ray.get(late, timeout=60)
+        outcome = ray.get(late, timeout=60).outcome
     finally:
         os.kill(pid, signal.SIGCONT)
     assert outcome.done > 0
