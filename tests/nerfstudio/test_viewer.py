@@ -2,6 +2,7 @@
 
 import io
 import socket
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -100,14 +101,26 @@ def test_every_block_has_its_box(watched):
     assert {f"/abcd/label_{b + 1}" for b in range(BLOCKS)} <= labels
 
 
+def eventually(holds, seconds: float = 30.0) -> bool:
+    """Whether something comes to hold: the browser hears of it a little later."""
+    until = time.monotonic() + seconds
+    while not holds() and time.monotonic() < until:
+        time.sleep(0.1)
+    return holds()
+
+
 def test_the_active_block_was_marked_and_is_no_longer(watched):
     drawn = [m for m in watched.browser.of("MeshMessage") if m["name"].startswith("/abcd/block_")]
     colors = {m["color"] for m in drawn}
     assert len(colors) == 3  # untrained, active, done
     texts = [m["text"] for m in watched.browser.of("LabelMessage")]
     assert any(text.endswith("active") for text in texts)
-    last = {m["name"]: m["color"] for m in drawn}
-    assert len(set(last.values())) == 1
+
+    def last_colors():
+        drawn = [m for m in watched.browser.of("MeshMessage") if m["name"].startswith("/abcd/block_")]
+        return set({m["name"]: m["color"] for m in drawn}.values())
+
+    assert eventually(lambda: len(last_colors()) == 1)
 
 
 def texts(watched) -> list[str]:
@@ -121,9 +134,9 @@ def test_the_panel_reports_the_run(watched):
     assert any(text.startswith("**Block ") and " left" in text for text in said)
     assert any(text.startswith("Sweep ") for text in said)
     assert any("| RAM |" in text and "| layers |" in text for text in said)
-    table = [text for text in said if text.startswith("| # | state |")][-1]
-    assert table.count("| done |") == BLOCKS
-    assert any(text == "**Trained.**" for text in said)
+    tables = lambda: [text for text in texts(watched) if text.startswith("| # | state |")]
+    assert eventually(lambda: tables()[-1].count("| done |") == BLOCKS)
+    assert eventually(lambda: "**Trained.**" in texts(watched))
     assert any("](data:image/svg+xml;base64," in text for text in said)
 
 
