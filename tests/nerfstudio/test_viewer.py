@@ -138,9 +138,9 @@ def test_the_panel_reports_the_run(watched):
     def table() -> str:
         return [text for text in texts(watched) if text.startswith("| # | state |")][-1]
 
-    assert eventually(lambda: table().count("| done |") >= BLOCKS - 1)
+    assert eventually(lambda: table().count("| done |") == BLOCKS)
     assert eventually(lambda: "**Trained.**" in texts(watched))
-    assert any("](data:image/svg+xml;base64," in text for text in said)
+    assert eventually(lambda: any("](data:image/svg+xml;base64," in text for text in texts(watched)))
 
 
 def test_pictures_came_while_it_trained_and_show_the_scene(watched):
