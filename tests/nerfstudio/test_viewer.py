@@ -140,7 +140,6 @@ def test_the_panel_reports_the_run(watched):
 
     assert eventually(lambda: table().count("| done |") == BLOCKS)
     assert eventually(lambda: "**Trained.**" in texts(watched))
-    assert eventually(lambda: any("](data:image/svg+xml;base64," in text for text in texts(watched)))
 
 
 def test_pictures_came_while_it_trained_and_show_the_scene(watched):
