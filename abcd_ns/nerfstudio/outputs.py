@@ -16,13 +16,14 @@ class Outputs(dict[str, Tensor]):
     """Outputs by name, some of which are drawn when they are first read. Names are there from the start.
 
     Args:
-        drawn: those that are there.
+        drawn: those that are there; the first is what a viewer opens with.
         later: what draws the others.
     """
 
     def __init__(self, drawn: Mapping[str, Tensor], later: Mapping[str, Callable[[], Tensor]]) -> None:
-        # Last names first: nerfstudio's viewer splits its picture with the last one.
-        super().__init__({**dict.fromkeys(later), **drawn})
+        # nerfstudio's viewer opens with the first name, and splits its picture with the last one.
+        first = dict(list(drawn.items())[:1])
+        super().__init__({**first, **dict.fromkeys(later), **drawn})
         self._later = dict(later)
 
     def draw(self, names: Iterable[str]) -> None:

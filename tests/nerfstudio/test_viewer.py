@@ -2,7 +2,6 @@
 
 import io
 import socket
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -101,26 +100,14 @@ def test_every_block_has_its_box(watched):
     assert {f"/abcd/label_{b + 1}" for b in range(BLOCKS)} <= labels
 
 
-def eventually(holds, seconds: float = 30.0) -> bool:
-    """Whether something comes to hold: the browser hears of it a little later."""
-    until = time.monotonic() + seconds
-    while not holds() and time.monotonic() < until:
-        time.sleep(0.1)
-    return holds()
-
-
 def test_the_active_block_was_marked_and_is_no_longer(watched):
     drawn = [m for m in watched.browser.of("MeshMessage") if m["name"].startswith("/abcd/block_")]
     colors = {m["color"] for m in drawn}
     assert len(colors) == 3  # untrained, active, done
     texts = [m["text"] for m in watched.browser.of("LabelMessage")]
     assert any(text.endswith("active") for text in texts)
-
-    def last_colors():
-        drawn = [m for m in watched.browser.of("MeshMessage") if m["name"].startswith("/abcd/block_")]
-        return set({m["name"]: m["color"] for m in drawn}.values())
-
-    assert eventually(lambda: len(last_colors()) == 1)
+    last = {m["name"]: m["color"] for m in drawn}
+    assert len(set(last.values())) == 1
 
 
 def texts(watched) -> list[str]:
@@ -134,12 +121,17 @@ def test_the_panel_reports_the_run(watched):
     assert any(text.startswith("**Block ") and " left" in text for text in said)
     assert any(text.startswith("Sweep ") for text in said)
     assert any("| RAM |" in text and "| layers |" in text for text in said)
+    table = [text for text in said if text.startswith("| # | state |")][-1]
+    assert table.count("| done |") == BLOCKS
+    assert any(text == "**Trained.**" for text in said)
+    assert any("](data:image/svg+xml;base64," in text for text in said)
 
-    def table() -> str:
-        return [text for text in texts(watched) if text.startswith("| # | state |")][-1]
 
-    assert eventually(lambda: table().count("| done |") == BLOCKS)
-    assert eventually(lambda: "**Trained.**" in texts(watched))
+def test_the_viewer_opens_with_colours(watched):
+    """With the first of the model's outputs, and not with one that costs more to draw."""
+    control = watched.trainer.viewer_state.control_panel
+    assert control.output_render == "rgb"
+    assert control.split_output_render not in ("normals", "depth_median")
 
 
 def test_pictures_came_while_it_trained_and_show_the_scene(watched):
@@ -151,11 +143,11 @@ def test_the_user_sees_one_block_alone(watched):
     since = watched.browser.heard
     watched.choose("Block", "3")
     watched.choose("Show", Show.BLOCK.value)
-    alone = covered(watched.picture(lambda picture: 0 < covered(picture) < 0.998 * everything, since))
+    alone = covered(watched.picture(lambda picture: 0 < covered(picture) < 0.8 * everything, since))
     assert watched.trainer.pipeline.model.choice.block == 2
     since = watched.browser.heard
     watched.choose("Show", Show.COMPOSITE.value)
-    assert covered(watched.picture(lambda picture: covered(picture) > 1.001 * alone, since)) > alone
+    assert covered(watched.picture(lambda picture: covered(picture) > 1.1 * alone, since)) > alone
     watched.choose("Show", Show.EVERYTHING.value)
 
 
@@ -243,7 +235,7 @@ def test_ns_viewer_stays_on_this_machine_and_shows_blocks(finished):
     update = {"type": "GuiUpdateMessage", "id": show["id"], "updates": {"value": Show.BLOCK.value}}
     browser.send(update)
     browser.wait_for(
-        lambda m: m["type"] == "BackgroundImageMessage" and 0 < covered(pixels(m)) < 0.998 * everything, since
+        lambda m: m["type"] == "BackgroundImageMessage" and 0 < covered(pixels(m)) < 0.8 * everything, since
     )
     browser.close()
 
