@@ -163,6 +163,8 @@ class AbcdPanel(ViewerControl):
             sweep = sweep_line(history.sweep, history.sweep_visits, visits, of_sweep)
         self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)
         self._controls.progress(coordinator.progress, share)
+        if coordinator.finished:
+            history.end(seconds)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
             self._curve_drawn = self._updated
             self._controls.draw_curve(history.curve)

@@ -97,6 +97,11 @@ class RunHistory:
             case VisitEnded():
                 self._end_visit(event)
 
+    def end(self, seconds: float) -> None:
+        """The run is over: its curve ends where it does, however short it was."""
+        if self._recent:
+            self._add_point(seconds)
+
     def _begin(self, visit: VisitBegan) -> None:
         self.under_way[visit.visit], self.steps[visit.visit], self._crops[visit.visit] = visit, 0, []
 

@@ -112,6 +112,16 @@ def test_the_curve_has_a_point_every_other_second():
     assert history.curve[2][1] == pytest.approx(10 + 30.5)
 
 
+def test_the_curve_of_a_short_run_ends_where_it_does():
+    history = RunHistory()
+    for tick in range(3):
+        history.note(step(10.0 + tick), 0.5 * tick)
+    assert history.curve == [(0.0, 10.0)]
+    history.end(1.2)
+    history.end(1.3)  # nothing came after the end
+    assert history.curve == [(0.0, 10.0), (1.2, 11.5)]
+
+
 def test_a_long_curve_is_thinned_and_keeps_its_end():
     history = RunHistory()
     for tick in range(3 * MOST_POINTS):
