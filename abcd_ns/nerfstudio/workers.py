@@ -84,7 +84,8 @@ def dispatcher_for(
     on_gpu, run = config.machine.device_type == "cuda", local.run
     setup = setup_of(local, count, on_gpu)
     if config.pipeline.cluster is None and can_fork(run.device):
-        return Dispatcher(local, ForkedWorkers(count, VisitWorker(setup, run.rasterizer, target, run.device)))
+        forked = ForkedWorkers(count, VisitWorker(setup, run.rasterizer, target, run.device))
+        return Dispatcher(local, forked, lag=count)  # nothing is on its way for long: no slack is needed
     return Dispatcher(local, _ray_workers(setup, config, count, budget))
 
 
