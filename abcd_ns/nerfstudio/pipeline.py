@@ -33,7 +33,16 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
-from abcd_ns.nerfstudio.fit import FITTED, Demand, Fit, device_budget, find_fit, ram_budget, share_out
+from abcd_ns.nerfstudio.fit import (
+    FITTED,
+    SCAFFOLD,
+    Demand,
+    Fit,
+    device_budget,
+    find_fit,
+    ram_budget,
+    share_out,
+)
 from abcd_ns.nerfstudio.flags import named_too
 from abcd_ns.nerfstudio.inspection import factor_of
 from abcd_ns.nerfstudio.metrics import lpips_missing
@@ -254,10 +263,11 @@ class AbcdPipeline(VanillaPipeline):
     def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
         """The limits that were fitted to the device: as the run began, unless it goes on with a budget of
         its own."""
+        kept = {name: store.header.get(name, 0) for name in (*FITTED, SCAFFOLD)}
         if resumed and self.config.blocks == 0 and self.config.device_budget_gb > 0:
             blocks = BlockTree.from_json(store.header["tree"]).num_blocks
-            return self._fit(sum(map(store.counts, range(blocks))), blocks).limits
-        return {name: store.header.get(name, 0) for name in FITTED}
+            return {**kept, **self._fit(sum(map(store.counts, range(blocks))), blocks).limits}
+        return kept
 
     def _fit(self, points: int, blocks: int = 1) -> Fit:
         """How many blocks for a scene that goes on with so many Gaussians in so many blocks."""
@@ -313,18 +323,25 @@ class AbcdPipeline(VanillaPipeline):
         del everything
         blocks, fitted = self._first_cut(len(gaussians))
         tree = cut_space(gaussians, blocks, self.config.partition)
-        store = new_store(folder, {"tree": tree.to_json(), **fitted, **made_for.header()})
+        keep = self._scaffold_size(len(gaussians), tree.num_blocks, fitted)
+        header = {"tree": tree.to_json(), **fitted, SCAFFOLD: keep or 0}
+        store = new_store(folder, {**header, **made_for.header()})
         if training.recipe.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))
-            return store, False
-        warms_up = training.warmup > 0 and tree.num_blocks > 1 and not training.recipe.exact
-        # Blocks grow to hold as many Gaussians as there were points, and so may the scaffold.
-        grown = max(min(self._points, training.density.limit or self._points), len(gaussians))
-        largest = fitted["block_limit"] or -(-grown // tree.num_blocks)
-        training = replace(training, limits=replace(training.limits, **fitted))
-        keep = scaffold_size(training, largest, self._pixels) if warms_up else None
-        store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
+        else:
+            store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
         return store, False
+
+    def _scaffold_size(self, gaussians: int, blocks: int, fitted: dict[str, int]) -> int | None:
+        """Gaussians that the warm-up may have; None where there is no warm-up."""
+        training = self.config.training
+        if training.warmup == 0 or blocks == 1 or training.recipe.exact or training.recipe.overlap > 0:
+            return None
+        # Blocks grow to hold as many Gaussians as there were points, and so may the scaffold.
+        grown = max(min(self._points, training.density.limit or self._points), gaussians)
+        largest = fitted["block_limit"] or -(-grown // blocks)
+        training = replace(training, limits=replace(training.limits, **fitted))
+        return scaffold_size(training, largest, self._pixels)
 
     @property
     def _points(self) -> int:

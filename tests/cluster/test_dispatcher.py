@@ -18,7 +18,7 @@ from abcd_ns.engine.types import PARAM_NAMES
 from tests.cluster.conftest import in_process
 from tests.reference.scenes import whole_scene
 
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4, price=2.0)
 STILL = DensityConfig(strategy="off")
 
 

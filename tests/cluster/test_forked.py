@@ -25,7 +25,7 @@ from tests.cluster.test_dispatcher import equal
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
 
 pytestmark = pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4, price=2.0)
 
 
 def make_run(folder, views, workers_of, **options):

@@ -36,7 +36,7 @@ from abcd_ns.cluster import ray_workers  # noqa: E402 - needs Ray
 from abcd_ns.cluster.ray_workers import RayWorkers  # noqa: E402
 
 pytestmark = pytest.mark.timeout(240)
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4, price=2.0)
 
 
 TRAPS = {

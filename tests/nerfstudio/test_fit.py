@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
-from abcd_ns.engine.train.schedule import WARM_UP_BATCH
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import (
     FITTED,
@@ -153,7 +152,7 @@ def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
 @pytest.mark.parametrize("pixels", [160 * 106, PIXELS])
 def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixels):
     size = scaffold_size(TRAINING, block, pixels)
-    visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, WARM_UP_BATCH))
+    visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, 1))
     assert warm_up.bytes_for(size) <= visit.bytes_for(block) < warm_up.bytes_for(size + 1)
     assert size > block
 

@@ -27,12 +27,12 @@ class TrainingConfig:
     4 x 4 pixels (gsplat: 16 x 16). This much of their weight, in a picture of the block alone, may be nearer
     than the nearest that counts, and as much farther than the farthest; 0 counts all, which is exact and
     dear."""
-    warmup: float = 0.2
-    """Share of the run, at most, for which a scaffold is trained before blocks are: as many Gaussians, all
-    over the scene, as take no more memory than a visit to the largest block. 0 for none."""
+    warmup: float = 0.35
+    """Share of the run, at most, for which a scaffold is trained before blocks are: Gaussians all over the
+    scene, which grow to as many as take no more memory than a visit to the largest block. 0 for none."""
     batch: int = 0
-    """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and 4 elsewhere: with
-    small blocks a step's overhead would outweigh its work. The warm-up draws 2 at most."""
+    """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and in the
+    warm-up, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""

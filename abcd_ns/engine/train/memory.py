@@ -15,7 +15,7 @@ from abcd_ns.engine.layers.painter import LEAST_PASS
 from abcd_ns.engine.layers.visit_layers import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.schedule import views_per_step, views_per_warm_up_step
+from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 
 FLOAT = 4
@@ -121,7 +121,7 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
     """
     batches = (
         views_per_step(config.batch, 2, config.limits.batch_limit),
-        views_per_warm_up_step(config.batch, config.limits.batch_limit),
+        views_per_step(config.batch, 1),
     )
     options = {"crop_pixels": config.limits.crop_pixels, "primitive": config.primitive}
     visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, **options) for n in batches)

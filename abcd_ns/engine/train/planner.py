@@ -11,7 +11,7 @@ from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
 from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.store.settle import has_scaffold
-from abcd_ns.engine.store.special_blocks import WHOLE
+from abcd_ns.engine.store.special_blocks import RESERVE, WHOLE
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
@@ -23,7 +23,6 @@ from abcd_ns.engine.train.schedule import (
     plan_sweep,
     views_per_step,
     views_per_visit,
-    views_per_warm_up_step,
     visit_views,
 )
 from abcd_ns.engine.train.step.batch import Batch
@@ -98,9 +97,13 @@ class Planner:
         return lambda: live_gaussians(self._run.params)
 
     def room(self) -> int | None:
-        """What the limits of scene and block leave."""
-        live, blocks = len(self._run.params["means"]), self._scene.tree.num_blocks
-        return self._config.room(self._run.count(), live, blocks)
+        """What the limits of scene and block leave; in the warm-up what the memory of a visit holds."""
+        run, live = self._run, len(self._run.params["means"])
+        if run.active.is_whole:
+            waiting, limit = self._scene.rows(RESERVE), self._config.density.limit
+            most = self._config.limits.scaffold_gaussians
+            return (most if limit is None else min(most, limit - waiting)) - live
+        return self._config.room(run.count(), live, run.blocks)
 
     def compared(
         self,
@@ -116,8 +119,10 @@ class Planner:
         crops = {index: view.full for index, view in self._run.views.items()}
         geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
-        views = views_per_warm_up_step(self._config.batch, self._config.limits.batch_limit)
-        taken = min(taken, math.ceil(SCAFFOLD_PASSES * len(crops) / views))
+        if self._scene.rows(RESERVE):
+            taken = min(
+                taken, math.ceil(SCAFFOLD_PASSES * len(crops) / views_per_step(self._config.batch, 1))
+            )
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
     def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:

@@ -65,6 +65,7 @@ class Limits:
     """Pixels of a view that a step trains on at most. Of larger crops a step takes a random rectangle,
     another one each time, and weighs it by how much of the crop it leaves out."""
     scaffold_gaussians: int = 0
-    """Gaussians of the warm-up's scaffold; 0 takes as many as the memory of a visit allows."""
+    """Gaussians of the warm-up's scaffold at most, see `memory.scaffold_size`; 0 is as many as there are in
+    the beginning."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""

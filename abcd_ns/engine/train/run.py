@@ -83,6 +83,12 @@ class TrainingRun:
         self.density = DensityControl(for_blocks(self.config.density, blocks, self.rasterizer.primitive))
 
     @property
+    def blocks(self) -> int:
+        """That the scene is trained by: one in the warm-up, which trains all at once."""
+        active = self.state.active
+        return 1 if active is not None and active.is_whole else self.scene.tree.num_blocks
+
+    @property
     def progress(self) -> float:
         """Share of the run that is done, 0..1; what workers are at counts as done."""
         return self.budget.progress(self.state.planned, self.stopwatch.seconds)

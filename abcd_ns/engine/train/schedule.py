@@ -14,11 +14,9 @@ from functools import lru_cache
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
-WARM_UP_BATCH = 2
-"""Views in a step of the warm-up, at most: as many as the processors of a small machine, for more of them
-leave less room for Gaussians."""
 SCAFFOLD_PASSES = 24
-"""Uses of each view in the warm-up, at most: so few Gaussians soon are as good as they can be."""
+"""Uses of each view in the warm-up, at most, where it has no room for all Gaussians that there are: so few
+soon are as good as they can be."""
 
 LEAST_SIDE = 100
 """Of a reduced picture, pixels, at least: what is smaller has too little to teach."""
@@ -111,11 +109,6 @@ def views_per_step(batch: int, blocks: int, limit: int = 0) -> int:
         limit: `Limits.batch_limit`.
     """
     return batch or (1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH))
-
-
-def views_per_warm_up_step(batch: int, limit: int = 0) -> int:
-    """How many views a step of the warm-up draws, which only scenes of several blocks have."""
-    return min(views_per_step(batch, 2, limit), WARM_UP_BATCH)
 
 
 def views_per_visit(seen: int, most_seen: int, limit: int) -> int:

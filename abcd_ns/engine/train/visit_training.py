@@ -97,15 +97,13 @@ class VisitTraining:
         run.state.step += 1
         active.done += 1
         sound, psnr = run.health.end_step(psnrs)
-        self.live.count_step(self.batch, 0 if active.is_whole else taken)
-        if not active.is_whole:
-            infos = rendered.infos if sound else ()
-            clock = self.live.density_clock(taken, self.batch, self._visits.room())
-            self.live.refine(infos, clock)
-            if self.live.is_due_to_shed(taken):
-                self.live.shed()
-                self.live.lower_degrees()
-                self.live.hold_back_giants()
+        self.live.count_step(self.batch, taken)
+        clock = self.live.density_clock(taken, self.batch, self._visits.room())
+        self.live.refine(rendered.infos if sound else (), clock)
+        if self.live.is_due_to_shed(taken):
+            self.live.shed()
+            self.live.lower_degrees()
+            self.live.hold_back_giants()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _adapt_light(self, rendered: Rendered) -> None:
@@ -127,10 +125,10 @@ class VisitTraining:
     def finish(self) -> BlockState:
         """What the visit has made of its block, on the CPU; its layers go."""
         active = self.run.active
+        if not active.is_all:
+            self.live.shed()
+            self.live.lower_degrees()
         if not active.is_whole:
-            if not active.sole:
-                self.live.shed()
-                self.live.lower_degrees()
             self.live.count_visit()
         state = self.run.health.end_visit(active, self.live.detached)
         self.steps.end_visit()

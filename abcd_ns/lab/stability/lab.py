@@ -29,7 +29,7 @@ from abcd_ns.engine.train.memory import scaffold_size
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
-from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step, views_per_warm_up_step
+from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -180,10 +180,12 @@ class Lab:
         warms = config.warmup > 0 and tree.num_blocks > 1
         largest, pixels = math.ceil(len(start) / tree.num_blocks), max(v.width * v.height for v in views)
         keep = scaffold_size(config, largest, pixels) if warms else None
+        config = replace(config, limits=replace(config.limits, scaffold_gaussians=keep or 0))
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
         params, adam = optimizers or nothing_live(start.sh_degree)
         scene = StoredScene(tree, store)
-        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views)))
+        passes = SCAFFOLD_PASSES if keep is not None and keep < len(start) else math.inf
+        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), passes))
         return kind(TrainingRun(config, steps, scene, views, self.rasterizer, params, adam))
 
     def train(
@@ -255,11 +257,9 @@ class Lab:
         return float(torch.stack(errors).mean())
 
 
-def steps_for(
-    drawn: int, config: TrainingConfig, blocks: int, views: int, passes: int = SCAFFOLD_PASSES
-) -> int:
+def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, passes: float = math.inf) -> int:
     """Steps that draw about so many views of `views`, in the warm-up, of `passes` at most, and after it."""
-    batch, batch_warm = views_per_step(config.batch, blocks), views_per_warm_up_step(config.batch)
+    batch, batch_warm = views_per_step(config.batch, blocks), views_per_step(config.batch, 1)
     warmup = config.warmup if blocks > 1 else 0.0
     steps = drawn / (warmup * batch_warm + (1 - warmup) * batch)
     longest = passes * views / batch_warm

@@ -1,5 +1,7 @@
 """The warm-up: bounded, lossless, resumable."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -8,13 +10,13 @@ from abcd_ns.engine.gaussians.initialize import split_off
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scaffold import REVEALED_OPACITY, blocks_at_rest
 from abcd_ns.engine.store.special_blocks import RESERVE, in_order
-from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.schedule import WARM_UP_BATCH
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import make_coordinator, whole_scene
 
 STILL = DensityConfig(strategy="off")
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=1e-5, price=0.0)
 
 
 def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
@@ -59,9 +61,8 @@ def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, ph
     assert coordinator.state.active.is_whole
     assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == 30
     batch = coordinator.next_batch()
-    assert [sample.crop for sample in batch.samples] == [views[0].full] * WARM_UP_BATCH
+    assert [sample.crop for sample in batch.samples] == [views[0].full]
     assert all(sample.layers is None for sample in batch.samples)
-    assert len({sample.view.index for sample in batch.samples}) == WARM_UP_BATCH
 
 
 def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, start):
@@ -81,9 +82,9 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
         trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)
         assert bool(waits.any())
         assert not bool((waits & trained).any())
-        assert state.clocks.adam_views == 10 * WARM_UP_BATCH
+        assert state.clocks.adam_views == 10
         assert state.clocks.visits == 0
-        assert state.clocks.steps == 0
+        assert state.clocks.steps == 10
     assert coordinator.count() == 120
     train(coordinator, photos)
     assert [event.block for event in begun][:2] != [None, None]
@@ -145,27 +146,70 @@ def test_no_more_is_live_than_in_the_largest_block(tmp_path, views, photos, star
     assert most <= 32  # a migrant or two
 
 
-def test_density_controls_clock_starts_when_the_warm_up_is_over(tmp_path, views, photos, start):
+def test_density_controls_clock_starts_anew_when_the_warm_up_is_over(
+    tmp_path, views, photos, start, monkeypatch
+):
     coordinator = make_coordinator(
         tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.5, density=STILL
     )
     found = []
-    watched = coordinator.density.after_step
 
-    def watch(params, optimizers, growth, infos, clock, wide):
+    def watch(_control, _params, _optimizers, growth, _infos, clock, _wide):
         found.append(clock.progress)
-        return watched(params, optimizers, growth, infos, clock, wide)
+        return growth
 
-    coordinator.density.after_step = watch
+    monkeypatch.setattr(DensityControl, "after_step", watch)
     train(coordinator, photos)
-    assert found == pytest.approx([(step + 1) / 20 for step in range(20)])
+    warm_up, blocks = ([(step + 1) / steps for step in range(20)] for steps in (40, 20))
+    assert found == pytest.approx(warm_up + blocks)
 
 
-@pytest.mark.parametrize(("passes", "expected"), [(1, 3), (2, 5), (24, 25)])
+@pytest.mark.parametrize("most", [0, 125, 400])
+def test_the_scaffold_grows_while_there_is_room_for_it(tmp_path, views, photos, start, most):
+    """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
+    coordinator = make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=4,
+        steps=60,
+        scaffold=len(start),
+        scaffold_gaussians=most,
+        warmup=0.5,
+        density=GROWING,
+    )
+    train(coordinator, photos, steps=29)
+    live = len(coordinator.params["means"])
+    assert live == coordinator.count()
+    assert live == most if most == 125 else live > 125 if most else live <= len(start)
+    train(coordinator, photos, steps=1)
+    assert coordinator.state.active is None
+    assert coordinator.count() == live
+    assert coordinator.scene.clocks(0).refined > 0
+
+
+def test_a_limit_on_gaussians_counts_those_that_wait(tmp_path, views, photos, start):
+    density = replace(GROWING, max_gaussians=len(start))
+    coordinator = make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=4,
+        steps=60,
+        scaffold=60,
+        scaffold_gaussians=100,
+        warmup=0.5,
+        density=density,
+    )
+    train(coordinator, photos, steps=29)
+    assert len(coordinator.params["means"]) <= 60
+
+
+@pytest.mark.parametrize(("passes", "expected"), [(1, 5), (2, 10), (24, 25)])
 def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     tmp_path, views, photos, start, monkeypatch, passes, expected
 ):
-    """Growing begins then, and not only when the share of the run is over that it might have taken."""
+    """Where it has no room for all: then, and not only when its share of the run is over."""
     monkeypatch.setattr("abcd_ns.engine.train.planner.SCAFFOLD_PASSES", passes)
     coordinator = make_coordinator(
         tmp_path,

@@ -252,7 +252,7 @@ def test_events_tell_the_whole_story(tmp_path, views, photos, start):
 
 def test_a_limit_on_gaussians_is_kept_at_every_step(tmp_path, views, photos, start):
     limit = len(start) + 15
-    density = dataclasses.replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0)
+    density = dataclasses.replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0, price=0.0)
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=60, density=density)
     counts = []
     while not coordinator.finished:

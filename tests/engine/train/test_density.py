@@ -235,9 +235,7 @@ def test_covariances_against_the_definition():
 @pytest.mark.parametrize(("blocks", "given", "expected"), [(1, 0, 100), (8, 0, 30), (1, 7, 7), (8, 7, 7)])
 def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given, expected):
     config = DensityConfig(refine_every=given, refine_stop=0.3)
-    price = 8.0 if blocks == 1 else 2.0
-    assert for_blocks(config, blocks) == replace(config, refine_every=expected, price=price)
-    assert for_blocks(replace(config, price=3.0), blocks).price == 3.0
+    assert for_blocks(config, blocks) == replace(config, refine_every=expected)
 
 
 def test_surfels_grow_by_plain_gradients_and_2dgs_threshold():

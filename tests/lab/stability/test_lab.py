@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.schedule import WARM_UP_BATCH
 from abcd_ns.lab.stability.lab import Lab, make_stage, steps_for
 
 
@@ -21,8 +20,8 @@ def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, passes, blocks):
     config = TrainingConfig(warmup=0.2, batch=0)
     steps = steps_for(drawn, config, blocks, views, passes)
     batch, share = (1, 0.0) if blocks == 1 else (4, config.warmup)
-    warm = min(math.ceil(share * steps), math.ceil(passes * views / WARM_UP_BATCH))
-    assert warm * WARM_UP_BATCH + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)
+    warm = min(math.ceil(share * steps), math.ceil(passes * views))
+    assert warm + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)
 
 
 def test_a_labs_seed_is_that_of_its_trainings_unless_they_name_one(tmp_path):

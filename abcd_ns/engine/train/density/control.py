@@ -31,8 +31,6 @@ GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
 COUNTED = (*GRADIENTS, *WEIGHED)
 REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
-PRICE_SCENE, PRICE_BLOCK = 8.0, 2.0
-"""What a view of a block takes hangs on its pixels more than on its Gaussians: fewer win fewer steps."""
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
 """Shares of a visit after which a block among others is neither refined nor reset."""
 CULL_SCALE = 0.5
@@ -76,10 +74,10 @@ class DensityConfig:
     use_absgrad: bool = True
     """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum. Surfels have no such
     sums: they are judged by a quarter of the threshold."""
-    price: float | None = None
+    price: float = 8.0
     """Pixels that a Gaussian must fill (sum of alpha T) in all views of its block together, once growth ends;
     those that fill less go, and those that fill less than four times as many do not grow (`default`
-    strategy). None takes 8 where the scene is one block, and 2 elsewhere; 0 keeps everything."""
+    strategy). 0 keeps everything."""
     max_gaussians: int = 0
     """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
     to begin with, a random choice of them begins."""
@@ -97,9 +95,8 @@ def for_blocks(config: DensityConfig, blocks: int, primitive: Primitive = SPLATS
     if config.use_absgrad and not primitive.has_absgrad:
         plain = config.densify_grad_thresh * PLAIN_GRADIENT
         config = replace(config, use_absgrad=False, densify_grad_thresh=plain)
-    every, price = (REFINE_EVERY_SCENE, PRICE_SCENE) if blocks == 1 else (REFINE_EVERY_BLOCK, PRICE_BLOCK)
-    given = every if config.refine_every == 0 else config.refine_every
-    return replace(config, refine_every=given, price=price if config.price is None else config.price)
+    every = REFINE_EVERY_SCENE if blocks == 1 else REFINE_EVERY_BLOCK
+    return replace(config, refine_every=config.refine_every or every)
 
 
 @dataclass(frozen=True)
@@ -146,11 +143,7 @@ class DensityControl:
     @property
     def weighs(self) -> bool:
         """Whether the rasterizer must leave `weights`."""
-        return self.config.strategy == "default" and self._price > 0
-
-    @property
-    def _price(self) -> float:
-        return self.config.price or 0.0
+        return self.config.strategy == "default" and self.config.price > 0
 
     def before_backward(self, infos: Infos) -> None:
         """Keep the gradient of the projected means, by which the default strategy judges."""
@@ -270,7 +263,7 @@ class DensityControl:
         """
         if not self.weighs or any(name not in growth for name in WEIGHED):
             return growth
-        price = price_at(self._price, progress, self.config.refine_stop)
+        price = price_at(self.config.price, progress, self.config.refine_stop)
         drop = worthless(growth, views, price)
         growth = faded(growth, views)
         if bool(drop.any()):
@@ -317,7 +310,7 @@ class DensityControl:
         """The statistics without the gradients of those that fill too little to become two."""
         if not self.weighs or any(name not in growth for name in WEIGHED):
             return growth
-        grows = may_grow(growth, views, self._price)
+        grows = may_grow(growth, views, self.config.price)
         return {**growth, "grad2d": torch.where(grows, growth["grad2d"], 0.0)}
 
     def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:

@@ -18,7 +18,6 @@ from abcd_ns.engine.train.schedule import (
     endless_order,
     view_order,
     views_per_step,
-    views_per_warm_up_step,
 )
 from abcd_ns.engine.train.step.batch import Backgrounds, Batch, Rendered, Sample, part_to_draw
 from abcd_ns.engine.train.step.weighing import weighed
@@ -43,10 +42,8 @@ class StepDrawing:
     @property
     def batch(self) -> int:
         """Views in a step of the visit that is under way."""
-        config, active = self._run.config, self._run.state.active
-        if active is not None and active.is_whole:
-            return views_per_warm_up_step(config.batch, config.limits.batch_limit)
-        return views_per_step(config.batch, self._run.scene.tree.num_blocks, config.limits.batch_limit)
+        config = self._run.config
+        return views_per_step(config.batch, self._run.blocks, config.limits.batch_limit)
 
     def begin_visit(self, active: ActiveVisit) -> None:
         """Draw layers; the block is live."""

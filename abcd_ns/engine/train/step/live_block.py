@@ -65,7 +65,7 @@ class LiveBlock:
 
         Args:
             views: that the step was made for.
-            taken: that count for density control, which leaves the warm-up alone.
+            taken: that were drawn.
         """
         clocks = self.clocks
         self.clocks = replace(clocks, adam_views=clocks.adam_views + views, steps=clocks.steps + taken)
@@ -122,13 +122,13 @@ class LiveBlock:
         return run.state.views.get(active.geometry.block, len(active.geometry.views))
 
     def is_due_to_shed(self, taken: int) -> bool:
-        """Whether the one block of the scene has been drawn often enough since it last shed.
+        """Whether all that is trained at once has been drawn often enough since it last shed.
 
         Args:
             taken: the last step's views.
         """
         every, steps = PASSES * len(self._run.active.geometry.views), self.clocks.steps
-        return self._run.active.sole and steps // every > (steps - taken) // every
+        return self._run.active.is_all and steps // every > (steps - taken) // every
 
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
         """All that decides whether to refine after a step.
@@ -139,7 +139,7 @@ class LiveBlock:
             room: Gaussians that may be added.
         """
         run, active, views = self._run, self._run.active, self._views
-        blocks = run.scene.tree.num_blocks
+        blocks = run.blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
         if blocks > 1:
             views = min(views, active.steps * batch)  # once a visit, even with thousands of photos
