@@ -1,4 +1,5 @@
-"""What a mesh of `abcd mesh` looks like, and how far from it the points of the photos' model lie.
+"""What a mesh of `abcd mesh` looks like, how far from it the points of the photos' model lie, and how it
+turns from the planes through these.
 
     python -m benchmarks.mesh outputs/SCENE/METHOD/TIME castle.ply --data SCENE --view 3 --out mesh.png
 
@@ -15,12 +16,14 @@ import torch
 import tyro
 from open3d import core
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from abcd_ns.cli.export.command import to_data
 from abcd_ns.cli.report.run_folder import pipeline_config, read_settings
 from abcd_ns.engine.types import View
 from abcd_ns.nerfstudio.views import views_of
 
+NEIGHBOURS = 16
 LAMP = np.array([-0.4, -0.4, -0.8])
 """Towards it, from what is lit, in the camera's frame."""
 
@@ -74,10 +77,25 @@ def main(
     picture.quantize(colors, dither=Image.Dither.NONE).save(out, optimize=True)
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(surface))
-    points = core.Tensor(dataset.metadata["points3D_xyz"].numpy())
-    off = scene.compute_distance(points).numpy() * to.scale
+    points = dataset.metadata["points3D_xyz"].numpy()
+    closest = scene.compute_closest_points(core.Tensor(points))
+    off = np.linalg.norm(closest["points"].numpy() - points, axis=1) * to.scale
     half, most = np.quantile(off, [0.5, 0.9])
     print(f"{len(off):,} points: half are within {half:.3g} of the mesh, nine of ten within {most:.3g}")
+    turned = angles(closest["primitive_normals"].numpy(), points)
+    print(
+        f"where it is closest to these, half of it is within {np.median(turned):.3g} degrees of their planes"
+    )
+
+
+def angles(normals: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Degrees between each normal and that of the plane through a point's neighbours: across it is the
+    thinnest principal axis of these NEIGHBOURS points."""
+    _, near = cKDTree(points).query(points, k=NEIGHBOURS)
+    off = points[near] - points[near].mean(axis=1, keepdims=True)
+    across = np.linalg.eigh(np.swapaxes(off, 1, 2) @ off)[1][..., 0]
+    cosines = np.abs((across * normals).sum(axis=1)) / (np.linalg.norm(normals, axis=1) + 1e-12)
+    return np.degrees(np.arccos(cosines.clip(0, 1)))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import torch
 from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, levels_of
+from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, fewest_blocks, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 
@@ -178,7 +178,7 @@ def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
         if _needs(demand, batch, training.limits.crop_pixels, levels=0).step_bytes <= room:
             return batch, training.limits.crop_pixels
     batch = views[-1]
-    of_a_pixel = DeviceNeeds(1, batch).step_bytes
+    of_a_pixel = DeviceNeeds(1, batch, drawings=drawings_of(training)).step_bytes
     return batch, training.limits.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
 
 
@@ -191,7 +191,7 @@ def _fewer(views: int) -> Iterator[int]:
 
 def _needs(demand: Demand, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
     training, keeps = demand.training, not demand.on_cpu
-    options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive)
+    options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive, drawings_of(training))
     return DeviceNeeds(demand.pixels, batch, *options)
 
 

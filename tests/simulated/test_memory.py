@@ -12,9 +12,10 @@ import pytest
 from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, projected_bytes
+from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, levels_of, projected_bytes
+from abcd_ns.engine.train.step import drawing
 from abcd_ns.engine.train.training_loop import train
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, training_config
 from tests.reference.simulated_device import DEVICE
 
 LAVISH = 4.0
@@ -43,24 +44,34 @@ def peak_of_steps(counts, folder, **options) -> tuple[int, int]:
     return counts.peak_bytes, coordinator.count()
 
 
-@pytest.mark.parametrize(("batch", "light"), [(1, "none"), (2, "none"), (1, "bilateral")])
-def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch, light):
-    options = {"gaussians": 40, "batch": batch, "density": STILL, "light": light}
+PLAIN, LIT = {"density": STILL}, {"density": STILL, "light": "bilateral"}
+CONSISTENT = {"density": STILL, "primitive": "2dgs", "normal_consistency": 0.05}
+
+
+@pytest.mark.parametrize(("batch", "given"), [(1, PLAIN), (2, PLAIN), (1, LIT), (1, CONSISTENT)])
+def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, monkeypatch, batch, given):
+    monkeypatch.setattr(drawing, "BEGINS", 0.0)
+    options = {"gaussians": 40, "batch": batch, **given}
     (small, _), (large, _) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(w), width=w, **options) for w in (48, 96)
     )
-    model = [DeviceNeeds(width**2, batch, levels=0).step_bytes for width in (48, 96)]
+    drawings = drawings_of(training_config(**given))
+    model = [DeviceNeeds(w**2, batch, levels=0, drawings=drawings).step_bytes for w in (48, 96)]
     assert large - small <= model[1] - model[0] <= LAVISH * (large - small)
 
 
-@pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
-@pytest.mark.parametrize("density", [STILL, GROWING], ids=["still", "growing"])
-def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, density, primitive):
-    options = {"width": 32, "batch": 1, "density": density, "primitive": primitive}
+GROWING_SURFELS = {"density": GROWING, "primitive": "2dgs"}
+
+
+@pytest.mark.parametrize("given", [PLAIN, {"density": GROWING}, GROWING_SURFELS, CONSISTENT])
+def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, monkeypatch, given):
+    monkeypatch.setattr(drawing, "BEGINS", 0.0)
+    options = {"width": 32, "batch": 1, **given}
     (small, few), (large, many) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, **options) for n in (300, 1200)
     )
-    model = DeviceNeeds(32**2, 1, levels=0, primitive=primitive).gaussian_bytes * (many - few)
+    needs = {"primitive": given.get("primitive", "3dgs"), "drawings": drawings_of(training_config(**given))}
+    model = DeviceNeeds(32**2, 1, levels=0, **needs).gaussian_bytes * (many - few)
     assert large - small <= model <= LAVISH * (large - small)
 
 

@@ -53,6 +53,9 @@ class TrainingConfig:
     """Highest degree of spherical harmonics."""
     ssim_lambda: float = 0.2
     """Weight of 1 - SSIM in the loss; the rest is the difference of pixels."""
+    normal_consistency: float = 0.0
+    """Weight of 2DGS's normal consistency in the loss of surfels, from a quarter of the run on: smoother
+    surfaces, worse pictures. 2DGS has 0.05; 0 for none."""
     antialiased: bool = False
     """Scale opacities by gsplat's compensation for its low-pass filter."""
     background: Literal["random", "black", "white"] = "random"
@@ -96,6 +99,7 @@ class TrainingConfig:
             ("warmup", 0 <= self.warmup < 1, "from 0 to below 1"),
             ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
             ("influence-share", self.influence_share > 0, "above 0"),
+            ("normal-consistency", self.normal_consistency >= 0, "0 or more"),
             ("window-weight", 0 <= self.window_weight < 1, "from 0 to below 1"),
         ):
             if not fits:
@@ -104,6 +108,11 @@ class TrainingConfig:
         if self.primitive == "2dgs" and (self.antialiased or self.poses != "off"):
             name = "antialiased" if self.antialiased else "poses"
             raise UserError(f"--pipeline.training.{name} is for 3dgs: gsplat's surfels do not have it.")
+        if self.normal_consistency > 0 and (self.primitive == "3dgs" or recipe.exact):
+            raise UserError(
+                "--pipeline.training.normal-consistency is for surfels that are trained by visits: set "
+                "--pipeline.training.primitive 2dgs, and take another method than abcd-exact."
+            )
         if self.light != "none" and recipe.exact:
             raise UserError("--pipeline.training.light is for methods that train by visits, not abcd-exact.")
         if self.poses != "off" and (recipe.exact or recipe.overlap > 0):

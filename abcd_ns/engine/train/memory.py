@@ -48,6 +48,7 @@ class DeviceNeeds:
         keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
             budget of its own for them.
         primitive: what a Gaussian is.
+        drawings: of each view in a step; see `drawings_of`.
     """
 
     pixels: int
@@ -57,6 +58,7 @@ class DeviceNeeds:
     levels: int = 2
     keeps: bool = True
     primitive: PrimitiveName = "3dgs"
+    drawings: int = 1
 
     @property
     def parameter_bytes(self) -> int:
@@ -67,13 +69,13 @@ class DeviceNeeds:
     def gaussian_bytes(self) -> int:
         """Of one Gaussian in training: parameters, gradient, two moments; three of them once more while the
         block is refined; and what its views' drawings hold."""
-        return 7 * self.parameter_bytes + self.batch * projected_bytes(self.primitive)
+        return 7 * self.parameter_bytes + self.batch * self.drawings * projected_bytes(self.primitive)
 
     @property
     def step_bytes(self) -> int:
         """Of a step's pictures."""
         drawn = min(self.crop_pixels or self.pixels, self.pixels)
-        return self.batch * drawn * PIXEL_FLOATS * FLOAT
+        return self.batch * self.drawings * drawn * PIXEL_FLOATS * FLOAT
 
     @property
     def drawing_bytes(self) -> int:
@@ -123,11 +125,20 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
         views_per_step(config.batch, 2, config.limits.batch_limit),
         views_per_step(config.batch, 1),
     )
-    options = {"crop_pixels": config.limits.crop_pixels, "primitive": config.primitive}
+    options = {
+        "crop_pixels": config.limits.crop_pixels,
+        "primitive": config.primitive,
+        "drawings": drawings_of(config),
+    }
     visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, **options) for n in batches)
     # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
     room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
     return config.limits.scaffold_gaussians or room // warm_up.gaussian_bytes
+
+
+def drawings_of(config: TrainingConfig) -> int:
+    """How often a step draws each of its views."""
+    return 2 if config.normal_consistency > 0 else 1
 
 
 def levels_of(blocks: int) -> int:

@@ -20,6 +20,7 @@ from abcd_ns.engine.train.schedule import (
     views_per_step,
 )
 from abcd_ns.engine.train.step.batch import Backgrounds, Batch, Rendered, Sample, part_to_draw
+from abcd_ns.engine.train.step.normal_consistency import BEGINS, normal_consistency
 from abcd_ns.engine.train.step.weighing import weighed
 from abcd_ns.engine.types import Crop, Gaussians, View
 
@@ -97,17 +98,21 @@ class StepDrawing:
         pictures: Sequence[Float[Tensor, "_h _w 3"]],
         photos: Sequence[Float[Tensor, "_h _w 3"]],
     ) -> Float[Tensor, ""]:
-        """The loss of a step: photometric over the crops, the mean of the samples', plus what the density
-        strategy asks for."""
+        """The loss of a step: photometric over the crops, the mean of the samples', plus what surfels and the
+        density strategy ask for."""
         run = self._run
         losses = batch.losses(pictures, photos, run.config)
-        photometric = sum(losses[1:], start=losses[0]) / len(losses)
+        loss = sum(losses[1:], start=losses[0]) / len(losses)
         run.health.note(
-            [(s.view.index, loss.detach()) for s, loss in zip(batch.samples, losses, strict=True)]
+            [(s.view.index, found.detach()) for s, found in zip(batch.samples, losses, strict=True)]
         )
-        if run.config.density.strategy != "mcmc":
-            return photometric
-        return photometric + run.density.regularisation(run.params, run.count())
+        if run.config.normal_consistency > 0 and run.share >= BEGINS:
+            surfels = live_gaussians(run.params)
+            off = normal_consistency(surfels, batch.samples, run.rasterizer)
+            loss = loss + run.config.normal_consistency * off
+        if run.config.density.strategy == "mcmc":
+            loss = loss + run.density.regularisation(run.params, run.count())
+        return loss
 
     def whole(self, view: int) -> Sample:
         """All that a view shows of the block in this visit."""
