@@ -80,6 +80,9 @@ class DensityConfig:
     """Pixels that a Gaussian must fill (sum of alpha T) in all views of its block together, once growth ends;
     those that fill less go, and those that fill less than four times as many do not grow (`default`
     strategy). None takes 8 where the scene is one block, and 2 elsewhere; 0 keeps everything."""
+    last_loss: float = 0.05
+    """dB of training views' mean PSNR that a last shedding may cost when the run is complete: it takes out
+    what these views miss least, where Gaussians have a price (`default` strategy). 0 for none."""
     max_gaussians: int = 0
     """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
     to begin with, a random choice of them begins."""

@@ -1,0 +1,94 @@
+"""When a run is complete, what its training views hardly miss goes, and no more than they can spare."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from abcd_ns.engine.events import Shedding, ShedAtEnd
+from abcd_ns.engine.render.loss import psnr
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.types import Gaussians
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, price=1e-9)
+"""Nothing grows, and training sheds nobody that fills anything."""
+VIEWS, FAINT = 5, 30
+"""Fewer views than a last shedding looks at: it looks at all of them."""
+
+
+def scene(seed: int = 1) -> Gaussians:
+    """The last FAINT of them are next to nothing."""
+    gaussians = random_gaussians(120, seed=seed, size=0.12)
+    gaussians.opacities[-FAINT:] = -5.0
+    return gaussians
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return ring_of_views(VIEWS)
+
+
+@pytest.fixture(scope="module")
+def pictured(ring):
+    return Photos(random_gaussians(150, seed=7, size=0.12), ring)
+
+
+def completed(folder, ring, pictured, **options):
+    """A complete run, and what it said of its last shedding."""
+    options = {"blocks": 1, "steps": 40, "density": STILL, "batch": 1, "background": "black", **options}
+    target = lambda sample: (pictured(sample.view.index, sample.crop), None)  # noqa: E731
+    coordinator = make_coordinator(folder, scene(), ring, target=target, **options)
+    told: list = []
+    coordinator.announce.subscribe(told.append)
+    train(coordinator, pictured)
+    return coordinator, told
+
+
+def mean_psnr(coordinator, ring, pictured) -> float:
+    """Of the whole scene, drawn at once."""
+    gaussians, draw = whole_scene(coordinator), coordinator.run.rasterizer
+    with torch.no_grad():
+        pictures = [draw(gaussians, view, sh_degree=gaussians.sh_degree).color.clamp(0, 1) for view in ring]
+    return float(
+        sum(psnr(p, pictured.images[v.index]) for p, v in zip(pictures, ring, strict=True)) / len(ring)
+    )
+
+
+def at_end(told) -> ShedAtEnd:
+    (event,) = [event for event in told if isinstance(event, ShedAtEnd)]
+    return event
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"blocks": 4}, {"blocks": 4, "pass_gaussians": 1}, {"primitive": "2dgs"}]
+)
+def test_as_many_go_as_training_views_can_spare(tmp_path, ring, pictured, options):
+    all_of_it, _ = completed(
+        tmp_path / "all", ring, pictured, **options, density=replace(STILL, last_loss=0.0)
+    )
+    coordinator, told = completed(tmp_path / "shed", ring, pictured, **options)
+    found = at_end(told)
+    assert found.gone >= FAINT // 2
+    assert (
+        coordinator.count()
+        == found.gaussians
+        == len(whole_scene(coordinator))
+        == all_of_it.count() - found.gone
+    )
+    # By units a picture is the merged one, but for the 1e-4 of light at which drawing stops.
+    assert mean_psnr(all_of_it, ring, pictured) == pytest.approx(found.before, abs=0.005)
+    assert mean_psnr(coordinator, ring, pictured) == pytest.approx(found.after, abs=0.005)
+    assert found.before - found.after <= 0.05
+    assert not [event for event in told[told.index(found) :] if isinstance(event, Shedding)]
+
+
+@pytest.mark.parametrize("loss", [0.01, 0.3, 3.0])
+def test_the_more_it_may_cost_the_more_go(tmp_path, ring, pictured, loss):
+    counts = []
+    for each in (loss, 2 * loss):
+        _, told = completed(tmp_path / f"{each}", ring, pictured, density=replace(STILL, last_loss=each))
+        assert at_end(told).before - at_end(told).after <= each
+        counts.append(at_end(told).gone)
+    assert counts[0] <= counts[1] > 0
