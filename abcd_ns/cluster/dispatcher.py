@@ -107,6 +107,8 @@ class Dispatcher(Trainer):
                 self._hear(report)
             self.announce(WorkersSeen(tuple(self.workers.seen())))
         self._counted += 1
+        if self.finished:
+            self._local.shed_at_end()
 
     @property
     def finished(self) -> bool:

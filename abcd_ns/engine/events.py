@@ -136,6 +136,31 @@ class WorkerLost:
 
 
 @dataclass(frozen=True)
+class Shedding:
+    """The run is complete but for its last shedding, which draws training views again and again."""
+
+    done: int
+    total: int
+    """Times."""
+
+
+@dataclass(frozen=True)
+class ShedAtEnd:
+    """The last shedding is over."""
+
+    gone: int
+    """Gaussians that were taken out."""
+    gaussians: int
+    """That are left in the whole scene."""
+    views: int
+    """Training views by which it was judged how many might go."""
+    before: float
+    """Mean PSNR of these, dB."""
+    after: float
+    """The same without who is gone."""
+
+
+@dataclass(frozen=True)
 class HeldOutScored:
     """Whoever runs the training has looked at views that are not trained on; means over them."""
 
@@ -156,6 +181,8 @@ Event = (
     | VisitUndone
     | WorkersSeen
     | WorkerLost
+    | Shedding
+    | ShedAtEnd
     | HeldOutScored
 )
 Listener = Callable[[Event], None]

@@ -32,6 +32,7 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
     return [
         *_quality(story, held_out),
         Fact("Gaussians", f"{story.gaussians:,}", more="" if limit is None else f"limit {limit:,}"),
+        *_shed_at_end(story),
         *_parameters(run),
         Fact("blocks", f"{story.blocks:,}", more=rounds if visits else ""),
         Fact("steps", f"{story.step:,}"),
@@ -43,6 +44,14 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
         *_workers(story),
         *_memory(run),
     ]
+
+
+def _shed_at_end(story: Story) -> list[Fact]:
+    if (shed := story.shed_at_end) is None:
+        return []
+    share = shed.gone / max(shed.gone + shed.gaussians, 1)
+    cost = f"{share:.0%}, for {shed.before - shed.after:.2f} dB of {_count(shed.views, 'training view')}"
+    return [Fact("shed at the end", f"{shed.gone:,}", more=cost)]
 
 
 def _parameters(run: RunFolder) -> list[Fact]:

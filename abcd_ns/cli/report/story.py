@@ -16,6 +16,7 @@ from abcd_ns.nerfstudio.run.log_lines import (
     HeldOutLine,
     Line,
     SampleLine,
+    ShedAtEndLine,
     SweepEndLine,
     TrainingLine,
     VisitEndLine,
@@ -64,6 +65,8 @@ class Story:
     """Those with a PSNR."""
     workers: tuple[WorkerLine, ...]
     """At the end; none where one process trained."""
+    shed_at_end: ShedAtEndLine | None
+    """The last; None where the run is not complete, or nothing was to go."""
     end: EndLine | None
     """None where the run is still going on, or was killed."""
     moments: tuple[tuple[int, float], ...]
@@ -130,6 +133,7 @@ def read_story(path: Path) -> Story:
         sweeps=_of(lines, SweepEndLine),
         workers=_of(lines, WorkerLine),
         held_out=tuple(line for line in _of(lines, HeldOutLine) if line.psnr is not None),
+        shed_at_end=next(reversed(_of(lines, ShedAtEndLine)), None),
         end=ends[-1] if ends else None,
         moments=tuple((line.step, line.seconds) for line in lines),
     )

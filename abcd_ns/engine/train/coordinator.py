@@ -22,6 +22,7 @@ from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, Target
+from abcd_ns.engine.train.step.last_shedding import LastShedding
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.trainer import Trainer
@@ -34,7 +35,7 @@ class Coordinator(Trainer):
     Args:
         visits: decides which; None for ABCD's own.
         source: gives visits their layers; None for the run's scene, and little room.
-        target: gives what a sample is trained on; needed where poses are refined.
+        target: gives what a sample is trained on; needed where poses are refined, and for a last shedding.
         live: the block in training; None for one that nobody else looks after.
     """
 
@@ -52,6 +53,7 @@ class Coordinator(Trainer):
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)
+        self._last = None if target is None else LastShedding(run, target)
 
     # -- a step --------------------------------------------------------------------------------------
 
@@ -98,6 +100,8 @@ class Coordinator(Trainer):
         self.visit.after_step(rendered, psnrs)
         if self.visit.is_over:
             self.end_visit()
+            if self.finished:
+                self.shed_at_end()
         elif self.scene.is_due(self.config.commit_seconds):
             self.rest(self.config.commit_seconds)
 
@@ -127,6 +131,12 @@ class Coordinator(Trainer):
         tell_of_end(self.run, active, state, put_to_rest(self.run, updates), self.state.sweep)
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
+
+    def shed_at_end(self) -> None:
+        """Take out what the complete run's pictures hardly miss, where options ask for it and there are
+        photos to tell."""
+        if self._last is not None and self._last.is_wanted:
+            self._last.take()
 
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""

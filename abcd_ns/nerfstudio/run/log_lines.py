@@ -84,6 +84,21 @@ class SweepEndLine(Line):
 
 
 @dataclass(frozen=True)
+class ShedAtEndLine(Line):
+    """The run was complete, and what its pictures hardly miss was taken out."""
+
+    gone: int
+    """Gaussians."""
+    gaussians: int
+    """That are left."""
+    views: int
+    """Training views that told how many might go; means over them follow."""
+    before: float
+    """PSNR, dB."""
+    after: float
+
+
+@dataclass(frozen=True)
 class WorkerLostLine(Line):
     """A worker was lost, and the visit it was at is trained again."""
 
@@ -128,6 +143,7 @@ KINDS: dict[str, type[Line]] = {
     "sweep end": SweepEndLine,
     "worker lost": WorkerLostLine,
     "worker": WorkerLine,
+    "shed at end": ShedAtEndLine,
     "held out": HeldOutLine,
     "end": EndLine,
 }

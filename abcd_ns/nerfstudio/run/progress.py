@@ -13,6 +13,8 @@ from abcd_ns.engine.events import (
     Event,
     LayersDrawn,
     Mended,
+    ShedAtEnd,
+    Shedding,
     StepTaken,
     SweepEnded,
     VisitBegan,
@@ -66,6 +68,10 @@ class ProgressReport:
                 self._visit_seconds += event.seconds
             case SweepEnded():
                 self._end_sweep(event)
+            case Shedding():
+                self._show(f"last shedding {event.done}/{event.total}")
+            case ShedAtEnd() if event.gone:
+                self._print(_shed(event))
             case WorkersSeen():
                 self._workers = event.workers
                 self._show("")
@@ -168,6 +174,12 @@ class ProgressReport:
             self._task = self._live.add_task("", total=1.0, what="")
             self._live.start()
         return self._live
+
+
+def _shed(event: ShedAtEnd) -> str:
+    before, cost = event.gaussians + event.gone, event.before - event.after
+    where = f"{event.views} training views"
+    return f"{event.gone:,} of {before:,} Gaussians were hardly missed and are gone: {cost:.2f} dB of {where}"
 
 
 def _block(block: int | None) -> str:

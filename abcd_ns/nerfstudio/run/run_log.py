@@ -17,6 +17,7 @@ from abcd_ns.data.photos import Photos
 from abcd_ns.engine.events import (
     Event,
     HeldOutScored,
+    ShedAtEnd,
     StepTaken,
     SweepEnded,
     VisitBegan,
@@ -34,6 +35,7 @@ from abcd_ns.nerfstudio.run.log_lines import (
     HeldOutLine,
     Line,
     SampleLine,
+    ShedAtEndLine,
     SweepEndLine,
     TrainingLine,
     VisitEndLine,
@@ -109,6 +111,9 @@ class RunLog:
                 self._workers = event.workers
             case WorkerLost():
                 self._note(WorkerLostLine, block=event.block, why=event.why)
+                self._flush()
+            case ShedAtEnd():
+                self._note(ShedAtEndLine, **vars(event))
                 self._flush()
             case HeldOutScored():
                 self._note(HeldOutLine, psnr=_finite(event.psnr), ssim=_finite(event.ssim))

@@ -6,12 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
-from abcd_ns.engine.layers.whole_pictures import WholePicture, WholePictures
-from abcd_ns.engine.train.capture.light import lit
+from abcd_ns.engine.layers.whole_pictures import WholePicture
 from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.train.step.whole_views import WholeViews
 from abcd_ns.engine.types import View
 
 FIRST = 16.0
@@ -30,7 +29,7 @@ class PoseRounds:
     """
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
-        self._run, self._target = run, target
+        self._run, self._whole = run, WholeViews(run, target)
 
     def count(self, pictures: int) -> None:
         """A step of the visit that is under way has drawn so many pictures, of its block or of the scene."""
@@ -49,9 +48,9 @@ class PoseRounds:
     def take(self) -> None:
         """Take a step for the pose of each view."""
         run = self._run
-        views = list(run.views_at(self._reduction()).values())
+        views = self._whole.views()
         steps: dict[int, Tensor] = {}
-        pictures = self._pictures(views)
+        pictures = self._whole.pictures(views, run.scene)
         for group in pictures.groups(views):
             judged: dict[int, tuple[WholePicture, Tensor]] = {}
 
@@ -68,36 +67,10 @@ class PoseRounds:
         run.take_poses()
         run.state.posed = run.state.uses
 
-    def _reduction(self) -> int:
-        """Of the pictures: as the run has it, and so that none is larger than a step may draw."""
-        run, reduction = self._run, self._run.reduction
-        most = run.config.limits.crop_pixels
-        while most and max(view.full.pixels for view in run.views_at(reduction).values()) > most:
-            reduction *= 2
-        return reduction
-
-    def _pictures(self, views: list[View]) -> WholePictures:
-        run, active = self._run, self._run.state.active
-        together = default_pass(run.scene) if active is None else run.count()
-        painter = Painter(
-            run.scene,
-            views,
-            run.rasterizer,
-            ownership=run.config.recipe.ownership,
-            pass_gaussians=run.config.limits.pass_gaussians or together,
-            device=run.device,
-        )
-        return WholePictures(painter, PaintSettings(run.sh_degree, run.config.antialiased))
-
     def _judge(self, view: View, picture: WholePicture) -> tuple[Float[Tensor, "h w 3"], Tensor]:
         """The gradient of the loss by the picture, and the weight of each pixel."""
-        nothing = torch.zeros(3, device=picture.color.device, dtype=picture.color.dtype)
-        sample = Sample(view, view.full, None, None, None, nothing)
-        photo, counts = self._target(sample)
         shown = picture.color.detach().requires_grad_()
-        light = self._run.light
-        seen = shown if light is None else lit(shown, light.of(view.index).detach(), view.full, view)
-        counted = 1.0 if counts is None else counts.to(seen)
-        loss, weight = robust((seen - photo.to(seen)) * counted)
+        seen, photo, counts = self._whole.beside(view, shown)
+        loss, weight = robust((seen - photo) * counts)
         (gradient,) = torch.autograd.grad(loss, shown)
-        return gradient, weight * counted
+        return gradient, weight * counts
