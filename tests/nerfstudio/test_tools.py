@@ -339,7 +339,7 @@ def test_a_scene_without_points_begins_at_random_and_says_so(tmp_path, capsys):
     trainer = run(config)
     said = capsys.readouterr().out
     assert said.count("300 Gaussians begin at random places, as splatfacto's do") == 1
-    assert trainer.pipeline.coordinator.count() == 300
+    assert 0 < trainer.pipeline.coordinator.count() <= 300  # some go at the end
     (trainer.pipeline.datamanager.config.data / "train" / "r_0.png").unlink()
     # Who only looks at a scene needs no photos; Blender's reader itself opens the first, for its size.
     Image.new("RGBA", (32, 24)).save(tmp_path / "lego" / "train" / "r_0.png")

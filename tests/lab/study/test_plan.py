@@ -119,7 +119,7 @@ def test_a_study_of_gaussians_has_the_method_as_it_is_prices_limits_and_mcmc(sce
     plan = GaussiansStudy(**given(scene, blocks=4), prices=(8, 0.5), max_gaussians=(500, 100)).plan()
     configs = [trainer_config(job, Path("out")).pipeline for job in plan.jobs]
     found = [(c.training.density.price, c.training.density.max_gaussians) for c in configs]
-    assert found == [(None, 0), (0.5, 0), (8.0, 0), (None, 100), (None, 500), (None, 100), (None, 500)]
+    assert found == [(8.0, 0), (0.5, 0), (8.0, 0), (8.0, 100), (8.0, 500), (8.0, 100), (8.0, 500)]
     assert [c.training.density.strategy for c in configs] == ["default"] * 5 + ["mcmc"] * 2
     assert {c.blocks for c in configs} == {4}
     assert "--prices 0.5 8 --max-gaussians 100 500" in plan.command
@@ -129,16 +129,16 @@ def test_a_study_of_gaussians_has_the_method_as_it_is_prices_limits_and_mcmc(sce
 
 
 def test_an_ablation_begins_with_the_method_as_it_is(scene):
-    plan = OptionsStudy(**given(scene), vary=("training.warmup=0", "training.warmup=0.2")).plan()
+    plan = OptionsStudy(**given(scene), vary=("training.warmup=0", "training.warmup=0.35")).plan()
     assert [variant.name for variant in plan.variants] == [
         "default",
         "training.warmup=0",
-        "training.warmup=0.2",
+        "training.warmup=0.35",
     ]
     assert plan.variants[0] == Variant()
     (note,) = plan.notes
-    assert note.startswith("training.warmup=0.2 is the default")
-    assert "--vary training.warmup=0 training.warmup=0.2" in plan.command
+    assert note.startswith("training.warmup=0.35 is the default")
+    assert "--vary training.warmup=0 training.warmup=0.35" in plan.command
 
 
 @pytest.mark.parametrize(

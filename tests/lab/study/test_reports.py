@@ -303,6 +303,7 @@ def test_a_study_that_really_trains(scene, tmp_path, monkeypatch):
     results = read_results(tmp_path / "out" / "results.json")
     for arm, blocks in zip(results.arms, (1, 3), strict=True):
         (run,) = arm.runs
-        assert (run.blocks, run.steps, run.gaussians) == (blocks, 12, 150)
-        assert [point.gaussians for point in run.curve][-1] == 150
+        assert (run.blocks, run.steps) == (blocks, 12)
+        assert 100 < run.gaussians <= 150  # some go at the end
+        assert [point.gaussians for point in run.curve][-1] == run.gaussians
         assert arm.psnr > 8
