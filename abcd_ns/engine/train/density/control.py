@@ -82,7 +82,7 @@ class DensityConfig:
     strategy). None takes 8 where the scene is one block, and 2 elsewhere; 0 keeps everything."""
     last_loss: float = 0.05
     """dB of training views' mean PSNR that a last shedding may cost when the run is complete: it takes out
-    what these views miss least, where Gaussians have a price (`default` strategy). 0 for none."""
+    what these views miss least. 0 for none, as where `strategy` is `off` or `price` 0."""
     max_gaussians: int = 0
     """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
     to begin with, a random choice of them begins."""
