@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from abcd_ns.engine.events import BlockSplit, VisitEnded
+from abcd_ns.engine.events import BlockSplit, ShedAtEnd, VisitEnded
 from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render import TorchRasterizer
@@ -65,6 +65,21 @@ def test_blocks_are_trained(tmp_path, start, views, photos, blocks, density, lay
     assert coordinator.state.step == steps
     assert len(scene) != len(start)
     assert all(bool(value.isfinite().all()) for _, value in scene.items())
+
+
+@pytest.mark.parametrize("together", [0, 1])
+def test_what_is_hardly_missed_goes_at_the_end(tmp_path, start, views, photos, monkeypatch, together):
+    monkeypatch.setattr("abcd_ns.engine.train.step.last_shedding.LOSS", 0.5)
+    target = lambda sample: (photos(sample.view.index, sample.crop).to(DEVICE), None)  # noqa: E731
+    options = {"blocks": 2, "steps": 6, "pass_gaussians": together, "target": target}
+    coordinator = on_device(tmp_path, start, views, **options, density=DensityConfig())
+    told: list = []
+    coordinator.announce.subscribe(lambda event: told.append(event) if isinstance(event, ShedAtEnd) else None)
+    train(coordinator, photos)
+    (found,) = told
+    assert found.gone > 0
+    assert coordinator.count() == found.gaussians
+    assert found.before - found.after <= 0.5
 
 
 @pytest.mark.parametrize("light", ["exposure", "bilateral"])

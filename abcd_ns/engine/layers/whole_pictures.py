@@ -1,4 +1,4 @@
-"""Pictures of the whole scene, one unit of it on the device at a time, and their gradient by the pose.
+"""Pictures of the whole scene, one unit of it on the device at a time, and their gradient, by the pose say.
 
 As exact joint training has them (peers/exact.py), but for the camera: every unit is drawn without gradients
 and all are folded to the picture; a loss gives G = dL/dC; every unit is drawn again, with gradients, and
@@ -48,7 +48,7 @@ class _Part:
 
 
 class WholePictures:
-    """Draws a scene for poses to be judged by.
+    """Draws a scene for it, or for poses, to be judged by.
 
     Args:
         views: all that will be drawn.
@@ -86,19 +86,29 @@ class WholePictures:
             gradient: gives dL/dC of a view's picture.
         """
         leaves = [replace(view, viewmat=view.viewmat.detach().clone().requires_grad_()) for view in views]
-        parts = self._draw(leaves)
-        pulls = []
-        for view, own in zip(leaves, parts, strict=True):
-            own[:] = self._in_order(view, own)
-            pulls.append(gradient(view, self._picture(view, own)))
-        for unit in self._units:
-            loaded = self._load(unit, leaves) if len(self._units) > 1 else None
-            for view, own, pull in zip(leaves, parts, pulls, strict=True):
-                self._differentiate(unit, loaded, view, own, pull)
+        self.backward(leaves, gradient)
         return [
             torch.zeros_like(view.viewmat) if view.viewmat.grad is None else view.viewmat.grad
             for view in leaves
         ]
+
+    def backward(
+        self, views: Sequence[View], gradient: Callable[[View, WholePicture], Float[Tensor, "h w 3"]]
+    ) -> None:
+        """Leave the gradient of a loss, added up over views, in what of views and of the scene are leaves.
+
+        Args:
+            gradient: gives dL/dC of a view's picture.
+        """
+        parts = self._draw(views)
+        pulls = []
+        for view, own in zip(views, parts, strict=True):
+            own[:] = self._in_order(view, own)
+            pulls.append(gradient(view, self._picture(view, own)))
+        for unit in self._units:
+            loaded = self._load(unit, views) if len(self._units) > 1 else None
+            for view, own, pull in zip(views, parts, pulls, strict=True):
+                self._differentiate(unit, loaded, view, own, pull)
 
     def _load(self, unit: int, views: Sequence[View]) -> Loaded:
         return self._painter.load(unit, seen_by=self._painter.frusta((still(v), v.full) for v in views))

@@ -1,16 +1,17 @@
 """A last shedding: when a run is complete, what its pictures hardly miss is taken out.
 
-Shedding in training (density/shedding) ends while there is time to make good what is missed, so that there
-is more in a scene at its end than its pictures need. RadSplat (Niemeyer et al., 2024), LightGaussian (Fan et
-al., NeurIPS 2024) and Speedy-Splat (Hanson et al., CVPR 2025) leave out a given share of what ranks lowest.
-Here the pictures say how much: as many go as training views can spare.
+Shedding in training (density/shedding) ends while there is time to make good what is missed, so that more is
+in a scene at its end than its pictures need. RadSplat (Niemeyer et al., 2024), LightGaussian (Fan et al.,
+NeurIPS 2024) and Speedy-Splat (Hanson et al., CVPR 2025) leave out a given share of what ranks lowest. Here
+the pictures say how many: as many as training views can spare.
 
-A pixel is linear in each Gaussian's opacity, so that without the Gaussian it changes by o dC/do. Adam's
-second moment of the logit of o is the mean square over steps of o (1 - o) <r, dC/do>, where r, the loss by
-the picture, is hardly more than a sign in each pixel: over (1 - o)^2 it tells of the sum of squared changes,
-for nothing and from all views. Times the pixels that the Gaussian fills, it ranks better than either alone.
+A pixel is linear in each Gaussian's opacity o, so that without the Gaussian it changes by o dC/do. What that
+is squared and summed over pixels is told by one drawing backward for all Gaussians at once (Hutchinson 1990):
+with a random sign for each pixel and channel as the gradient of the picture, the square of what comes back is
+it in expectation. As a share of the view's squared error it is the Gaussian's worth in dB, if it alone went.
 """
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -18,67 +19,100 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.events import ShedAtEnd, Shedding
-from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.layers.whole_pictures import WholePicture
+from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail
-from abcd_ns.engine.train.density.shedding import WEIGHED
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.step.whole_views import WholeViews
+from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
 LOSS = 0.05
 """Of the mean PSNR of training views, dB, that it may cost."""
-MOST_VIEWS, FEWEST_VIEWS = 32, 4
-"""That tell how much may go."""
-STEPS_EACH = 100
-"""Of a short run, for each of these views: drawing them again and again is to take 3% of its time at most."""
-MOST = 0.5
-"""Share of the Gaussians that may go."""
+RANKING = 32
+"""Views that a block was trained on, for each that Gaussians are ranked by: of a short run not all are."""
+FEWEST, MOST, STEPS_EACH = 5, 32, 100
+"""Views that tell how much may go: at least, at most, and steps of a short run for each."""
 ROUNDS = 6
-"""In each of which as many may go as halves what is between too few and too many."""
+"""In each of which as many are left out as the last one suggests; after too many, half as many at most."""
+SURE = 0.97
+"""Share of what it may cost that is aimed at, so as not to miss by little."""
+PER_NEPER = 10 / math.log(10)
+"""dB that the logarithm of a squared error is worth."""
 LEAST_ERROR = 1e-10
 """Mean squared difference below which a picture is its photo."""
 
 
-def rank(state: BlockState, views: int) -> Float[Tensor, "n"]:
-    """By how much a block's Gaussians would be missed, in no unit; infinite for who was never weighed.
+class _Scene:
+    """A scene at rest in which others see something else of each block; see BlockScene."""
 
-    Args:
-        views: that see the block.
-    """
-    if any(name not in state.growth for name in WEIGHED):
-        return torch.full((len(state),), torch.inf)
-    weight, looks = (state.growth[name] for name in WEIGHED)
-    through = torch.sigmoid(-state.gaussians.opacities).clamp_min(1e-6)
-    change = (state.exp_avg_sq.opacities / through.square()).flatten()
-    return torch.where(looks > 0, views**2 * change * weight / looks, torch.inf)
-
-
-class Without:
-    """A scene at rest without those of its Gaussians that rank no higher than a price.
-
-    Args:
-        ranks: by block, of those that are seen, in their order.
-    """
-
-    def __init__(self, scene: BlockScene, ranks: Sequence[Float[Tensor, "_n"]], price: float) -> None:
-        self.tree = scene.tree
-        self._scene, self._stays = scene, [of_block > price for of_block in ranks]
+    def __init__(self, scene: BlockScene) -> None:
+        self._scene = scene
+        self.tree: BlockTree = scene.tree
 
     def gaussians(self, block: int) -> Gaussians:
-        return self._scene.gaussians(block)[self._stays[block]]
+        return self._scene.gaussians(block)
 
     def version(self, block: int) -> int:
         return self._scene.version(block)
 
     def count(self, block: int) -> int:
-        return int(self._stays[block].sum())
+        return self._scene.count(block)
 
     def bounds(self, block: int) -> Box | None:
-        """Of all: who is left is within them."""
+        """Of all: whoever is left is within them."""
         return self._scene.bounds(block)
+
+
+class _Probed(_Scene):
+    """Its opacities are leaves on a device, of which it remembers what they are worth by what comes back."""
+
+    def __init__(self, scene: BlockScene, device: torch.device) -> None:
+        super().__init__(scene)
+        self._device = device
+        self._leaves: dict[int, Tensor] = {}
+        self._worth: dict[int, Tensor] = {}
+
+    def gaussians(self, block: int) -> Gaussians:
+        found = self._scene.gaussians(block).to(self._device)
+        if block not in self._leaves:
+            self._leaves[block] = found.opacities.detach().clone().requires_grad_()
+        return Gaussians(**{**dict(found.items()), "opacities": self._leaves[block]})
+
+    def take_note(self) -> None:
+        """A view has been drawn backward."""
+        for block, logits in self._leaves.items():
+            if logits.grad is None:
+                continue
+            # By o dC/do = dC/dlogit / (1 - o).
+            change = logits.grad / torch.sigmoid(-logits.detach()).clamp_min(1e-6)
+            self._worth[block] = self._worth.get(block, 0.0) + change.flatten().square()
+            logits.grad = None
+
+    def worth(self, block: int) -> Float[Tensor, "n"]:
+        """By now, of those that are drawn; 0 for who showed in no view."""
+        found = self._worth.get(block)
+        return torch.zeros(len(self._scene.gaussians(block))) if found is None else found.cpu()
+
+
+class _Without(_Scene):
+    """It lacks those that are worth no more than a price.
+
+    Args:
+        worth: by block.
+    """
+
+    def __init__(self, scene: BlockScene, worth: Sequence[Float[Tensor, "_n"]], price: float) -> None:
+        super().__init__(scene)
+        self._stays = [of_block > price for of_block in worth]
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._scene.gaussians(block)[self._stays[block]]
+
+    def count(self, block: int) -> int:
+        return int(self._stays[block].sum())
 
 
 class LastShedding:
@@ -90,73 +124,98 @@ class LastShedding:
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
         self._run, self._whole = run, WholeViews(run, target)
-        self._seen: list[Tensor] = []
-        """By block, the ranks of those that are drawn."""
 
     @property
     def is_wanted(self) -> bool:
-        """Whether Gaussians have a price: nothing else weighs them."""
-        return self._run.density.weighs
+        """Whether the run's options let Gaussians go."""
+        density = self._run.density.config
+        return density.price > 0 and density.strategy != "off"
 
-    @torch.no_grad()
     def take(self) -> None:
         """Do it; tells listeners how many went, and at what cost."""
         run = self._run
-        blocks = range(run.scene.tree.num_blocks)
-        ranks = [self._rank(block) for block in blocks]
-        ranked = torch.cat(self._seen)
+        views, step = self._whole.views(), run.state.step
+        worth = self._worth(views)
+        ranked = torch.cat(worth)
         ranked = ranked[ranked.isfinite()].sort().values
-        if len(ranked) == 0:
-            return
-        views = self._views()
-        self.announce(0)
-        before = after = self._psnr(views, -1.0)
-        few, many, price = 0, int(MOST * len(ranked)), -1.0
-        for taken in range(1, ROUNDS + 1):
-            self.announce(taken)
-            if (middle := (few + many) // 2) == few:
+        costs = ranked.double().cumsum(0)
+        views = evenly(views, min(max(step // STEPS_EACH, FEWEST), MOST))
+        before = after = self._psnr(views, worth, -1.0)
+        few, most, price, guess = 0, len(ranked), -1.0, SURE * LOSS
+        for taken in range(ROUNDS):
+            run.announce(Shedding(taken + 1, ROUNDS + 1))
+            number = min(max(int(torch.searchsorted(costs, guess)), few + 1), most)
+            if number <= few:
                 break
-            tried = float(ranked[middle - 1])
-            found = self._psnr(views, tried)
+            tried = float(ranked[number - 1])
+            found = self._psnr(views, worth, tried)
             if before - found <= LOSS:
-                few, price, after = middle, tried, found
+                few, price, after = number, tried, found
             else:
-                many = middle
-        gone = sum(self._take_out(block, ranks[block] > price) for block in blocks)
+                most = (few + number) // 2
+            guess = float(costs[number - 1]) * SURE * LOSS / max(before - found, LOSS / 4)
+        gone = sum(self._take_out(block, of_block, price) for block, of_block in enumerate(worth))
         run.announce(ShedAtEnd(gone, run.count(), len(views), before, after))
 
-    def announce(self, taken: int) -> None:
-        """Tell listeners how far this is."""
-        self._run.announce(Shedding(taken, ROUNDS + 1))
+    def _worth(self, views: list[View]) -> list[Float[Tensor, "_n"]]:
+        """By block, what those that are drawn are worth in these views, dB of the mean PSNR; infinite for who
+        shows in none of them, unless they are all."""
+        run = self._run
+        run.announce(Shedding(0, ROUNDS + 1))
+        blocks = range(run.scene.tree.num_blocks)
+        trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
+        chosen = evenly(views, max(trained // RANKING, FEWEST))
+        scene = _Probed(run.scene, run.device)
+        pictures = self._whole.pictures(chosen, scene)
+        drawn = random_signs(run.config.seed)
 
-    def _views(self) -> list[View]:
-        """Those that tell."""
-        views, steps = self._whole.views(), self._run.state.step
-        wanted = min(max(steps // STEPS_EACH, FEWEST_VIEWS), MOST_VIEWS)
-        return views[:: -(-len(views) // wanted)]
+        def gradient(view: View, picture: WholePicture) -> Float[Tensor, "h w 3"]:
+            square, counts = self._square(view, picture)
+            signs = upload(drawn(picture.color.shape), run.device).to(picture.color)
+            return signs * counts / square.clamp_min(LEAST_ERROR * picture.color.numel()).sqrt()
 
-    def _rank(self, block: int) -> Float[Tensor, "n"]:
-        """Of a block and its mail; of those that wait nobody is drawn."""
-        state = with_mail(self._run.scene, block)
-        found = rank(state, self._run.state.views.get(block, 0))
-        self._seen.append(found[~state.waits])
-        return found
+        for view in chosen:
+            pictures.backward([view], gradient)
+            scene.take_note()
+        nowhere = 0.0 if len(chosen) == len(views) else torch.inf
+        worth = [PER_NEPER / len(chosen) * scene.worth(block) for block in blocks]
+        return [torch.where(of_block > 0, of_block, nowhere) for of_block in worth]
 
-    def _psnr(self, views: list[View], price: float) -> float:
-        """Mean over views without who ranks no higher than a price, dB."""
-        pictures = self._whole.pictures(views, Without(self._run.scene, self._seen, price))
+    @torch.no_grad()
+    def _psnr(self, views: list[View], worth: Sequence[Tensor], price: float) -> float:
+        """Mean over views without who is worth no more than a price, dB."""
+        pictures = self._whole.pictures(views, _Without(self._run.scene, worth, price))
         found = []
         for view, picture in zip(views, pictures.draw(views), strict=True):
-            seen, photo, counts = self._whole.beside(view, picture.color)
-            square = ((seen.clamp(0, 1) - photo) * counts).square().sum() / (3 * counts.sum()).clamp_min(1.0)
-            found.append(-10 * square.clamp_min(LEAST_ERROR).log10())
+            square, counts = self._square(view, picture)
+            error = square / (3 * counts.sum()).clamp_min(1.0)
+            found.append(-10 * error.clamp_min(LEAST_ERROR).log10())
         return float(torch.stack(found).mean())
 
-    def _take_out(self, block: int, stays: Tensor) -> int:
-        """Put a block to rest with its mail, and without the others; how many these are."""
+    def _square(self, view: View, picture: WholePicture) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 1"]]:
+        """The squared error of a picture, summed over the pixels that count, and which these are."""
+        seen, photo, counts = self._whole.beside(view, picture.color.detach())
+        return ((seen.clamp(0, 1) - photo) * counts).square().sum(), counts
+
+    def _take_out(self, block: int, worth: Float[Tensor, "n"], price: float) -> int:
+        """Put a block to rest with its mail, without who is worth no more than a price; tells how many."""
         run, scene = self._run, self._run.scene
-        gone = int((~stays).sum())
+        gone = int((worth <= price).sum())
         if gone:
-            left = with_mail(scene, block)[stays]
-            run.rest(scene.tree, {block: left, **inbox_without(scene, {block})}, within=0.0)
+            state = with_mail(scene, block)
+            stays = state.waits.clone()  # who is not drawn
+            stays[~state.waits] = worth > price
+            run.rest(scene.tree, {block: state[stays], **inbox_without(scene, {block})}, within=0.0)
         return gone
+
+
+def evenly(views: list[View], wanted: int) -> list[View]:
+    """So many of the views, as far apart from each other as from both ends; all if there are no more."""
+    wanted = min(wanted, len(views))
+    return [views[int((k + 0.5) * len(views) / wanted)] for k in range(wanted)]
+
+
+def random_signs(seed: int) -> Callable[[Sequence[int]], Tensor]:
+    """Gives signs of any shape, int8, others each time."""
+    generator = torch.Generator().manual_seed(seed)
+    return lambda shape: torch.randint(0, 2, tuple(shape), generator=generator, dtype=torch.int8) * 2 - 1
