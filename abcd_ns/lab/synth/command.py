@@ -1,10 +1,15 @@
 """`abcd synth OUT`: draw a scene of walled courts into a COLMAP data set."""
 
+import os
 import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
 from PIL import Image
 from rich.console import Console
@@ -115,12 +120,15 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[int, int]:
     names = [f"court{k // count:03d}_view{k % count:03d}.png" for k in range(len(views))]
     (out / "images").mkdir(exist_ok=True)
     parts: list[SparsePoints] = []
-    with ProgressBar("Drawing", len(views), console) as bar:
+
+    def draw(k: int) -> None:
+        picture = (255 * world.photo(views[k], settings.supersample)).round().byte().numpy()
+        Image.fromarray(picture).save(out / "images" / names[k], optimize=False)
+
+    with ProgressBar("Drawing", len(views), console) as bar, _a_view_on_each_core() as pool:
         for court in range(settings.courts):
             own = range(court * count, (court + 1) * count)
-            for k in own:
-                picture = (255 * world.photo(views[k], settings.supersample)).round().byte().numpy()
-                Image.fromarray(picture).save(out / "images" / names[k], optimize=False)
+            for _ in pool.map(draw, own):
                 bar.advance()
             around = sorted([court, *site.neighbors(court)])
             nearby = [c for k in around for c in range(k * count, (k + 1) * count)]
@@ -131,6 +139,18 @@ def _draw(out: Path, settings: Settings, console: Console) -> tuple[int, int]:
         raise UserError("No point is seen by two views; raise --views-per-court or --points-per-court.")
     write_model(out / "sparse" / "0", dict(zip(names, views, strict=True)), points)
     return len(views), len(points.xyz)
+
+
+@contextmanager
+def _a_view_on_each_core() -> Iterator[ThreadPoolExecutor]:
+    """Threads that draw: rays are parted by what they meet, into rows too few for torch's own threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _prepare(out: Path, settings: Settings, overwrite: bool) -> bool:
