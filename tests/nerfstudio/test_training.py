@@ -196,6 +196,7 @@ def test_while_training_only_the_live_block_is_registered(data, tmp_path):
 def test_a_limit_below_the_number_of_points_is_kept_from_the_start(data, tmp_path, method, capsys):
     config = configure(data, tmp_path, method, steps=8)
     config.pipeline.training.density.max_gaussians = 100
+    config.pipeline.training.density.last_loss = 0.0
     trainer = run(config)
     assert trainer.pipeline.coordinator.count() == 100
     assert "Training begins with 100 of 278 Gaussians" in capsys.readouterr().out
