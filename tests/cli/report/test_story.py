@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from abcd_ns.cli.report.headline import _shed_at_end
 from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.lab.results.records import RecordError
 from tests.cli.report.runs import TRAINING, line, log_lines, write_log
@@ -77,3 +78,12 @@ def test_a_line_that_is_none_is_named(tmp_path, bad, message):
 def test_a_missing_log_is_named(tmp_path):
     with pytest.raises(RecordError, match=r"absent\.jsonl does not exist"):
         read_story(tmp_path / "absent.jsonl")
+
+
+def test_what_went_at_the_end_is_told(tmp_path):
+    shed = {"gone": 30, "gaussians": 300, "views": 5, "before": 25.0, "after": 24.96}
+    lines = [*log_lines(), json.dumps({"kind": "shed at end", "step": 40, "seconds": 17.0, **shed})]
+    story = read_story(write_log(tmp_path / "log.jsonl", lines))
+    (fact,) = _shed_at_end(story)
+    assert (fact.value, fact.more) == ("30", "9%, for 0.04 dB of 5 training views")
+    assert _shed_at_end(read_story(write_log(tmp_path / "other.jsonl", log_lines()))) == []

@@ -31,14 +31,12 @@ from abcd_ns.engine.types import Gaussians, View
 
 LOSS = 0.05
 """Of the mean PSNR of training views, dB, that it may cost."""
-RANKING = 32
+RANKING = 16
 """Views that a block was trained on, for each that Gaussians are ranked by: of a short run not all are."""
 FEWEST, MOST, STEPS_EACH = 5, 32, 100
 """Views that tell how much may go: at least, at most, and steps of a short run for each."""
 ROUNDS = 6
-"""In each of which as many are left out as the last one suggests; after too many, half as many at most."""
-SURE = 0.97
-"""Share of what it may cost that is aimed at, so as not to miss by little."""
+"""In the first so many are left out as should cost what may be; then twice that, or what halves the doubt."""
 PER_NEPER = 10 / math.log(10)
 """dB that the logarithm of a squared error is worth."""
 LEAST_ERROR = 1e-10
@@ -141,19 +139,19 @@ class LastShedding:
         costs = ranked.double().cumsum(0)
         views = evenly(views, min(max(step // STEPS_EACH, FEWEST), MOST))
         before = after = self._psnr(views, worth, -1.0)
-        few, most, price, guess = 0, len(ranked), -1.0, SURE * LOSS
+        few, many, price, guess = 0, len(ranked) + 1, -1.0, LOSS
         for taken in range(ROUNDS):
             run.announce(Shedding(taken + 1, ROUNDS + 1))
-            number = min(max(int(torch.searchsorted(costs, guess)), few + 1), most)
+            suggested = min(int(torch.searchsorted(costs, guess)), len(ranked))
+            number = suggested if many > len(ranked) else (few + many) // 2
             if number <= few:
                 break
             tried = float(ranked[number - 1])
             found = self._psnr(views, worth, tried)
             if before - found <= LOSS:
-                few, price, after = number, tried, found
+                few, price, after, guess = number, tried, found, 2 * guess
             else:
-                most = (few + number) // 2
-            guess = float(costs[number - 1]) * SURE * LOSS / max(before - found, LOSS / 4)
+                many = number
         gone = sum(self._take_out(block, of_block, price) for block, of_block in enumerate(worth))
         run.announce(ShedAtEnd(gone, run.count(), len(views), before, after))
 

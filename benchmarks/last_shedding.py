@@ -1,0 +1,93 @@
+"""What a last shedding takes out and costs: held-out views of one run right before it and after.
+
+python -m benchmarks.last_shedding --data DIR --steps 500 --blocks 1 --out OUT.json
+"""
+
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+import tyro
+
+from abcd_ns.engine.events import Event, ShedAtEnd, Shedding
+from abcd_ns.lab.job import Job, Settings
+from abcd_ns.lab.runs.configs import trainer_config
+from abcd_ns.lab.runs.evaluate import draw_held_out, mean, score
+from abcd_ns.lab.runs.training import Training
+from abcd_ns.lab.runs.worker import seed_everything
+from abcd_ns.machine import describe_versions
+
+
+@dataclass(frozen=True)
+class Args:
+    """A scene and how long it is trained."""
+
+    data: Path
+    out: Path
+    steps: int = 500
+    blocks: int = 1
+    downscale: int = 4
+    seed: int = 0
+
+
+def main(args: Args) -> None:
+    """Train, look before and after, write what was found."""
+    settings = Settings(
+        data=str(args.data.resolve()),
+        downscale=args.downscale,
+        blocks=args.blocks,
+        seconds=None,
+        steps=args.steps,
+        evals=1,
+        max_gaussians=0,
+        densify=True,
+        pictures=0,
+    )
+    with TemporaryDirectory() as folder:
+        found = _train(
+            Job("abcd-monolithic" if args.blocks == 1 else "abcd", args.seed, settings), Path(folder)
+        )
+    found = {"args": {k: str(v) for k, v in asdict(args).items() if k not in ("out", "data")}, **found}
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps({"scene": settings.scene, **found}, indent=1) + "\n")
+    print(json.dumps(found, indent=1))
+
+
+def _train(job: Job, folder: Path) -> dict:
+    config = trainer_config(job, folder)
+    config.check()
+    seed_everything(job.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    config.save_config()
+    trainer.setup()
+    training = Training(trainer, job.settings)
+    training.warm_up()
+    found: dict = {}
+
+    def look() -> dict[str, float | None]:
+        scores = [score(drawn) for drawn in draw_held_out(training.pipeline)]
+        return {
+            name: mean([getattr(each, name) for each in scores]) for name in ("psnr_merged", "ssim_merged")
+        }
+
+    def listen(event: Event) -> None:
+        match event:
+            case Shedding(done=0):
+                found["training_seconds"] = training.stopwatch.seconds
+                found["held_out_before"], found["began"] = look(), time.perf_counter()
+            case ShedAtEnd():
+                found["shedding_seconds"] = time.perf_counter() - found.pop("began")
+                found["shed"], found["held_out_after"] = asdict(event), look()
+
+    training.coordinator.announce.subscribe(listen)
+    trainer.train()
+    versions = asdict(describe_versions())
+    return {**found, "threads": torch.get_num_threads(), "versions": versions}
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Args)))
