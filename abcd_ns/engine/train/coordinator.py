@@ -105,6 +105,12 @@ class Coordinator(Trainer):
         elif self.scene.is_due(self.config.commit_seconds):
             self.rest(self.config.commit_seconds)
 
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is used up, and nothing is live: seconds may run out just after a visit was
+        found not to be over, and then it takes one more step."""
+        return self.state.active is None and super().finished
+
     # -- a visit -------------------------------------------------------------------------------------
 
     def begin_visit(self) -> None:

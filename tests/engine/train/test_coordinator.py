@@ -13,7 +13,7 @@ from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.store.special_blocks import LIVE
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain
@@ -260,6 +260,19 @@ def test_a_limit_on_gaussians_is_kept_at_every_step(tmp_path, views, photos, sta
         counts.append(coordinator.count())
     assert max(counts) <= limit
     assert counts[-1] > len(start)
+
+
+def test_a_run_whose_time_runs_out_within_a_visit_ends_that_visit(tmp_path, views, photos, start):
+    """Seconds pass between any two looks at the clock."""
+    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=60)
+    train(coordinator, photos, steps=3)
+    assert coordinator.state.active is not None
+    coordinator.run.budget = Budget(steps=3)
+    assert not coordinator.finished
+    train(coordinator, photos)
+    assert coordinator.finished
+    assert coordinator.state.active is None
+    assert coordinator.state.step == 4
 
 
 def test_a_scene_that_no_view_sees_is_an_error_that_says_so(tmp_path, views, photos, start):
