@@ -15,10 +15,8 @@ import tyro
 
 from abcd_ns.engine.events import Event, ShedAtEnd, Shedding
 from abcd_ns.lab.job import Job, Settings
-from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.evaluate import draw_held_out, mean, score
-from abcd_ns.lab.runs.training import Training
-from abcd_ns.lab.runs.worker import seed_everything
+from abcd_ns.lab.runs.worker import set_up
 from abcd_ns.machine import describe_versions
 
 
@@ -58,14 +56,7 @@ def main(args: Args) -> None:
 
 
 def _train(job: Job, folder: Path) -> dict:
-    config = trainer_config(job, folder)
-    config.check()
-    seed_everything(job.seed)
-    trainer = config.setup(local_rank=0, world_size=1)
-    config.save_config()
-    trainer.setup()
-    training = Training(trainer, job.settings)
-    training.warm_up()
+    training = set_up(job, folder)
     found: dict = {}
 
     def look() -> dict[str, float | None]:
@@ -84,7 +75,7 @@ def _train(job: Job, folder: Path) -> dict:
                 found["shed"], found["held_out_after"] = asdict(event), look()
 
     training.coordinator.announce.subscribe(listen)
-    trainer.train()
+    training.trainer.train()
     versions = asdict(describe_versions())
     return {**found, "threads": torch.get_num_threads(), "versions": versions}
 

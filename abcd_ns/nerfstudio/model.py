@@ -28,7 +28,7 @@ from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_raster
 from abcd_ns.engine.render.loss import photometric_loss, psnr, psnrs, ssim_windows
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store.scene import BlockScene, MemoryScene, StoredScene
+from abcd_ns.engine.store.scene import BlockScene, ChangedScene, MemoryScene, StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.train.step.batch import Batch
@@ -304,10 +304,9 @@ class AbcdModel(SplatfactoModel):
         """Draws the scene by parts: of Gaussians what `keep` gives, or those in the crop box."""
         whole = self.scene()
         if isinstance(whole, StoredScene) and whole.is_live_as_a_whole:
-            whole = MemoryScene(
-                whole.tree, self.merged()
-            )  # which block holds how many is not known otherwise
-        scene = viewed.Cropped(whole, keep or self._crop)
+            whole = MemoryScene(whole.tree, self.merged())  # or nobody knows which block holds how many
+        shown = keep or self._crop
+        scene = ChangedScene(whole, lambda _, found: shown(found))
         most = min(default_pass(scene), self._most_at_once())
         painter = Painter(
             scene,

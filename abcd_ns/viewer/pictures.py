@@ -2,7 +2,6 @@
 
 import math
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -14,8 +13,6 @@ from abcd_ns.engine.layers.painter import FrozenLayers, Painter, PaintSettings, 
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.influence import coarser
-from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Gaussians, Layer, View
 
 MOST_PIXELS = 2048 * 2048
@@ -63,25 +60,6 @@ def bounded(view: View) -> View:
     times = math.ceil(math.sqrt(view.width * view.height / MOST_PIXELS))
     smaller = coarser(view, times) if times > 1 else view
     return replace(smaller, width=max(smaller.width, 1), height=max(smaller.height, 1))
-
-
-class Cropped:
-    """A scene without what a filter takes away; for nerfstudio's crop box."""
-
-    def __init__(self, scene: BlockScene, keep: Callable[[Gaussians], Gaussians]) -> None:
-        self.tree, self._scene, self._keep = scene.tree, scene, keep
-
-    def gaussians(self, block: int) -> Gaussians:
-        return self._keep(self._scene.gaussians(block))
-
-    def version(self, block: int) -> int:
-        return self._scene.version(block)
-
-    def count(self, block: int) -> int:
-        return self._scene.count(block)
-
-    def bounds(self, block: int) -> Box | None:
-        return self._scene.bounds(block)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ from abcd_ns.engine.layers.compositing import over
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.store.scene import ChangedScene, MemoryScene
 from abcd_ns.viewer.pictures import (
     FAR,
     MOST_PIXELS,
     BlockPictures,
-    Cropped,
     Show,
     asked_by_viewer,
     bounded,
@@ -113,7 +112,7 @@ def test_an_empty_block_shows_nothing():
 
 
 def test_a_cropped_scene():
-    upper = Cropped(MemoryScene(TREE, GAUSSIANS), lambda gaussians: gaussians[gaussians.means[:, 2] > 0])
+    upper = ChangedScene(MemoryScene(TREE, GAUSSIANS), lambda _, found: found[found.means[:, 2] > 0])
     found = pictures(scene=upper).draw(Show.EVERYTHING, None)
     expected = DRAW(GAUSSIANS[GAUSSIANS.means[:, 2] > 0], VIEW, sh_degree=1)
     assert float((found.color - expected.color).abs().max()) < 2e-3

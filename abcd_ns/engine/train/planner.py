@@ -120,9 +120,8 @@ class Planner:
         geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
         taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
         if self._scene.rows(RESERVE):
-            taken = min(
-                taken, math.ceil(SCAFFOLD_PASSES * len(crops) / views_per_step(self._config.batch, 1))
-            )
+            uses, batch = SCAFFOLD_PASSES * len(crops), views_per_step(self._config.batch, 1)
+            taken = min(taken, math.ceil(uses / batch))
         return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
 
     def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:

@@ -46,7 +46,21 @@ def run(job: Job, folder: Path) -> Run:
     Raises:
         UserError, SystemExit: the scene or an option cannot be used; said on the console.
     """
-    config = trainer_config(job, folder.parent.parent.parent)
+    training = set_up(job, folder.parent.parent.parent)
+    training.trainer.train()
+    total = time.time() - psutil.Process().create_time() - training.recorder.seconds
+    memory = memory_of_run()
+    scores, gaps = score_held_out(training, job, folder / "pictures")
+    return _record(job, training, total, scores, gaps, folder, memory)
+
+
+def set_up(job: Job, out: Path) -> Training:
+    """All that comes before the first step.
+
+    Args:
+        out: where the job's folder is.
+    """
+    config = trainer_config(job, out)
     if isinstance(config, AbcdTrainerConfig):
         config.check()
     seed_everything(job.seed)
@@ -55,11 +69,7 @@ def run(job: Job, folder: Path) -> Run:
     trainer.setup()
     training = Training(trainer, job.settings)
     training.warm_up()
-    trainer.train()
-    total = time.time() - psutil.Process().create_time() - training.recorder.seconds
-    memory = memory_of_run()
-    scores, gaps = score_held_out(training, job, folder / "pictures")
-    return _record(job, training, total, scores, gaps, folder, memory)
+    return training
 
 
 def seed_everything(seed: int) -> None:

@@ -9,9 +9,9 @@ from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in, normals_of
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scene import MemoryScene
+from abcd_ns.engine.store.scene import ChangedScene, MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians, View
-from abcd_ns.viewer.pictures import BlockPictures, Cropped
+from abcd_ns.viewer.pictures import BlockPictures
 from tests.reference.naive_rasterizer import rotation
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -22,7 +22,7 @@ PRIMITIVES = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
 
 
 def painter_of(primitive: str, pass_gaussians: int, keep=lambda gaussians: gaussians) -> Painter:
-    scene = Cropped(MemoryScene(build_kd(SCENE.means, 4), SCENE), keep)
+    scene = ChangedScene(MemoryScene(build_kd(SCENE.means, 4), SCENE), lambda _, found: keep(found))
     rasterizer = TorchRasterizer(primitive=primitive)
     options = {"ownership": "fragments", "pass_gaussians": pass_gaussians}
     return Painter(scene, VIEWS, rasterizer, **options)

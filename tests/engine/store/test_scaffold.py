@@ -17,6 +17,8 @@ from tests.reference.scenes import make_coordinator, whole_scene
 
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=1e-5, price=0.0)
+LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
+"""Enough for growth."""
 
 
 def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
@@ -167,17 +169,8 @@ def test_density_controls_clock_starts_anew_when_the_warm_up_is_over(
 @pytest.mark.parametrize("most", [0, 125, 400])
 def test_the_scaffold_grows_while_there_is_room_for_it(tmp_path, views, photos, start, most):
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
-    coordinator = make_coordinator(
-        tmp_path,
-        start,
-        views,
-        blocks=4,
-        steps=60,
-        scaffold=len(start),
-        scaffold_gaussians=most,
-        warmup=0.5,
-        density=GROWING,
-    )
+    options = {**LONG, "scaffold": len(start), "scaffold_gaussians": most, "density": GROWING}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
     train(coordinator, photos, steps=29)
     live = len(coordinator.params["means"])
     assert live == coordinator.count()
@@ -190,17 +183,8 @@ def test_the_scaffold_grows_while_there_is_room_for_it(tmp_path, views, photos, 
 
 def test_a_limit_on_gaussians_counts_those_that_wait(tmp_path, views, photos, start):
     density = replace(GROWING, max_gaussians=len(start))
-    coordinator = make_coordinator(
-        tmp_path,
-        start,
-        views,
-        blocks=4,
-        steps=60,
-        scaffold=60,
-        scaffold_gaussians=100,
-        warmup=0.5,
-        density=density,
-    )
+    options = {**LONG, "scaffold": 60, "scaffold_gaussians": 100, "density": density}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
     train(coordinator, photos, steps=29)
     assert len(coordinator.params["means"]) <= 60
 

@@ -9,7 +9,7 @@ from abcd_ns.engine.events import ShedAtEnd, Shedding
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import last_shedding
-from abcd_ns.engine.train.step.last_shedding import LastShedding, _Probed, random_signs
+from abcd_ns.engine.train.step.last_shedding import LastShedding, _Probe, random_signs
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
@@ -139,8 +139,8 @@ def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian
     coordinator, _ = completed(tmp_path, ring, pictured, steps=5, density=replace(STILL, price=0.0))
     everything, draw, view = whole_scene(coordinator), coordinator.run.rasterizer, ring[0]
     whole = coordinator._last._whole
-    probed = _Probed(coordinator.scene, coordinator.device)
-    pictures, signs = whole.pictures([view], probed), random_signs(0)
+    probed = _Probe(coordinator.scene, coordinator.device)
+    pictures, signs = whole.pictures([view], probed.scene), random_signs(0)
     times = 400
     for _ in range(times):
         pictures.backward([view], lambda _, picture: signs(picture.color.shape).to(picture.color))

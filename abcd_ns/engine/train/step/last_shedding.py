@@ -13,6 +13,7 @@ it in expectation. As a share of the view's squared error it is the Gaussian's w
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -20,8 +21,7 @@ from torch import Tensor
 
 from abcd_ns.engine.events import ShedAtEnd, Shedding
 from abcd_ns.engine.layers.whole_pictures import WholePicture
-from abcd_ns.engine.space.tree import BlockTree, Box
-from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.store.scene import BlockScene, ChangedScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -43,41 +43,20 @@ LEAST_ERROR = 1e-10
 """Mean squared difference below which a picture is its photo."""
 
 
-class _Scene:
-    """A scene at rest in which others see something else of each block; see BlockScene."""
-
-    def __init__(self, scene: BlockScene) -> None:
-        self._scene = scene
-        self.tree: BlockTree = scene.tree
-
-    def gaussians(self, block: int) -> Gaussians:
-        return self._scene.gaussians(block)
-
-    def version(self, block: int) -> int:
-        return self._scene.version(block)
-
-    def count(self, block: int) -> int:
-        return self._scene.count(block)
-
-    def bounds(self, block: int) -> Box | None:
-        """Of all: whoever is left is within them."""
-        return self._scene.bounds(block)
-
-
-class _Probed(_Scene):
-    """Its opacities are leaves on a device, of which it remembers what they are worth by what comes back."""
+class _Probe:
+    """Opacities of a scene as leaves on a device: of what comes back it keeps what Gaussians are worth."""
 
     def __init__(self, scene: BlockScene, device: torch.device) -> None:
-        super().__init__(scene)
-        self._device = device
+        self.scene = ChangedScene(scene, self._with_leaf)
+        self._rest, self._device = scene, device
         self._leaves: dict[int, Tensor] = {}
         self._worth: dict[int, Tensor] = {}
 
-    def gaussians(self, block: int) -> Gaussians:
-        found = self._scene.gaussians(block).to(self._device)
+    def _with_leaf(self, block: int, gaussians: Gaussians) -> Gaussians:
+        found = gaussians.to(self._device)
         if block not in self._leaves:
             self._leaves[block] = found.opacities.detach().clone().requires_grad_()
-        return Gaussians(**{**dict(found.items()), "opacities": self._leaves[block]})
+        return replace(found, opacities=self._leaves[block])
 
     def take_note(self) -> None:
         """A view has been drawn backward."""
@@ -92,25 +71,7 @@ class _Probed(_Scene):
     def worth(self, block: int) -> Float[Tensor, "n"]:
         """By now, of those that are drawn; 0 for who showed in no view."""
         found = self._worth.get(block)
-        return torch.zeros(len(self._scene.gaussians(block))) if found is None else found.cpu()
-
-
-class _Without(_Scene):
-    """It lacks those that are worth no more than a price.
-
-    Args:
-        worth: by block.
-    """
-
-    def __init__(self, scene: BlockScene, worth: Sequence[Float[Tensor, "_n"]], price: float) -> None:
-        super().__init__(scene)
-        self._stays = [of_block > price for of_block in worth]
-
-    def gaussians(self, block: int) -> Gaussians:
-        return self._scene.gaussians(block)[self._stays[block]]
-
-    def count(self, block: int) -> int:
-        return int(self._stays[block].sum())
+        return torch.zeros(len(self._rest.gaussians(block))) if found is None else found.cpu()
 
 
 class LastShedding:
@@ -163,8 +124,8 @@ class LastShedding:
         blocks = range(run.scene.tree.num_blocks)
         trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
         chosen = evenly(views, max(trained // RANKING, FEWEST))
-        scene = _Probed(run.scene, run.device)
-        pictures = self._whole.pictures(chosen, scene)
+        probe = _Probe(run.scene, run.device)
+        pictures = self._whole.pictures(chosen, probe.scene)
         drawn = random_signs(run.config.seed)
 
         def gradient(view: View, picture: WholePicture) -> Float[Tensor, "h w 3"]:
@@ -174,15 +135,16 @@ class LastShedding:
 
         for view in chosen:
             pictures.backward([view], gradient)
-            scene.take_note()
+            probe.take_note()
         nowhere = 0.0 if len(chosen) == len(views) else torch.inf
-        worth = [PER_NEPER / len(chosen) * scene.worth(block) for block in blocks]
+        worth = [PER_NEPER / len(chosen) * probe.worth(block) for block in blocks]
         return [torch.where(of_block > 0, of_block, nowhere) for of_block in worth]
 
     @torch.no_grad()
     def _psnr(self, views: list[View], worth: Sequence[Tensor], price: float) -> float:
         """Mean over views without who is worth no more than a price, dB."""
-        pictures = self._whole.pictures(views, _Without(self._run.scene, worth, price))
+        left = ChangedScene(self._run.scene, lambda block, found: found[worth[block] > price])
+        pictures = self._whole.pictures(views, left)
         found = []
         for view, picture in zip(views, pictures.draw(views), strict=True):
             square, counts = self._square(view, picture)
