@@ -188,7 +188,6 @@ class Dispatcher(Trainer):
             step=state.planned,
             seconds=self.stopwatch.seconds,
             sweep=state.sweep,
-            warm=state.warm,
             views=state.views.get(block, len(active.geometry.views)),
             health=state.health.get(block, BlockHealth()),
             light=self._light_of(active.views),

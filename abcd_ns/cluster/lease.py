@@ -37,8 +37,6 @@ class VisitTask:
     seconds: float
     """Training time when it begins."""
     sweep: int
-    warm: float
-    """As in RunState."""
     views: int
     """Worth training the block on."""
     health: BlockHealth

@@ -170,7 +170,6 @@ class VisitWorker:
             step=task.step,
             sweep=task.sweep,
             visit=task.active.number + 1,
-            warm=task.warm,
             views={block: task.views},
             influence={block: {}},
             health={block: copy.copy(task.health)},

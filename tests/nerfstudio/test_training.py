@@ -29,7 +29,7 @@ def configure(data: Path, out: Path, method=methods.abcd, *, steps: int = STEPS,
     config.output_dir, config.vis, config.max_num_iterations = out, "tensorboard", steps
     config.steps_per_save, config.timestamp = 10, "run"
     if config.pipeline.training.warmup:
-        config.pipeline.training.warmup = 0.2  # leaves so short a run some visits
+        config.pipeline.training.warmup = 0.1  # leaves so short a run some visits
     if config.method_name != "abcd-monolithic":
         config.pipeline.blocks = blocks
     config.viewer.quit_on_train_completion = True

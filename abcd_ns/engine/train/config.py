@@ -28,8 +28,9 @@ class TrainingConfig:
     than the nearest that counts, and as much farther than the farthest; 0 counts all, which is exact and
     dear."""
     warmup: float = 0.35
-    """Share of the run, at most, for which a scaffold is trained before blocks are: Gaussians all over the
-    scene, which grow to as many as take no more memory than a visit to the largest block. 0 for none."""
+    """Share of the run for which a scaffold is trained before blocks are: Gaussians all over the scene, which
+    grow to as many as take no more memory than a visit to the largest block. Twice as long, if need be, for
+    each view to be used 24 times; but no longer than that where not all points have room. 0 for none."""
     batch: int = 0
     """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and in the
     warm-up, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
@@ -39,9 +40,9 @@ class TrainingConfig:
     coarse: float = 0.2
     """Share of the run that is trained on reduced pictures: its first half at a quarter of their width, then
     at a half, where no side is below 100 pixels then. 0 for none."""
-    visit_views: int = 32
+    visit_views: int = 64
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
-    first_passes: int = 8
+    first_passes: int = 4
     """Uses of each of these views in a visit of the first sweep."""
     heal: bool = True
     """Where blocks are trained within layers: undo a visit that left its pictures worse than it found them,

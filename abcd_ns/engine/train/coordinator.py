@@ -147,7 +147,6 @@ class Coordinator(Trainer):
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""
         run = self.run
-        self.state.warm = min(self.progress, self.config.warmup)
         live, views = live_gaussians(self.params).detach(), self.views.values()
         owner, options = self.scene.tree.assign(live.means), {"antialiased": self.config.antialiased}
         self.state.influence = influence(live, owner, views, run.rasterizer, **options)

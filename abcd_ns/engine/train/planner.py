@@ -1,6 +1,5 @@
 """Which block is trained next, on which views, and for how many steps."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -15,7 +14,6 @@ from abcd_ns.engine.store.special_blocks import RESERVE, WHOLE
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
-    SCAFFOLD_PASSES,
     VisitPlan,
     passes_at_once,
     passes_for_layers,
@@ -117,12 +115,8 @@ class Planner:
     def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the scaffold of all blocks is trained."""
         crops = {index: view.full for index, view in self._run.views.items()}
-        geometry, steps = VisitGeometry(WHOLE, crops), self._budget.steps
-        taken = UNLIMITED if steps is None else math.ceil(steps * self._config.warmup)
-        if self._scene.rows(RESERVE):
-            uses, batch = SCAFFOLD_PASSES * len(crops), views_per_step(self._config.batch, 1)
-            taken = min(taken, math.ceil(uses / batch))
-        return ActiveVisit(0, geometry, sh_degree, taken, geometry.views, began=began)
+        geometry = VisitGeometry(WHOLE, crops)
+        return ActiveVisit(0, geometry, sh_degree, UNLIMITED, geometry.views, began=began)
 
     def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:
         while True:

@@ -100,11 +100,6 @@ class TrainingRun:
         return self.progress if active is None else active.share(self.progress)
 
     @property
-    def share_of_blocks(self) -> float:
-        """The same, the run's warm-up left out."""
-        return max(self.share - self.state.warm, 0.0) / (1 - self.state.warm)
-
-    @property
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use."""
         active = self.state.active

@@ -103,8 +103,6 @@ class RunState:
     sweep: int = 0
     visit: int = 0
     """Visits begun so far."""
-    warm: float = 0.0
-    """Share of the run that the warm-up took; 0 until it is over."""
     queue: list[VisitPlan] = field(default_factory=list)
     """Visits of this sweep still to come."""
     views: dict[int, int] = field(default_factory=dict)

@@ -15,8 +15,11 @@ from functools import lru_cache
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
 SCAFFOLD_PASSES = 24
-"""Uses of each view in the warm-up, at most, where it has no room for all Gaussians that there are: so few
-soon are as good as they can be."""
+"""Uses of each view in the warm-up: at most, where it has no room for all Gaussians that there are, as so few
+soon are as good as they can be. Elsewhere it goes on until then, for ..."""
+LONGER = 2
+"""... so many times its share of the run at most: a run that cannot often show all views to the whole scene
+can do so even less to each block."""
 
 LEAST_SIDE = 100
 """Of a reduced picture, pixels, at least: what is smaller has too little to teach."""
@@ -36,6 +39,20 @@ class VisitPlan:
 
     block: int
     steps: int
+
+
+def warm_up_is_over(progress: float, uses: float, share: float, waiting: int) -> bool:
+    """Whether the scaffold has been trained for long enough.
+
+    Args:
+        progress: share of the run that is done.
+        uses: of each view so far.
+        share: of the run, for the warm-up: `TrainingConfig.warmup`.
+        waiting: Gaussians that had no room in the scaffold.
+    """
+    if waiting:
+        return uses >= SCAFFOLD_PASSES or progress >= share
+    return progress >= share and (uses >= SCAFFOLD_PASSES or progress >= LONGER * share)
 
 
 def passes_of_sweep(sweep: int, first: int, last: int) -> int:

@@ -8,12 +8,13 @@ from torch import Tensor
 from abcd_ns.engine.events import StepTaken, VisitBegan
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Pace
+from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST, gradients_of
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.schedule import exponential_decay
+from abcd_ns.engine.train.schedule import exponential_decay, warm_up_is_over
 from abcd_ns.engine.train.step.batch import Batch, Rendered
 from abcd_ns.engine.train.step.drawing import StepDrawing
 from abcd_ns.engine.train.step.live_block import LiveBlock
@@ -118,9 +119,16 @@ class VisitTraining:
     def is_over(self) -> bool:
         """Whether the visit has had all its steps or time, or its block has outgrown the device."""
         run, active = self.run, self.run.active
-        is_warm = active.is_whole and run.progress >= run.config.warmup
         out_of_time = run.progress >= min(active.until, 1.0)
-        return active.done >= active.steps or out_of_time or is_warm or self.live.has_outgrown
+        return active.done >= active.steps or out_of_time or self._is_warm or self.live.has_outgrown
+
+    @property
+    def _is_warm(self) -> bool:
+        run, active = self.run, self.run.active
+        if not active.is_whole:
+            return False
+        uses, waiting = active.done * self.batch / len(active.views), run.scene.rows(RESERVE)
+        return warm_up_is_over(run.progress, uses, run.config.warmup, waiting)
 
     def finish(self) -> BlockState:
         """What the visit has made of its block, on the CPU; its layers go."""
@@ -128,6 +136,7 @@ class VisitTraining:
         if not active.is_all:
             self.live.shed()
             self.live.lower_degrees()
+        self.live.hold_back_giants()
         if not active.is_whole:
             self.live.count_visit()
         state = self.run.health.end_visit(active, self.live.detached)

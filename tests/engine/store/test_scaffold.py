@@ -21,6 +21,12 @@ LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
 """Enough for growth."""
 
 
+@pytest.fixture(autouse=True)
+def warm_up_is_not_prolonged(monkeypatch):
+    """Its share of the run is known beforehand then."""
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 1)
+
+
 def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
     return {tuple(row) for row in gaussians.quats.tolist()}
 
@@ -148,9 +154,8 @@ def test_no_more_is_live_than_in_the_largest_block(tmp_path, views, photos, star
     assert most <= 32  # a migrant or two
 
 
-def test_density_controls_clock_starts_anew_when_the_warm_up_is_over(
-    tmp_path, views, photos, start, monkeypatch
-):
+def test_density_controls_clock_is_the_runs(tmp_path, views, photos, start, monkeypatch):
+    """It does not start anew when the warm-up is over, which grows as well."""
     coordinator = make_coordinator(
         tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.5, density=STILL
     )
@@ -162,8 +167,7 @@ def test_density_controls_clock_starts_anew_when_the_warm_up_is_over(
 
     monkeypatch.setattr(DensityControl, "after_step", watch)
     train(coordinator, photos)
-    warm_up, blocks = ([(step + 1) / steps for step in range(20)] for steps in (40, 20))
-    assert found == pytest.approx(warm_up + blocks)
+    assert found == pytest.approx([(step + 1) / 40 for step in range(40)])
 
 
 @pytest.mark.parametrize("most", [0, 125, 400])
@@ -194,7 +198,7 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     tmp_path, views, photos, start, monkeypatch, passes, expected
 ):
     """Where it has no room for all: then, and not only when its share of the run is over."""
-    monkeypatch.setattr("abcd_ns.engine.train.planner.SCAFFOLD_PASSES", passes)
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.SCAFFOLD_PASSES", passes)
     coordinator = make_coordinator(
         tmp_path,
         start,
@@ -210,10 +214,20 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
     while not ended:
         train_step(coordinator, photos)
     assert coordinator.state.step == expected
-    assert coordinator.state.warm == pytest.approx(expected / (10 * len(views)))
     assert not coordinator.state.active
-    train_step(coordinator, photos)
-    rest = 10 * len(views) - coordinator.state.step + 1
-    assert coordinator.visit.live.density_clock(4, coordinator.batch, None).progress == pytest.approx(
-        1 / rest
-    )
+
+
+@pytest.mark.parametrize(("passes", "expected"), [(1, 10), (3, 15), (24, 20)])
+def test_the_warm_up_goes_on_for_twice_its_share_until_each_view_was_used_often_enough(
+    tmp_path, views, photos, start, monkeypatch, passes, expected
+):
+    """Where it has room for all, views are few in relation to the run, or the run is short."""
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.SCAFFOLD_PASSES", passes)
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 2)
+    options = {"blocks": 4, "steps": 50, "scaffold": len(start), "warmup": 0.2, "density": STILL}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    ended = []
+    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    while not ended:
+        train_step(coordinator, photos)
+    assert coordinator.state.step == expected

@@ -148,7 +148,7 @@ def test_degrees_go_in_the_later_half_and_stay_away(tmp_path, blocks):
     photos, whole, gone = Photos(truth, views), 120 * (11 + 27), []
     while not coordinator.finished:
         train_step(coordinator, photos)
-        if coordinator.run.share_of_blocks < degrees.START:
+        if coordinator.run.share < degrees.START:
             assert coordinator.scene.parameters() == whole
         elif coordinator.state.active is not None and GONE in coordinator.visit.live.growth:
             live, adam = coordinator.params["features_rest"], coordinator.optimizers["features_rest"]

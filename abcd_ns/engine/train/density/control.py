@@ -58,10 +58,10 @@ class DensityConfig:
     strategy: Literal["default", "mcmc", "off"] = "default"
     """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""
     refine_start: float = 1 / 60
-    """Share of the run, its warm-up left out, before the first refinement (500 of 30,000 steps in
+    """Share of the run before the first refinement (500 of 30,000 steps in
     splatfacto)."""
     refine_stop: float = 0.5
-    """Share of the run, its warm-up left out, after which the number of Gaussians no longer changes."""
+    """Share of the run after which the number of Gaussians no longer changes."""
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
     where a block sees every step, as splatfacto has it, and 30 elsewhere."""
@@ -104,7 +104,7 @@ class DensityClock:
     """Where the run and the active block stand; all that decides whether to refine."""
 
     progress: float
-    """Share of the run, its warm-up left out, that is done: 0..1."""
+    """Share of the run that is done: 0..1."""
     steps: int
     """Views that were drawn to train the block so far, this step's included."""
     taken: int

@@ -48,8 +48,6 @@ class LiveBlock:
         attach(rest, run.params, run.optimizers, batch=batch)
         run.health.begin_visit(active, run.state.health)
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
-        if active.done == 0 and not active.is_whole:
-            self.hold_back_giants()
         if active.done == 0 and not (active.saved or active.is_whole or active.sole):
             self.lower_degrees()
 
@@ -95,14 +93,14 @@ class LiveBlock:
     def shed(self) -> None:
         """Take out Gaussians that fill too little of the block's views; tells how many."""
         run, before = self._run, len(self)
-        options = {"views": self._views, "progress": run.share_of_blocks}
+        options = {"views": self._views, "progress": run.share}
         self.growth = run.density.shed(run.params, run.optimizers, self.growth, **options)
         run.health.count_shed(before - len(self))
 
     def lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""
         run, seen = self._run, self._run.active.geometry.views
-        if run.density.weighs and run.share_of_blocks >= START:
+        if run.density.weighs and run.share >= START:
             views, trained = [run.views[view] for view in seen], self._views
             self.growth = lower(run.params, run.optimizers, self.growth, views, trained)
 
@@ -144,7 +142,7 @@ class LiveBlock:
         if blocks > 1:
             views = min(views, active.steps * batch)  # once a visit, even with thousands of photos
         return DensityClock(
-            progress=run.share_of_blocks,
+            progress=run.share,
             steps=self.clocks.steps,
             taken=taken,
             views=views,
