@@ -2,6 +2,7 @@
 
 import math
 import tempfile
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from abcd_ns.engine.train.memory import scaffold_size
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
-from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step
+from abcd_ns.engine.train.schedule import views_per_step, warm_up_is_over
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -184,8 +185,8 @@ class Lab:
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
         params, adam = optimizers or nothing_live(start.sh_degree)
         scene = StoredScene(tree, store)
-        passes = SCAFFOLD_PASSES if keep is not None and keep < len(start) else math.inf
-        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), passes))
+        waiting = 0 if keep is None else max(len(start) - keep, 0)
+        steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), waiting))
         return kind(TrainingRun(config, steps, scene, views, self.rasterizer, params, adam))
 
     def train(
@@ -257,15 +258,24 @@ class Lab:
         return float(torch.stack(errors).mean())
 
 
-def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, passes: float = math.inf) -> int:
-    """Steps that draw about so many views of `views`, in the warm-up, of `passes` at most, and after it."""
+def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, waiting: int = 0) -> int:
+    """Steps that draw about so many views of `views`, in the warm-up and after it.
+
+    Args:
+        waiting: Gaussians that have no room in the warm-up.
+    """
     batch, batch_warm = views_per_step(config.batch, blocks), views_per_step(config.batch, 1)
-    warmup = config.warmup if blocks > 1 else 0.0
-    steps = drawn / (warmup * batch_warm + (1 - warmup) * batch)
-    longest = passes * views / batch_warm
-    if longest < warmup * steps:
-        steps = longest + (drawn - longest * batch_warm) / batch
-    return max(round(steps), 1)
+
+    def drawn_in(steps: int) -> int:
+        if blocks == 1 or config.warmup == 0:
+            return steps * batch
+        uses, share = batch_warm / views, config.warmup
+        taken = range(1, steps)
+        is_over = (warm_up_is_over(step / steps, step * uses, share, waiting) for step in taken)
+        warm = next((step for step, over in zip(taken, is_over, strict=True) if over), steps)
+        return warm * batch_warm + (steps - warm) * batch
+
+    return max(bisect_left(range(drawn + 1), drawn, key=drawn_in), 1)
 
 
 def merged(coordinator: Coordinator) -> Gaussians:

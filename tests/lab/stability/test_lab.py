@@ -7,21 +7,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES
 from abcd_ns.lab.stability.lab import Lab, make_stage, steps_for
 
 
 @given(
     drawn=st.integers(100, 10_000),
     views=st.integers(1, 50),
-    passes=st.integers(1, 20),
+    waiting=st.sampled_from([0, 5]),
     blocks=st.sampled_from([1, 8]),
 )
-def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, passes, blocks):
+def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, waiting, blocks):
     config = TrainingConfig(warmup=0.2, batch=0)
-    steps = steps_for(drawn, config, blocks, views, passes)
-    batch, share = (1, 0.0) if blocks == 1 else (4, config.warmup)
-    warm = min(math.ceil(share * steps), math.ceil(passes * views))
-    assert warm + (steps - warm) * batch == pytest.approx(drawn, abs=2 * batch)
+    steps = steps_for(drawn, config, blocks, views, waiting)
+    batch, least = (1, 0.0) if blocks == 1 else (4, 0.2 * steps)
+    enough = SCAFFOLD_PASSES * views
+    warm = min(enough, least) if waiting else min(max(enough, least), 2 * least)
+    assert math.ceil(warm) + (steps - math.ceil(warm)) * batch == pytest.approx(drawn, abs=3 * batch)
 
 
 def test_a_labs_seed_is_that_of_its_trainings_unless_they_name_one(tmp_path):
