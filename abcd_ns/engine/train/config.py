@@ -42,8 +42,9 @@ class TrainingConfig:
     at a half, where no side is below 100 pixels then. 0 for none."""
     visit_views: int = 64
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
-    first_passes: int = 4
-    """Uses of each of these views in a visit of the first sweep."""
+    first_passes: int = 8
+    """Uses of each of these views in a visit of the first sweep, where they are 32 or fewer; in proportion
+    fewer uses where they are more."""
     heal: bool = True
     """Where blocks are trained within layers: undo a visit that left its pictures worse than it found them,
     shrink giants. Values that are no numbers are mended in any case."""

@@ -189,8 +189,9 @@ class Planner:
             remaining = None if self._budget.steps is None else self._budget.steps - state.planned
             last = config.recipe.last_passes or passes_for_layers(state.trained, state.frozen)
             state.trained = state.frozen = 0
-            passes = passes_of_sweep(state.sweep, config.first_passes, last)
             used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
+            most = max(used.values(), default=0)
+            passes = passes_of_sweep(state.sweep, config.first_passes, last, most)
             blocks = self._scene.tree.num_blocks
             passes = passes_at_once(passes, at_once, blocks)
             batch = views_per_step(config.batch, blocks, config.limits.batch_limit)

@@ -24,6 +24,8 @@ can do so even less to each block."""
 LEAST_SIDE = 100
 """Of a reduced picture, pixels, at least: what is smaller has too little to teach."""
 
+FEW_VIEWS = 32
+"""Of a visit: with more, a visit uses each less often, and is as long."""
 LAYER_SHARE = 0.1
 """Of a visit's time, for its layers, where visits are as long as they should be."""
 SHORTER = 4
@@ -55,8 +57,14 @@ def warm_up_is_over(progress: float, uses: float, share: float, waiting: int) ->
     return progress >= share and (uses >= SCAFFOLD_PASSES or progress >= LONGER * share)
 
 
-def passes_of_sweep(sweep: int, first: int, last: int) -> int:
-    """How often each view of a block is used in a visit of this sweep: from `first` up by one to `last`."""
+def passes_of_sweep(sweep: int, first: int, last: int, used: int) -> int:
+    """How often each view of a block is used in a visit of this sweep: from `first` up by one to `last`.
+
+    Args:
+        first: where a visit uses FEW_VIEWS or fewer.
+        used: views that a visit to the block uses that most views see.
+    """
+    first = math.ceil(first * min(1.0, FEW_VIEWS / max(used, 1)))
     return min(first + sweep, max(first, last))
 
 
