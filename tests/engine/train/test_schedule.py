@@ -66,8 +66,13 @@ def test_orders_differ_between_visits_and_seeds():
 
 
 def test_passes_grow_by_one_a_sweep():
-    assert [passes_of_sweep(sweep, 1, 4) for sweep in range(6)] == [1, 2, 3, 4, 4, 4]
-    assert passes_of_sweep(0, 3, 1) == 3
+    assert [passes_of_sweep(sweep, 1, 4, used=5) for sweep in range(6)] == [1, 2, 3, 4, 4, 4]
+    assert passes_of_sweep(0, 3, 1, used=5) == 3
+
+
+def test_a_first_visit_is_about_as_long_with_many_views_as_with_few():
+    assert [passes_of_sweep(0, 8, 23, used) for used in (1, 32, 44, 64)] == [8, 8, 6, 4]
+    assert passes_of_sweep(5, 8, 23, used=64) == 9
 
 
 @pytest.mark.parametrize("frozen", [0, 500, 7_000, 63_000])

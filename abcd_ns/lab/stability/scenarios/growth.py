@@ -6,6 +6,7 @@ from itertools import pairwise
 import torch
 
 from abcd_ns.engine.events import VisitEnded, VisitUndone
+from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_visit
@@ -14,6 +15,7 @@ from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.world.world import ring
 
 CAP = 300
+PASSES, VIEWS = TrainingConfig().first_passes, TrainingConfig().visit_views
 CAMERAS = (1, 2, 3, 10, 100, 1000, 2900, 15_000)
 RESET_EVERY = 150
 """A block's own views between resets: in the midst of visits and at their ends."""
@@ -78,10 +80,13 @@ def resets(lab: Lab) -> Finding:
     return Finding(numbers["worst rise abcd"] <= ALLOWED_RISE, said, numbers)
 
 
-def refinements(cameras: int, sweep: int, config: DensityConfig, *, batch: int = 4, limit: int = 32) -> int:
+def refinements(
+    cameras: int, sweep: int, config: DensityConfig, *, batch: int = 4, limit: int = VIEWS
+) -> int:
     """How often a block that `cameras` see is refined in one visit, once it is warm."""
     control = DensityControl(for_blocks(config, 8))
-    steps = -(-passes_of_sweep(sweep, 4, 8) * views_per_visit(cameras, cameras, limit) // batch)
+    used = views_per_visit(cameras, cameras, limit)
+    steps = -(-passes_of_sweep(sweep, PASSES, PASSES, used) * used // batch)
     views, done = min(cameras, steps * batch), 10 * max(cameras, 1)
     clocks = [
         DensityClock(0.2, done + batch * (k + 1), batch, views, None, 0) for k in range(steps)
@@ -99,14 +104,15 @@ def splatfacto_refines(cameras: int, steps: int = 15_000) -> int:
     "A7",
     "never densifies from 2,900 images on (nerfstudio #2927, #3743)",
     "the schedule for 1 to 15,000 cameras, and splatfacto's",
-    "at least one refinement in each visit of 30 views or more; shorter ones, of fewer than 8 cameras, "
+    "at least one refinement in each visit of 30 views or more; shorter ones, of fewer than 4 cameras, "
     "gather statistics over several",
 )
 def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no training
     """A7: the schedule alone, for captures of 1 to 15,000 photos."""
     least = {cameras: min(refinements(cameras, s, DensityConfig()) for s in range(6)) for cameras in CAMERAS}
     never = [cameras for cameras in CAMERAS if splatfacto_refines(cameras) == 0]
-    too_short = [c for c in CAMERAS if passes_of_sweep(0, 4, 8) * views_per_visit(c, c, 32) < 30]
+    used = {cameras: views_per_visit(cameras, cameras, VIEWS) for cameras in CAMERAS}
+    too_short = [c for c, views in used.items() if passes_of_sweep(0, PASSES, PASSES, views) * views < 30]
     passed = all(count >= 1 for cameras, count in least.items() if cameras not in too_short)
     said = {
         "abcd": f"at least {min(c for n, c in least.items() if n not in too_short)} refinement in each visit "
