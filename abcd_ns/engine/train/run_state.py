@@ -183,8 +183,8 @@ class RunState:
         known = {int(b): {int(v): value for v, value in row.items()} for b, row in data["influence"].items()}
         health = {from_text(block): BlockHealth(**record) for block, record in data.get("health", {}).items()}
         changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
-        known = {name: value for name, value in data.items() if name not in GONE}
-        return RunState(**{**known, **changed})
+        same = {name: value for name, value in data.items() if name not in GONE}
+        return RunState(**{**same, **changed})
 
 
 class Stopwatch:

@@ -58,8 +58,7 @@ class DensityConfig:
     strategy: Literal["default", "mcmc", "off"] = "default"
     """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""
     refine_start: float = 1 / 60
-    """Share of the run before the first refinement (500 of 30,000 steps in
-    splatfacto)."""
+    """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
     """Share of the run after which the number of Gaussians no longer changes."""
     refine_every: int = 0
