@@ -1,15 +1,14 @@
-"""Trains blocks at once: lends them to workers, and takes in what they made of them in a fixed order.
+"""Trains blocks at once: lends them to workers, and takes in what they made of them in a planned order.
 
-Visits are numbered as they are planned. Visit k begins from what visits up to k - `lag` have left, whoever is
-done sooner or later, and they are taken in one after the other. So what a run computes depends on `lag` and
-not on timing, nor on who was lost: whoever is given a visit again makes the same of it. With a lag of 1 a
-run is the same as one by a coordinator alone.
+`lag` visits are out. They are taken in one after the other, as they would end if all steps took equally long,
+and whenever one is, the next begins from what is there by then. Whoever is done sooner waits for its turn. So
+what a run computes depends on `lag` and not on timing, nor on who was lost: whoever is given a visit again
+makes the same of it. With a lag of 1 a run is the same as one by a coordinator alone.
 
 Blocks that are trained at once each make good their share of what is missing (`shared_residual`), in shorter
 visits. What it still costs was measured (docs/cluster.md).
 """
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -56,6 +55,8 @@ class Lent:
     lease: Lease
     taken: int
     """Gaussians that waited for the block and are in its visit."""
+    ends: int
+    """Steps that each place for a visit has been given when this one is to end."""
     submitted: bool = False
     losses: int = 0
     outcome: VisitOutcome | None = None
@@ -73,9 +74,9 @@ class Dispatcher(Trainer):
         super().__init__(local.run)
         self._local, self.workers = local, workers
         self._lag = lag or SLACK * workers.count
-        self._lent: deque[Lent] = deque()
+        self._lent: list[Lent] = []
         self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}
-        self._leases = 0
+        self._leases = self._ended = 0
         self._counted = self.state.step
         self.refused = 0
         """Answers that came after their lease was given up."""
@@ -199,7 +200,7 @@ class Dispatcher(Trainer):
         state.in_flight.append(active)
         own = self.workers.share(state_for_visit(scene, block))
         lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks}))
-        return Lent(active, lease, len(mail or ()))
+        return Lent(active, lease, len(mail or ()), self._ended + active.steps)
 
     def _light_of(self, views: Sequence[int]) -> dict[int, Tensor]:
         """The transforms of these views by now."""
@@ -273,10 +274,12 @@ class Dispatcher(Trainer):
         lent.lease, lent.submitted = self._lease(lent.lease), False
 
     def _take_in_first(self) -> bool:
-        """Take in the visit that was begun first, if it is done; whether it was."""
-        if self._lent[0].outcome is None:
+        """Take in the visit that is to end first, if it is done; whether it was."""
+        lent = min(self._lent, key=lambda lent: lent.ends)
+        if lent.outcome is None:
             return False
-        lent = self._lent.popleft()
+        self._lent.remove(lent)
+        self._ended = lent.ends
         outcome, active, state = lent.outcome, lent.active, self.state
         block, sweep = active.geometry.block, lent.lease.task.sweep
         state.in_flight.remove(active)

@@ -12,6 +12,7 @@ from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded, WorkerLost
 from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES
@@ -141,6 +142,22 @@ def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(m
     assert not out
     assert sweeps == list(range(run.state.sweep + 1))
     assert run.state.step == 60
+
+
+def test_who_has_a_long_visit_keeps_no_other_from_beginning_the_next(make, photos):
+    run = make(workers=2, density=STILL, lag=2, steps=8)
+    run.state.views = dict.fromkeys(range(4), 8)
+    run.state.queue = [VisitPlan(block, steps) for block, steps in enumerate((4, 1, 1, 2))]
+    heard = []
+
+    def hear(event) -> None:
+        if isinstance(event, VisitBegan | VisitEnded):
+            heard.append((type(event) is VisitBegan, event.visit))
+
+    run.announce.subscribe(hear)
+    train(run, photos)
+    assert [visit for begins, visit in heard if not begins] == [1, 2, 0, 3]
+    assert heard.index((True, 3)) < heard.index((False, 0))
 
 
 def test_nobody_who_moves_meanwhile_is_lost(make, photos):

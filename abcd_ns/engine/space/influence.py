@@ -2,11 +2,13 @@
 
 The influence of a Gaussian on a view is the mean, over the image, of its weight alpha T in each pixel: what
 it adds to the picture once everything before it is taken into account. Influences of all Gaussians and of
-the background add up to 1. It is the gradient of the picture's sum by the Gaussian's colour, so that one
-drawing forward and backward finds it for all of them.
+the background add up to 1. Rasterizers leave them on their way back, whatever is drawn (`weigh`): so the
+warm-up, which draws the whole scene, tells them of the views that it has used (`InfluenceTable`), and the
+others are drawn small for it.
 """
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -15,8 +17,12 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Rasterizer, Shot
+from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.types import Gaussians, View
 
+AT_ONCE = 1 << 17
+"""Gaussians times views that are drawn in one pass: of small images, calls would cost more than what they
+compute."""
 COARSE, COARSE_SIDE = 2, 80
 """Influences of whole views are found in images that are so many times smaller, and those of large images in
 such as are about so many pixels long: what counts is the order of a block's views, and there may be many."""
@@ -30,26 +36,27 @@ Influence = dict[int, dict[int, float]]
 def weights(
     gaussians: Gaussians,
     rasterizer: Rasterizer,
-    shot: Shot,
-    front: Float[Tensor, "h w"] | None = None,
+    shots: Sequence[Shot],
+    fronts: Sequence[Float[Tensor, "_h _w"]] = (),
     *,
     antialiased: bool = False,
-) -> Float[Tensor, "n"]:
-    """The sum of each Gaussian's weights over the pixels of a shot.
+) -> Float[Tensor, "v n"]:
+    """For each shot the sum of each Gaussian's weights over its pixels.
 
     Args:
-        front: transmittance of what lies before everything in the shot; None for nothing.
+        fronts: transmittances of what lies before everything in each shot; none for nothing.
     """
-    # Colours of 1/2 for all, as these are far from the clamp at 0 that would stop the gradient.
-    dark = torch.zeros_like(gaussians.features_dc).requires_grad_()
-    grey = replace(gaussians.detach(), features_dc=dark)
-    (raster,) = rasterizer.draw(grey, [shot], sh_degree=0, antialiased=antialiased)
-    red = raster.color[..., 0]
-    total = red.sum() if front is None else (front * red).sum()
-    if not total.requires_grad:
-        return gaussians.means.new_zeros(len(gaussians))
-    (found,) = torch.autograd.grad(total, dark)
-    return found.flatten(1)[:, 0] / SH_C0
+    if not len(gaussians):
+        return gaussians.means.new_zeros(len(shots), 0)
+    rasters = rasterizer.draw(gaussians.detach(), shots, sh_degree=0, antialiased=antialiased, weigh=True)
+    depths = [raster.depth for raster in rasters]
+    if fronts:
+        depths = [depth * front for depth, front in zip(depths, fronts, strict=True)]
+    leaves = {id(raster.info): raster.info["weights"] for raster in rasters}
+    found = torch.autograd.grad(sum(depth.sum() for depth in depths), list(leaves.values()))
+    # Shots that share an info are its cameras, in their order.
+    rows = {info: iter(each) for info, each in zip(leaves, found, strict=True)}
+    return torch.stack([next(rows[id(raster.info)]) for raster in rasters])
 
 
 @torch.no_grad()
@@ -73,7 +80,8 @@ def share_shown(
     antialiased: bool = False,
 ) -> float:
     """The influence of some Gaussians on the view of a shot that shows all of them; see `weights`."""
-    found = weights(gaussians, rasterizer, shot, front, antialiased=antialiased)
+    fronts = () if front is None else (front,)
+    found = weights(gaussians, rasterizer, [shot], fronts, antialiased=antialiased)
     return round(float(found.sum()) / shot.view.full.pixels, DIGITS)
 
 
@@ -92,14 +100,66 @@ def influence(
     """
     blocks = int(owner.max()) + 1 if len(owner) else 0
     found: Influence = {}
-    for view in views:
-        small = coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE))
-        each = weights(gaussians, rasterizer, Shot(small, small.full), antialiased=antialiased)
-        sums = each.new_zeros(blocks).index_add_(0, owner, each) / small.full.pixels
-        for block, value in enumerate(sums.tolist()):
-            if round(value, DIGITS) > 0:
-                found.setdefault(block, {})[view.index] = round(value, DIGITS)
+    views, most = tuple(views), max(AT_ONCE // max(len(gaussians), 1), 1)
+    for few in (views[k : k + most] for k in range(0, len(views), most)):
+        small = [coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE)) for view in few]
+        shots = [Shot(view, view.full) for view in small]
+        each = weights(gaussians, rasterizer, shots, antialiased=antialiased)
+        sums = each.new_zeros(len(few), blocks).index_add_(1, owner, each).tolist()
+        for view, row in zip(small, sums, strict=True):
+            _put(found, view.index, [value / view.full.pixels for value in row])
     return found
+
+
+class InfluenceTable:
+    """The influence of every block on the views that were drawn to train the whole scene, as it was when each
+    was last drawn: the drawings know it. On the device; nothing waits for it until it is asked for.
+
+    Args:
+        known: to begin with.
+    """
+
+    def __init__(
+        self, tree: BlockTree, views: Iterable[int], known: Influence, device: torch.device | str
+    ) -> None:
+        self._tree, self._means = tree, None
+        self._row = {view: row for row, view in enumerate(views)}
+        table = torch.full((len(self._row), tree.num_blocks), torch.nan)
+        for view in {view for of_block in known.values() for view in of_block}:
+            row = [known.get(block, {}).get(view, 0.0) for block in range(tree.num_blocks)]
+            table[self._row[view]] = torch.tensor(row)
+        self._table = table.to(device)
+
+    def note(self, means: Tensor, views: Sequence[View], weights: Float[Tensor, "v n"]) -> None:
+        """Some views have been drawn.
+
+        Args:
+            means: of all Gaussians; their blocks are looked up when it is another tensor than before.
+            weights: of each in each view, summed over pixels.
+        """
+        if self._means is not means:
+            self._means, self._owner = means, self._tree.assign(means.detach())
+        sums = weights.new_zeros(len(views), self._tree.num_blocks).index_add_(1, self._owner, weights)
+        for view, row in zip(views, sums, strict=True):
+            self._table[self._row[view.index]] = row / view.full.pixels
+
+    def found(self) -> tuple[Influence, set[int]]:
+        """By now, and the views that it says nothing of."""
+        influence: Influence = {}
+        unknown = set[int]()
+        for view, row in zip(self._row, self._table.tolist(), strict=True):
+            if not all(map(math.isfinite, row)):
+                unknown.add(view)
+                continue
+            _put(influence, view, row)
+        return influence, unknown
+
+
+def _put(influence: Influence, view: int, row: Sequence[float]) -> None:
+    """What a view shows of each block."""
+    for block, value in enumerate(row):
+        if share := round(value, DIGITS):
+            influence.setdefault(block, {})[view] = share
 
 
 def coarser(view: View, times: int) -> View:

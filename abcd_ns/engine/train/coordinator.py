@@ -146,10 +146,11 @@ class Coordinator(Trainer):
 
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""
-        run = self.run
-        live, views = live_gaussians(self.params).detach(), self.views.values()
-        owner, options = self.scene.tree.assign(live.means), {"antialiased": self.config.antialiased}
-        self.state.influence = influence(live, owner, views, run.rasterizer, **options)
+        known, unknown = self.visit.influence.found()
+        views = [self.views[view] for view in sorted(unknown)]
+        live, options = live_gaussians(self.params).detach(), {"antialiased": self.config.antialiased}
+        others = influence(live, self.scene.tree.assign(live.means), views, self.run.rasterizer, **options)
+        self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
 
     # -- at rest -------------------------------------------------------------------------------------
 
@@ -171,6 +172,8 @@ class Coordinator(Trainer):
             self.health.look_over()
             updates = {LIVE: self.visit.live.detached()}
             active.saved = True
+            if self.visit.influence is not None:
+                self.state.influence, _ = self.visit.influence.found()
         self.run.rest(self.scene.tree, updates, within)
 
     def restore(self) -> None:

@@ -127,7 +127,7 @@ class RunState:
     """What had to be mended, by block."""
     active: ActiveVisit | None = None
     in_flight: list[ActiveVisit] = field(default_factory=list)
-    """Visits that workers are at, in the order in which they will count. Who goes on from here plans them
+    """Visits that workers are at, in the order in which they began. Who goes on from here plans them
     anew."""
     seconds: float = 0.0
     """Training time up to the last save."""

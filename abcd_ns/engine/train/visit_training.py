@@ -8,6 +8,7 @@ from torch import Tensor
 from abcd_ns.engine.events import StepTaken, VisitBegan
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Pace
+from abcd_ns.engine.space.influence import InfluenceTable
 from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST, gradients_of
 from abcd_ns.engine.train.layer_source import LayerSource
@@ -39,6 +40,8 @@ class VisitTraining:
         self.run, self._visits = run, visits
         self.steps = StepDrawing(run, source)
         self.live = live or LiveBlock(run)
+        self.influence: InfluenceTable | None = None
+        """In the warm-up: what its drawings show of every block."""
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
 
     @property
@@ -56,7 +59,9 @@ class VisitTraining:
         self.live.attach(active, self.batch)
         block, seen = None if active.is_whole else active.geometry.block, len(active.geometry.views)
         run.scene.set_live(block, self._visits.attached(active))
-        gaussians = len(self.live)
+        gaussians, self.influence = len(self.live), None
+        if active.is_whole:
+            self.influence = InfluenceTable(run.scene.tree, run.views, state.influence, run.device)
         run.announce(VisitBegan(active.number, state.sweep, block, active.steps, seen, gaussians))
         before = run.stopwatch.seconds
         self.steps.begin_visit(active)
@@ -95,6 +100,7 @@ class VisitTraining:
         run, active = self.run, self.run.active
         taken = len(rendered.pictures)
         self._adapt_light(rendered)
+        self._note_influence(rendered)
         run.state.step += 1
         active.done += 1
         sound, psnr = run.health.end_step(psnrs)
@@ -106,6 +112,13 @@ class VisitTraining:
             self.live.lower_degrees()
             self.live.hold_back_giants()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
+
+    def _note_influence(self, rendered: Rendered) -> None:
+        if self.influence is None or len(rendered.infos) != 1 or "weights" not in rendered.infos[0]:
+            return
+        weights = rendered.infos[0]["weights"].grad
+        if weights is not None:
+            self.influence.note(self.run.params["means"], rendered.views, weights)
 
     def _adapt_light(self, rendered: Rendered) -> None:
         run = self.run

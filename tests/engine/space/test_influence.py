@@ -7,10 +7,19 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.render import Shot, TorchRasterizer
-from abcd_ns.engine.space.influence import coarser, influence, weights, weights_by_pixel, worth_training
+from abcd_ns.engine.space.influence import (
+    InfluenceTable,
+    coarser,
+    influence,
+    weights,
+    weights_by_pixel,
+    worth_training,
+)
+from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 SH_0 = 0.28209479177387814
@@ -51,15 +60,15 @@ def test_large_views_are_looked_at_in_small_pictures():
         random_gaussians(20, size=0.2), torch.zeros(20, dtype=torch.int64), views, Watching("never")
     )
     assert set(sizes) == {(80, 60)}
-    full = weights(random_gaussians(20, size=0.2), TorchRasterizer("never"), Shot(views[0], views[0].full))
+    full = weights(random_gaussians(20, size=0.2), TorchRasterizer("never"), [Shot(views[0], views[0].full)])
     assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
 
 
 def test_what_stands_in_front_takes_its_share(rasterizer):
     gaussians, (view,) = random_gaussians(20, seed=2, size=0.2), ring_of_views(1)
     shot = Shot(view, view.full)
-    bare = weights(gaussians, rasterizer, shot)
-    half = weights(gaussians, rasterizer, shot, torch.full((view.height, view.width), 0.5))
+    (bare,) = weights(gaussians, rasterizer, [shot])
+    (half,) = weights(gaussians, rasterizer, [shot], [torch.full((view.height, view.width), 0.5)])
     assert float(bare.sum()) > 1
     torch.testing.assert_close(half, bare / 2)
 
@@ -78,7 +87,43 @@ def test_a_view_that_sees_nothing_has_no_influence(rasterizer):
     view = ring_of_views(2)[1]
     behind = replace(random_gaussians(5), means=view.center + view.viewmat[2, :3] * -5 + torch.zeros(5, 3))
     assert influence(behind, torch.zeros(5, dtype=torch.int64), [view], rasterizer) == {}
-    assert not weights(behind, rasterizer, Shot(view, view.full)).any()
+    assert not weights(behind, rasterizer, [Shot(view, view.full)]).any()
+
+
+def test_each_shot_has_its_own_weights(rasterizer):
+    gaussians, views = random_gaussians(40, seed=3, size=0.15), ring_of_views(3)
+    shots = [Shot(view, view.full) for view in views]
+    together = weights(gaussians, rasterizer, shots)
+    for shot, row in zip(shots, together, strict=True):
+        torch.testing.assert_close(row, weights(gaussians, rasterizer, [shot])[0])
+
+
+def test_a_table_tells_what_was_noted_last_and_of_which_views_nothing(rasterizer):
+    gaussians, views = random_gaussians(80, seed=4, size=0.15), ring_of_views(4)
+    tree = build_kd(gaussians.means, 3)
+    table = InfluenceTable(tree, range(4), {}, "cpu")
+    found = weights(gaussians, rasterizer, [Shot(view, view.full) for view in views])
+    table.note(gaussians.means, views[1:2], 2 * found[1:2])
+    table.note(gaussians.means, views[:3], found[:3])
+    table.note(gaussians.means, views[3:], found[3:] * torch.nan)  # a step that was no number
+    known, unknown = table.found()
+    owner = tree.assign(gaussians.means)
+    for view in views[:3]:
+        for block in range(3):
+            share = float(found[view.index][owner == block].sum()) / view.full.pixels
+            assert known[block][view.index] == pytest.approx(share, abs=2e-6)
+    assert unknown == {3}
+    assert InfluenceTable(tree, range(4), known, "cpu").found() == (known, unknown)
+
+
+def test_moved_rows_are_looked_up_anew(rasterizer):
+    gaussians, (view,) = random_gaussians(80, seed=4, size=0.15), ring_of_views(1)
+    tree = build_kd(gaussians.means, 2)
+    (found,) = weights(gaussians, rasterizer, [Shot(view, view.full)])
+    table, few = InfluenceTable(tree, [0], {}, "cpu"), torch.where(tree.assign(gaussians.means) == 1)[0]
+    table.note(gaussians.means, [view], found[None])
+    table.note(gaussians.means[few], [view], found[None, few])
+    assert list(table.found()[0]) == [1]
 
 
 def test_a_coarser_view_sees_the_same():
@@ -105,6 +150,7 @@ def test_the_fewest_views_that_hold_the_share(views, share):
 
 
 def grown(tmp_path, start, views, **options):
+    density = DensityConfig(strategy="off")
     return make_coordinator(
         tmp_path,
         start,
@@ -113,8 +159,7 @@ def grown(tmp_path, start, views, **options):
         steps=60,
         scaffold=40,
         warmup=0.2,
-        density=DensityConfig(strategy="off"),
-        **options,
+        **{"density": density, **options},
     )
 
 
@@ -143,6 +188,32 @@ def test_with_a_share_of_one_every_view_counts(tmp_path, views, photos, start):
     coordinator = grown(tmp_path, start, views, influence_share=1.0)
     train(coordinator, photos)
     assert all(count == 5 for count in coordinator.state.views.values())
+
+
+def test_the_warm_up_draws_no_view_again_that_it_has_used(tmp_path, views, photos, start, monkeypatch):
+    drawn = []
+
+    def watched(gaussians, owner, others, *rest, **options):
+        drawn.extend(others)
+        return influence(gaussians, owner, others, *rest, **options)
+
+    monkeypatch.setattr("abcd_ns.engine.train.coordinator.influence", watched)
+    coordinator = grown(tmp_path, start, views, density=DensityConfig(price=1.0, refine_every=1000))
+    train(coordinator, photos, steps=4)
+    coordinator.save()
+    coordinator.restore()
+    noted = coordinator.visit.influence.found()
+    assert len(noted[1]) == 1
+    while coordinator.state.visit == 1:
+        train(coordinator, photos, steps=coordinator.state.step + 1)
+    assert not drawn
+    known = coordinator.state.influence
+    whole = Gaussians.cat([coordinator.scene.gaussians(block) for block in range(4)])
+    for view in views:
+        seen = float(weights(whole, coordinator.run.rasterizer, [Shot(view, view.full)]).sum())
+        assert sum(row[view.index] for row in known.values()) == pytest.approx(
+            seen / view.full.pixels, rel=0.1
+        )
 
 
 def test_influence_survives_a_save(tmp_path, views, photos, start):

@@ -88,7 +88,7 @@ def test_what_no_view_shows_goes_and_what_fills_much_stays(tmp_path, blocks):
     assert HIDDEN / 2 < len(start) - len(left) < 2 * HIDDEN
     assert sum(record.shed for record in coordinator.state.health.values()) == len(start) - len(left)
     assert float(left.means[:, 2].max()) < 40
-    fills = sum(weights(left, coordinator.run.rasterizer, Shot(view, view.full)) for view in views)
+    fills = weights(left, coordinator.run.rasterizer, [Shot(view, view.full) for view in views]).sum(dim=0)
     assert float((fills > 0.5).float().mean()) > 0.9
 
 
@@ -113,7 +113,9 @@ def test_statistics_weigh_what_lies_before_the_block(tmp_path, views, photos, st
     coordinator.loss(batch, rendered.pictures, [photos(sample.view.index, sample.crop)]).backward()
     found = run.density.count(run.params["means"], rendered.infos)["weight"]
     owner = torch.cat([torch.full((coordinator.scene.count(b),), b) for b in range(2)])
-    expected = weights(before, rasterizer, replace(sample.shot, frozen=None, z_window=None))[owner == block]
+    expected = weights(before, rasterizer, [replace(sample.shot, frozen=None, z_window=None)])[
+        0, owner == block
+    ]
     assert len(live) == len(expected) == len(found)
     # Layers are half floats, and by tiles where blocks interleave.
     torch.testing.assert_close(found, expected, rtol=0.05, atol=0.05)

@@ -136,6 +136,8 @@ class Rendered:
     infos: tuple[dict[str, Any], ...]
     lights: Sequence[Use] = ()
     """What the pictures were drawn in."""
+    views: Sequence[View] = ()
+    """That the pictures are of."""
 
 
 def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "3"]:

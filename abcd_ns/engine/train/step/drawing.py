@@ -172,4 +172,5 @@ class StepDrawing:
             for sample, transform in zip(samples, lights, strict=True)
             if transform is not None
         ]
-        return Rendered(pictures, tuple(raster.transmittance for raster in rasters), infos, uses)
+        views = tuple(sample.view for sample in samples)
+        return Rendered(pictures, tuple(raster.transmittance for raster in rasters), infos, uses, views)

@@ -97,7 +97,7 @@ def giants(lab: Lab) -> Finding:
 def unseen_weights(lab: Lab, gaussians: Gaussians, views: list[View]) -> Tensor:
     """[n] the sum of each Gaussian's weights over all views."""
     shots = [Shot(view, view.full) for view in views]
-    return torch.stack([weights(gaussians, lab.rasterizer, shot) for shot in shots]).sum(dim=0)
+    return weights(gaussians, lab.rasterizer, shots).sum(dim=0)
 
 
 @scenario(
