@@ -92,6 +92,18 @@ def test_what_no_view_shows_goes_and_what_fills_much_stays(tmp_path, blocks):
     assert float((fills > 0.5).float().mean()) > 0.9
 
 
+def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_sheds(tmp_path, views, photos):
+    start = random_gaussians(60, seed=7, size=0.12)
+    faint = torch.arange(60) % 3 == 0
+    start = replace(start, opacities=torch.where(faint[:, None], -6.0, 1.0))  # a sigmoid of 1/404
+    options = {"blocks": 2, "steps": 12, "density": replace(STILL, price=1e-6)}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    train(coordinator, photos)
+    left = whole_scene(coordinator)
+    assert len(left) == 40
+    assert float(torch.sigmoid(left.opacities).min()) >= 1 / 255
+
+
 def test_without_a_price_everything_stays(tmp_path, views, photos):
     options = {"blocks": 2, "steps": 30, "density": replace(STILL, price=0.0)}
     coordinator = make_coordinator(tmp_path, some_hidden(), views, **options)

@@ -5,10 +5,17 @@ engine/train/test_coordinator, A17 data/test_dataparser_reads, A18 data/test_pho
 data/test_dataparser_refuses, A21 engine/render/test_rasterizer_self_check.
 """
 
-import pytest
+from dataclasses import replace
+from types import SimpleNamespace
 
+import pytest
+import torch
+
+from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.lab.stability.command import SCENARIOS
 from abcd_ns.lab.stability.lab import Lab
+from abcd_ns.lab.stability.scenarios.borders import alpha_in_air
+from tests.reference.scenes import random_gaussians, ring_of_views
 
 SLOW = {"A3", "A6", "A8", "A9", "A11", "A12", "A13", "A14", "A15", "A16", "A19"}
 """These train for long. What they rest on is in engine/train/test_health too."""
@@ -40,3 +47,13 @@ def test_scenario(scenario, tmp_path):
 
 def test_every_way_to_fail_has_its_scenario():
     assert list(SCENARIOS) == [f"A{number}" for number in range(1, 23)]
+
+
+def test_alpha_in_air_is_that_of_what_stands_in_the_cell_around_the_origin(tmp_path):
+    views = ring_of_views(3)
+    tree = build_kd(torch.zeros(0, 3), 1).split(0, 2, 0.5)  # the origin is below
+    gaussians = replace(random_gaussians(30, size=0.1), opacities=torch.full((30, 1), 4.0))
+    inside = replace(gaussians, means=0.3 * gaussians.means.clamp(-1, 1))
+    lab, above = Lab(tmp_path), replace(inside, means=inside.means + torch.tensor([0.0, 0.0, 1.0]))
+    assert float(alpha_in_air(lab, SimpleNamespace(gaussians=inside), tree, views)) > 0.05
+    assert float(alpha_in_air(lab, SimpleNamespace(gaussians=above), tree, views)) < 0.01

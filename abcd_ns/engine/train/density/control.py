@@ -19,6 +19,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
+from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.density.shedding import WEIGHED, faded, may_grow, price_at, weigh, worthless
 
@@ -255,7 +256,8 @@ class DensityControl:
         views: int,
         progress: float,
     ) -> dict[str, Tensor]:
-        """Take out what fills too little of the block's `views`, at a share of the run.
+        """Take out what fills too little of the block's `views`, at a share of the run, and what is too faint
+        for any picture to show, which nothing would train again.
 
         Returns:
             The block's statistics from now on.
@@ -263,7 +265,7 @@ class DensityControl:
         if not self.weighs or any(name not in growth for name in WEIGHED):
             return growth
         price = price_at(self.config.price, progress, self.config.refine_stop)
-        drop = worthless(growth, views, price)
+        drop = worthless(growth, views, price) | (torch.sigmoid(params["opacities"][:, 0]) < MIN_ALPHA)
         growth = faded(growth, views)
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)

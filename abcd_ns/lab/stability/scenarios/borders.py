@@ -85,7 +85,7 @@ def alpha_in_air(lab: Lab, trained: Trained, tree: BlockTree, views: list[View])
     cell, gaussians = tree.cell(int(tree.assign(torch.zeros(1, 3)))), trained.gaussians
     alphas = []
     for view in views:
-        window = ray_interval(cell, view, view.full)
+        window = ray_interval(cell, view, lab.rasterizer.window_grid(view.full))
         with torch.no_grad():
             raster = lab.rasterizer(gaussians, view, sh_degree=gaussians.sh_degree, z_window=window)
         alphas.append(1 - raster.transmittance)
