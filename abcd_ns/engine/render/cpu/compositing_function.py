@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -110,15 +111,26 @@ def _composite(
     job: Job, table: Tensor, origins: Float[Tensor, "2 a"], keep_states: bool
 ) -> tuple[Float[Tensor, "5 p a"], list[_Drawn]]:
     """Draw all levels. Returns the final state of every tile and, if kept, what was drawn."""
-    lists, trace = job.lists, list[_Drawn]()
+    trace = list[_Drawn]()
+    # Not a closure: where shapes are checked, the checks of one are made anew at every drawing.
+    draw = partial(_draw_level, job, table, origins, trace if keep_states else None)
+    return _walk(job.lists, _initial_state(job.lists, table.dtype), draw), trace
 
-    def draw(level: Level, columns: Tensor | None, state: Tensor) -> Tensor:
-        if keep_states:
-            trace.append(_Drawn(level, columns, state))
-        params = gather_params(table, _level_ranks(lists, level, columns))
-        return job.kernels.forward(params, _take(origins, level, columns), state)
 
-    return _walk(lists, _initial_state(lists, table.dtype), draw), trace
+def _draw_level(
+    job: Job,
+    table: Tensor,
+    origins: Float[Tensor, "2 a"],
+    trace: list[_Drawn] | None,
+    level: Level,
+    columns: Tensor | None,
+    state: Tensor,
+) -> Tensor:
+    """A DrawChunk that draws, and notes in `trace` what it draws on."""
+    if trace is not None:
+        trace.append(_Drawn(level, columns, state))
+    params = gather_params(table, _level_ranks(job.lists, level, columns))
+    return job.kernels.forward(params, _take(origins, level, columns), state)
 
 
 class Composite(torch.autograd.Function):
@@ -189,15 +201,24 @@ def pair_weights(drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "q"]:
     table, origins = _table(drawn, job)
     table = table[: job.kernels.fragments.opacity + 1]
     per_slot = table.new_zeros(lists.ranks.numel())
-
-    def weigh(level: Level, columns: Tensor | None, state: Tensor) -> Tensor:
-        params = gather_params(table, _level_ranks(lists, level, columns))
-        state, weights = job.kernels.weigh(params, _take(origins, level, columns), state)
-        _put(per_slot, level, columns, weights.reshape(-1))
-        return state
-
-    _walk(lists, _initial_state(lists, table.dtype)[:1], weigh)
+    _walk(lists, _initial_state(lists, table.dtype)[:1], partial(_weigh_level, job, table, origins, per_slot))
     return per_slot[lists.slots]
+
+
+def _weigh_level(
+    job: Job,
+    table: Tensor,
+    origins: Float[Tensor, "2 a"],
+    per_slot: Tensor,
+    level: Level,
+    columns: Tensor | None,
+    state: Tensor,
+) -> Tensor:
+    """A DrawChunk that writes weights to `per_slot`."""
+    params = gather_params(table, _level_ranks(job.lists, level, columns))
+    state, weights = job.kernels.weigh(params, _take(origins, level, columns), state)
+    _put(per_slot, level, columns, weights.reshape(-1))
+    return state
 
 
 def deepen(drawn: Float[Tensor, "d m"], job: Job, state: Float[Tensor, "2 p t"]) -> Float[Tensor, "2 p t"]:
@@ -205,14 +226,24 @@ def deepen(drawn: Float[Tensor, "d m"], job: Job, state: Float[Tensor, "2 p t"])
     lists, fragments = job.lists, job.kernels.fragments
     table, origins = _table(drawn, job)
     table = table[: fragments.opacity + 1]
-
-    def draw(level: Level, columns: Tensor | None, before: Tensor) -> Tensor:
-        params = gather_params(table, _level_ranks(lists, level, columns))
-        return median_chunk(fragments, lists.sheet.side, params, _take(origins, level, columns), before)
-
     after = state.clone()
-    after[:, :, lists.tiles] = _walk(lists, state.index_select(2, lists.tiles), draw)
+    deepen_level = partial(_deepen_level, job, table, origins)
+    after[:, :, lists.tiles] = _walk(lists, state.index_select(2, lists.tiles), deepen_level)
     return after
+
+
+def _deepen_level(
+    job: Job,
+    table: Tensor,
+    origins: Float[Tensor, "2 a"],
+    level: Level,
+    columns: Tensor | None,
+    before: Tensor,
+) -> Tensor:
+    """A DrawChunk of `deepen`'s states."""
+    lists, fragments = job.lists, job.kernels.fragments
+    params = gather_params(table, _level_ranks(lists, level, columns))
+    return median_chunk(fragments, lists.sheet.side, params, _take(origins, level, columns), before)
 
 
 def _table(drawn: Float[Tensor, "d m"], job: Job) -> tuple[Float[Tensor, "c n"], Float[Tensor, "2 a"]]:

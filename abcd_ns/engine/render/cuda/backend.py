@@ -6,6 +6,7 @@ Importing this module imports gsplat, which compiles its CUDA extension at the f
 import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import gsplat
@@ -186,14 +187,13 @@ def _forward_absgrad(means2d: Float[Tensor, "c n 2"], drawn: Float[Tensor, "m 2"
     The hook holds `means2d` weakly, and `means2d` holds `drawn`: otherwise the graph would hold itself.
     """
     means2d.drawn_from = drawn
-    reference = weakref.ref(means2d)
+    means2d.register_hook(partial(_copy_absgrad, weakref.ref(means2d)))
 
-    def copy(_: Tensor) -> None:
-        target = reference()
-        if target is not None:
-            target.absgrad = target.drawn_from.absgrad[: target.numel() // 2].view_as(target)
 
-    means2d.register_hook(copy)
+def _copy_absgrad(reference: weakref.ref, _: Tensor) -> None:
+    target = reference()
+    if target is not None:
+        target.absgrad = target.drawn_from.absgrad[: target.numel() // 2].view_as(target)
 
 
 def _info(own: Projected, view: View) -> dict[str, Any]:

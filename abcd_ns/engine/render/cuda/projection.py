@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from gsplat.cuda._wrapper import spherical_harmonics
@@ -46,12 +47,6 @@ class Cameras:
     ) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c 3 3"], Float[Tensor, "c 3"]]:
         """World to camera, intrinsics, and centres in world space; all new ones in one copy. Those that take
         gradients are not kept."""
-
-        def make(new: list[int]) -> Sequence[Tensor]:
-            for k in new:  # holds on to tensors by whose identity views are known
-                self._views[id(views[k].viewmat), id(views[k].K)] = views[k]
-            return _rows([views[k] for k in new]).to(like, non_blocking=True).unbind()
-
         place = like.device, like.dtype
         if len(self._views) > MOST_KEPT:
             self._views, self._poses = {}, Kept()
@@ -59,21 +54,24 @@ class Cameras:
             packed = _rows(views).to(like)
         else:
             keys = [(id(view.viewmat), id(view.K), *place) for view in views]
-            packed = torch.stack(self._poses.get(keys, make))
+            packed = torch.stack(self._poses.get(keys, partial(self._new_poses, views, like)))
         return packed[:, :16].view(-1, 4, 4), packed[:, 16:25].view(-1, 3, 3), packed[:, 25:]
 
     def corners(self, crops: Sequence[Crop], like: Tensor) -> Float[Tensor, "c 2"]:
         """(x, y) of upper left corners; written there by the device, so nothing is copied."""
-
-        def make(new: list[int]) -> Sequence[Tensor]:
-            pairs, place = (
-                ((crops[k].x, crops[k].y) for k in new),
-                {"dtype": like.dtype, "device": like.device},
-            )
-            return [torch.stack([torch.full((), x, **place) for x in pair]) for pair in pairs]
-
         keys = [(crop.x, crop.y, like.device, like.dtype) for crop in crops]
-        return torch.stack(self._corners.get(keys, make))
+        return torch.stack(self._corners.get(keys, partial(_new_corners, crops, like)))
+
+    def _new_poses(self, views: Sequence[View], like: Tensor, new: list[int]) -> Sequence[Tensor]:
+        for k in new:  # holds on to tensors by whose identity views are known
+            self._views[id(views[k].viewmat), id(views[k].K)] = views[k]
+        return _rows([views[k] for k in new]).to(like, non_blocking=True).unbind()
+
+
+def _new_corners(crops: Sequence[Crop], like: Tensor, new: list[int]) -> Sequence[Tensor]:
+    place = {"dtype": like.dtype, "device": like.device}
+    pairs = ((crops[k].x, crops[k].y) for k in new)
+    return [torch.stack([torch.full((), x, **place) for x in pair]) for pair in pairs]
 
 
 def _rows(views: Sequence[View]) -> Float[Tensor, "c 28"]:
