@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
+from abcd_ns.lab.results.tables import markdown
 from benchmarks.runs import print_machine
 from tests.nerfstudio.crash_training import Trainings, gaussians, run_folder
 from tests.reference.colmap_scene import write_scene
@@ -326,14 +327,13 @@ def carry_out(trials: list[Trial], console: Console) -> list[Row]:
 
 def table(rows: list[Row]) -> str:
     """In Markdown."""
-    lines = ["| fault | tried | survived | steps lost |", "| --- | ---: | ---: | ---: |"]
+    lines = [["fault", "tried", "survived", "steps lost"]]
     for row in rows:
         slowest = f" (gone within {max(row.seconds):.1f} s)" if row.seconds else ""
-        lost = "-" if row.lost is None else row.lost
-        lines.append(f"| {row.fault}{slowest} | {row.tried} | {row.survived} | {lost} |")
-    tried, survived = sum(row.tried for row in rows), sum(row.survived for row in rows)
-    lines.append(f"| all | {tried} | {survived} | {sum(row.lost or 0 for row in rows)} |")
-    return "\n".join(lines)
+        lost = "-" if row.lost is None else str(row.lost)
+        lines.append([row.fault + slowest, str(row.tried), str(row.survived), lost])
+    sums = (sum(row.tried for row in rows), sum(row.survived for row in rows))
+    return markdown([*lines, ["all", *map(str, sums), str(sum(row.lost or 0 for row in rows))]])
 
 
 def main(args: Args) -> int:
