@@ -29,7 +29,6 @@ from abcd_ns.cli.plan.forecast import (
 from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
-from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
@@ -38,7 +37,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.fit import GB, Demand, Fit, device_budget, find_fit
-from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.nerfstudio.workers import BLOCKS_EACH
 
 R = TypeVar("R")
@@ -129,9 +128,7 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
         manager = config.setup(device="cpu", test_mode="val")
         dataset = manager.train_dataset
         points = dataset.metadata["points3D_xyz"].float()
-        views = views_of(dataset.cameras)
-        near = near_plane(points, views)
-        views = [replace(view, near=near) for view in views]
+        views = training_views(dataset.cameras, points)
         pixels = methods.abcd.config.pipeline.training.point_pixels
         thinned = thin_points(points, dataset.metadata["points3D_rgb"].float(), views, pixels)
         return Capture(*thinned, views, manager.dataparser.factor)
