@@ -18,11 +18,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
 from abcd_ns.lab.results.tables import markdown
@@ -35,8 +36,6 @@ KILLED = -signal.SIGKILL
 TRAINING_STEPS = 36
 IMPORTED = ("tests.nerfstudio.crash_training", "tyro", "rich.progress")
 """What processes import of this module's own imports, once for all of them."""
-SECONDS_BETWEEN_LINES = 10.0
-"""Where the output is no terminal."""
 
 
 @dataclass
@@ -68,8 +67,7 @@ class Row:
     """Until the process was gone, where that was measured."""
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What came of one fault."""
 
     survived: bool
@@ -77,8 +75,7 @@ class Outcome:
     seconds: float | None = None
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """One fault to be injected."""
 
     fault: str
@@ -303,25 +300,16 @@ def same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> b
 def carry_out(trials: list[Trial], console: Console) -> list[Row]:
     """Inject one after the other."""
     rows: dict[str, Row] = {}
-    began = said = time.monotonic()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("", total=len(trials))
-        for number, trial in enumerate(trials):
-            progress.update(task, description=trial.fault)
-            outcome, now = trial.inject(), time.monotonic()
-            if not console.is_terminal and now - said > SECONDS_BETWEEN_LINES:
-                said, left = now, (now - began) / (number + 1) * (len(trials) - number - 1)
-                print(f"{number + 1}/{len(trials)}  {trial.fault}  about {left:.0f} s left", flush=True)
-            if not outcome.survived:
-                console.print(f"not survived: {trial.fault}, {trial.inject}", markup=False)
-            row = rows.setdefault(trial.fault, Row(trial.fault))
-            row.tried += 1
-            row.survived += outcome.survived
-            if outcome.lost is not None:
-                row.lost = (row.lost or 0) + outcome.lost
-            row.seconds += [] if outcome.seconds is None else [outcome.seconds]
-            progress.advance(task)
+    for trial in track(trials, "Faults", console=console):
+        outcome = trial.inject()
+        if not outcome.survived:
+            console.print(f"not survived: {trial.fault}, {trial.inject}", markup=False)
+        row = rows.setdefault(trial.fault, Row(trial.fault))
+        row.tried += 1
+        row.survived += outcome.survived
+        if outcome.lost is not None:
+            row.lost = (row.lost or 0) + outcome.lost
+        row.seconds += [] if outcome.seconds is None else [outcome.seconds]
     return list(rows.values())
 
 
