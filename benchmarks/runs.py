@@ -15,7 +15,6 @@ import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from abcd_ns import methods
-from abcd_ns.engine.types import Gaussians
 from abcd_ns.machine import describe_machine, describe_versions
 
 
@@ -125,12 +124,6 @@ def trainer_alone(data: Path, **options: Any) -> Iterator[Trainer]:
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         yield trainer
-
-
-def whole(coordinator: Any) -> Gaussians:
-    """All blocks of a scene in one list."""
-    scene = coordinator.scene
-    return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)])
 
 
 def print_machine(*more: str) -> None:

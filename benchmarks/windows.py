@@ -31,7 +31,8 @@ from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.results.tables import markdown
-from benchmarks.runs import Asked, whole, write_runs
+from abcd_ns.lab.stability.lab import merged
+from benchmarks.runs import Asked, write_runs
 from benchmarks.visit import Capture, begin, read
 
 COUNTED = 10
@@ -93,7 +94,7 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
         options = {"steps": args.steps, "seed": seed, "rasterizer": rasterizer}
         coordinator = begin(capture, args.blocks, Path(folder), **options)
         train(coordinator, capture, rasterizer, counts)
-        gaussians, tree = whole(coordinator), coordinator.scene.tree
+        gaussians, tree = merged(coordinator), coordinator.scene.tree
         coordinator.close()
     painter = Painter(
         MemoryScene(tree, gaussians), capture.held_out, rasterizer, ownership="fragments", pass_gaussians=0
@@ -101,10 +102,10 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
     errors, gaps = [], []
     for view in capture.held_out:
         with torch.no_grad():
-            merged = rasterizer(gaussians, view, sh_degree=3).color.clamp(0, 1)
+            picture = rasterizer(gaussians, view, sh_degree=3).color.clamp(0, 1)
         composited = painter.picture(view, PaintSettings(3)).color.clamp(0, 1)
-        errors.append(psnr(merged, capture.held_out_photo(view.index, view.full)))
-        gaps.append(psnr(merged, composited))
+        errors.append(psnr(picture, capture.held_out_photo(view.index, view.full)))
+        gaps.append(psnr(picture, composited))
     drawn = max(counts.own + counts.frozen, 1)
     return Row(
         side=side,

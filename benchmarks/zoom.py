@@ -19,7 +19,8 @@ from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.results.tables import markdown
-from benchmarks.runs import Asked, whole, write_runs
+from abcd_ns.lab.stability.lab import merged
+from benchmarks.runs import Asked, write_runs
 from benchmarks.visit import Capture, begin, read
 
 
@@ -51,7 +52,7 @@ def run(captures: dict[int, Capture], antialiased: bool, seed: int, args: Args) 
         coordinator = begin(capture, args.blocks, Path(folder), rasterizer=rasterizer, **options)
         while not coordinator.finished:
             train_step(coordinator, capture.photo)
-        gaussians = whole(coordinator)
+        gaussians = merged(coordinator)
         coordinator.close()
     scores = {size: score(gaussians, captures[size], rasterizer, antialiased) for size in args.drawn}
     return Row(antialiased, seed, scores, len(gaussians))
