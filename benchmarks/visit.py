@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 import tyro
@@ -109,17 +109,10 @@ class StageClock:
         return {stage: 1e3 * self.seconds[stage] / self.views for stage in STAGES}
 
 
-class Source(Protocol):
-    """Where a capture is read from."""
-
-    data: Path
-    downscale: int
-
-
-def read(source: Source) -> Capture:
+def read(data: Path, downscale: int) -> Capture:
     """The capture in RAM."""
-    parser = AbcdDataParserConfig(downscale_factor=source.downscale)
-    manager = AbcdDataManagerConfig(data=source.data, dataparser=parser).setup(device="cpu", test_mode="val")
+    parser = AbcdDataParserConfig(downscale_factor=downscale)
+    manager = AbcdDataManagerConfig(data=data, dataparser=parser).setup(device="cpu", test_mode="val")
     points = manager.train_dataset.metadata["points3D_xyz"].float()
     train = training_views(manager.train_dataset.cameras, points)
     held_out = training_views(manager.eval_dataset.cameras, points, train[0].near)
@@ -257,7 +250,7 @@ def profile(coordinator: Coordinator, photo: PhotoReader, steps: int, top: int =
 
 def main(args: Args) -> None:
     """Run both and print the table."""
-    capture = read(args)
+    capture = read(args.data, args.downscale)
     with tempfile.TemporaryDirectory() as folder:
         one = run(capture, 1, args, Path(folder) / "one")
         several = run(capture, args.blocks, args, Path(folder) / "several")

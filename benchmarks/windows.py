@@ -136,7 +136,7 @@ def train(coordinator: Coordinator, capture: Capture, rasterizer: TorchRasterize
 
 def main(args: Args) -> None:
     """Run all pairs, print the table, write the file."""
-    capture, rows = read(args), []
+    capture, rows = read(args.data, args.downscale), []
     TorchRasterizer().warm_up()
     for k, seed in enumerate(args.seeds):
         for side in args.sides if k % 2 == 0 else args.sides[::-1]:  # the machine's speed drifts

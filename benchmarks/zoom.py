@@ -7,7 +7,7 @@ cameras: at twice the size pixels are half as large, as if the camera stood at h
 """
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
@@ -70,7 +70,7 @@ def score(gaussians: Gaussians, capture: Capture, rasterizer: TorchRasterizer, a
 
 def main(args: Args) -> None:
     """Run all pairs, print the table, write the file."""
-    captures = {size: read(replace(args, downscale=size)) for size in {args.downscale, *args.drawn}}
+    captures = {size: read(args.data, size) for size in {args.downscale, *args.drawn}}
     rows = []
     table = [["antialiased", "seed", "Gaussians", *(f"1/{size}" for size in args.drawn)]]
     for seed in args.seeds:
