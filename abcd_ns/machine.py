@@ -74,7 +74,7 @@ def describe_versions() -> Versions:
 def without_home(text: str) -> str:
     """Results are published: whose home folder it was is nobody's business."""
     home = str(Path.home())
-    return text if home == "/" else re.sub(rf"{re.escape(home)}(?![\w.-])", "~", text)
+    return text if home == "/" else re.sub(rf"(?<![\w.-]){re.escape(home)}(?![\w.-])", "~", text)
 
 
 def peak_rss_bytes() -> int:

@@ -9,37 +9,28 @@ thread, so that neither the machine nor how busy it is has a part in the result.
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from statistics import fmean
 
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded
+from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio import pipeline
 from abcd_ns.nerfstudio.workers import make_worker, setup_of
-from benchmarks.runs import runs_of, trainer_alone
+from benchmarks.runs import Asked, runs_of, trainer_alone
 from tests.cluster.in_process import InProcessWorkers
 
 
-@dataclass
-class Args:
+@dataclass(kw_only=True)
+class Args(Asked):
     """What to compare."""
 
-    data: Path
-    """As of ns-train."""
-    downscale: int = 4
-    """Divides the photos' width and height."""
     visits: tuple[int, ...] = (1, 2, 4, 8)
     """Numbers of visits at once to try."""
-    blocks: int = 8
-    """Of the scene."""
-    steps: int = 500
-    """Of each run, the warm-up included."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """A run of each number of visits for each."""
-    out: Path | None = None
-    """Where to write the results, JSON; runs that it has are not made again."""
+    """A run of each number of visits for each. Runs that `out` has are not made again."""
 
 
 @dataclass
@@ -74,8 +65,9 @@ def run(args: Args, at_once: int, seed: int) -> Row:
             out -= 1
             row.visits += 1
 
-    asked = {"downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
-    with trainer_alone(args.data, seed=seed, workers=2, **asked) as trainer:  # any number but 1 dispatches
+    with trainer_alone(
+        args.data, seed=seed, workers=2, **args.of_all_runs
+    ) as trainer:  # any number but 1 dispatches
         coordinator = trainer.pipeline.coordinator
         coordinator.announce.subscribe(hear)
         trainer.train()
@@ -86,15 +78,14 @@ def run(args: Args, at_once: int, seed: int) -> Row:
 
 def main(args: Args) -> None:
     """Make the runs that are missing, print the table, write the file after each."""
-    asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
     keys = [(at_once, seed) for seed in args.seeds for at_once in args.visits]
+    asked = {"data": args.data.name, **args.of_all_runs}
     rows = runs_of(args.out, asked, Row, keys, partial(run, args))
-    print("| visits at once |" + "".join(f" seed {seed} |" for seed in args.seeds) + " mean |")
-    print("| ---: " * (2 + len(args.seeds)) + "|")
+    table = [["visits at once", *(f"seed {seed}" for seed in args.seeds), "mean"]]
     for at_once in args.visits:
         psnrs = [rows[at_once, seed].psnr for seed in args.seeds]
-        told = [f"{psnr:.2f}" for psnr in (*psnrs, sum(psnrs) / len(psnrs))]
-        print(f"| {at_once} | {' | '.join(told)} |")
+        table.append([str(at_once), *(f"{psnr:.2f}" for psnr in (*psnrs, fmean(psnrs)))])
+    print(markdown(table))
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.lab.results.tables import markdown
 from abcd_ns.machine import describe_versions
 from tests.reference.device_counts import Counts
 from tests.reference.gsplat_stand_ins import lent
@@ -228,11 +229,9 @@ COLUMNS = {
 
 def table(runs: list[dict[str, Any]]) -> str:
     """For the terminal: a step of each run, and a visit's beginning and end."""
-    names = [f"{each['blocks']} block{'s' * (each['blocks'] > 1)}" for each in runs]
-    lines = ["| a step | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(runs)]
-    for key, title in COLUMNS.items():
-        lines.append(f"| {title} | " + " | ".join(f"{each[key]:,.1f}" for each in runs) + " |")
-    return "\n".join(lines)
+    rows = [["a step", *(f"{each['blocks']} block{'s' * (each['blocks'] > 1)}" for each in runs)]]
+    rows += [[title, *(f"{each[key]:,.1f}" for each in runs)] for key, title in COLUMNS.items()]
+    return markdown(rows)
 
 
 def main(args: Args) -> None:

@@ -18,13 +18,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
 from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
+from abcd_ns.lab.results.tables import markdown
 from benchmarks.runs import print_machine
 from tests.nerfstudio.crash_training import Trainings, gaussians, run_folder
 from tests.reference.colmap_scene import write_scene
@@ -34,8 +36,6 @@ KILLED = -signal.SIGKILL
 TRAINING_STEPS = 36
 IMPORTED = ("tests.nerfstudio.crash_training", "tyro", "rich.progress")
 """What processes import of this module's own imports, once for all of them."""
-SECONDS_BETWEEN_LINES = 10.0
-"""Where the output is no terminal."""
 
 
 @dataclass
@@ -67,8 +67,7 @@ class Row:
     """Until the process was gone, where that was measured."""
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What came of one fault."""
 
     survived: bool
@@ -76,8 +75,7 @@ class Outcome:
     seconds: float | None = None
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """One fault to be injected."""
 
     fault: str
@@ -302,38 +300,28 @@ def same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> b
 def carry_out(trials: list[Trial], console: Console) -> list[Row]:
     """Inject one after the other."""
     rows: dict[str, Row] = {}
-    began = said = time.monotonic()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("", total=len(trials))
-        for number, trial in enumerate(trials):
-            progress.update(task, description=trial.fault)
-            outcome, now = trial.inject(), time.monotonic()
-            if not console.is_terminal and now - said > SECONDS_BETWEEN_LINES:
-                said, left = now, (now - began) / (number + 1) * (len(trials) - number - 1)
-                print(f"{number + 1}/{len(trials)}  {trial.fault}  about {left:.0f} s left", flush=True)
-            if not outcome.survived:
-                console.print(f"not survived: {trial.fault}, {trial.inject}", markup=False)
-            row = rows.setdefault(trial.fault, Row(trial.fault))
-            row.tried += 1
-            row.survived += outcome.survived
-            if outcome.lost is not None:
-                row.lost = (row.lost or 0) + outcome.lost
-            row.seconds += [] if outcome.seconds is None else [outcome.seconds]
-            progress.advance(task)
+    for trial in track(trials, "Faults", console=console):
+        outcome = trial.inject()
+        if not outcome.survived:
+            console.print(f"not survived: {trial.fault}, {trial.inject}", markup=False)
+        row = rows.setdefault(trial.fault, Row(trial.fault))
+        row.tried += 1
+        row.survived += outcome.survived
+        if outcome.lost is not None:
+            row.lost = (row.lost or 0) + outcome.lost
+        row.seconds += [] if outcome.seconds is None else [outcome.seconds]
     return list(rows.values())
 
 
 def table(rows: list[Row]) -> str:
     """In Markdown."""
-    lines = ["| fault | tried | survived | steps lost |", "| --- | ---: | ---: | ---: |"]
+    lines = [["fault", "tried", "survived", "steps lost"]]
     for row in rows:
         slowest = f" (gone within {max(row.seconds):.1f} s)" if row.seconds else ""
-        lost = "-" if row.lost is None else row.lost
-        lines.append(f"| {row.fault}{slowest} | {row.tried} | {row.survived} | {lost} |")
-    tried, survived = sum(row.tried for row in rows), sum(row.survived for row in rows)
-    lines.append(f"| all | {tried} | {survived} | {sum(row.lost or 0 for row in rows)} |")
-    return "\n".join(lines)
+        lost = "-" if row.lost is None else str(row.lost)
+        lines.append([row.fault + slowest, str(row.tried), str(row.survived), lost])
+    sums = (sum(row.tried for row in rows), sum(row.survived for row in rows))
+    return markdown([*lines, ["all", *map(str, sums), str(sum(row.lost or 0 for row in rows))]])
 
 
 def main(args: Args) -> int:

@@ -8,13 +8,15 @@ Every run has a process and one thread of its own. Runs of ns-train's trainer.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
 
 from abcd_ns.engine.train.health import health
+from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.runs.evaluate import mean_psnr
-from benchmarks.runs import runs_of, trainer_alone
+from benchmarks.runs import Asked, runs_of, trainer_alone
 
 
 def _without_undo() -> None:
@@ -39,22 +41,14 @@ ARMS: dict[str, Callable[[], None]] = {
 """By name, what is done to the rules in a run's process."""
 
 
-@dataclass
-class Args:
+@dataclass(kw_only=True)
+class Args(Asked):
     """What to compare."""
 
     data: tuple[Path, ...]
-    """As of ns-train; several."""
-    downscale: int = 4
-    """Divides the photos' width and height."""
-    blocks: int = 8
-    """Of the scene."""
-    steps: int = 500
-    """Of each run, the warm-up included."""
+    """The scenes, as of ns-train."""
     seeds: tuple[int, ...] = (0, 1)
-    """A run of each arm for each."""
-    out: Path | None = None
-    """Where to write the results, JSON; runs that it has are not made again."""
+    """A run of each arm for each. Runs that `out` has are not made again."""
 
 
 @dataclass
@@ -73,36 +67,29 @@ class Row:
     """Of held-out views, merged, dB."""
 
 
-@dataclass
-class Runs:
-    """Makes a row: trains, and looks at held-out views."""
-
-    args: Args
-
-    def __call__(self, scene: str, arm: str, seed: int) -> Row:
-        ARMS[arm]()
-        data = next(path for path in self.args.data if path.name == scene)
-        asked = {"downscale": self.args.downscale, "blocks": self.args.blocks, "steps": self.args.steps}
-        with trainer_alone(data, seed=seed, **asked) as trainer:
-            trainer.train()
-            coordinator = trainer.pipeline.coordinator
-            records = coordinator.state.health.values()
-            giants, undone = (sum(getattr(r, name) for r in records) for name in ("giants", "undone"))
-            return Row(scene, arm, seed, giants, undone, coordinator.count(), mean_psnr(trainer.pipeline))
+def run(args: Args, scene: str, arm: str, seed: int) -> Row:
+    """Train and look at held-out views."""
+    ARMS[arm]()
+    data = next(path for path in args.data if path.name == scene)
+    with trainer_alone(data, seed=seed, **args.of_all_runs) as trainer:
+        trainer.train()
+        coordinator = trainer.pipeline.coordinator
+        records = coordinator.state.health.values()
+        giants, undone = (sum(getattr(r, name) for r in records) for name in ("giants", "undone"))
+        return Row(scene, arm, seed, giants, undone, coordinator.count(), mean_psnr(trainer.pipeline))
 
 
 def main(args: Args) -> None:
     """Make the runs that are missing, write the file after each, print the table."""
-    asked = {"downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
     scenes = [data.name for data in args.data]
     keys = [(scene, arm, seed) for seed in args.seeds for scene in scenes for arm in ARMS]
-    rows = runs_of(args.out, asked, Row, keys, Runs(args))
-    print("| scene, seed | " + " | ".join(ARMS) + " |")
-    print("| --- |" + " ---: |" * len(ARMS))
+    rows = runs_of(args.out, args.of_all_runs, Row, keys, partial(run, args))
+    table = [["scene, seed", *ARMS]]
     for scene in scenes:
         for seed in args.seeds:
             psnrs = [f"{rows[scene, arm, seed].psnr:.2f}" for arm in ARMS]
-            print(f"| {scene}, {seed} | {' | '.join(psnrs)} |")
+            table.append([f"{scene}, {seed}", *psnrs])
+    print(markdown(table))
 
 
 if __name__ == "__main__":

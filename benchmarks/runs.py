@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,30 @@ import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 
 from abcd_ns import methods
-from abcd_ns.engine.types import Gaussians
 from abcd_ns.machine import describe_machine, describe_versions
+
+
+@dataclass(kw_only=True)
+class Asked:
+    """What benchmarks of whole runs are asked for."""
+
+    data: Path
+    """The scene, as of ns-train."""
+    downscale: int = 4
+    """Divides the photos' width and height."""
+    blocks: int = 8
+    """Of the scene."""
+    steps: int = 500
+    """Of each run, the warm-up included."""
+    seeds: tuple[int, ...] = (0,)
+    """Each run once for each."""
+    out: Path | None = None
+    """Where to write the results, JSON."""
+
+    @property
+    def of_all_runs(self) -> dict[str, Any]:
+        """What they share, but for where the scene is; options of `config_of`."""
+        return {"downscale": self.downscale, "blocks": self.blocks, "steps": self.steps}
 
 
 def write_runs(out: Path | None, asked: Mapping[str, Any], runs: Sequence[Any]) -> None:
@@ -102,12 +124,6 @@ def trainer_alone(data: Path, **options: Any) -> Iterator[Trainer]:
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         yield trainer
-
-
-def whole(coordinator: Any) -> Gaussians:
-    """All blocks of a scene in one list."""
-    scene = coordinator.scene
-    return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)])
 
 
 def print_machine(*more: str) -> None:

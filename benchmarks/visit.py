@@ -12,9 +12,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 import tyro
@@ -28,7 +28,6 @@ from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render import Rasterizer, make_rasterizer
 from abcd_ns.engine.render.loss import psnrs
-from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
@@ -41,9 +40,10 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.lab.results.tables import markdown
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.nerfstudio.views import training_views
 from benchmarks.runs import print_machine
 
 STAGES = (
@@ -109,28 +109,21 @@ class StageClock:
         return {stage: 1e3 * self.seconds[stage] / self.views for stage in STAGES}
 
 
-class Source(Protocol):
-    """Where a capture is read from."""
-
-    data: Path
-    downscale: int
-
-
-def read(source: Source) -> Capture:
+def read(data: Path, downscale: int) -> Capture:
     """The capture in RAM."""
-    parser = AbcdDataParserConfig(downscale_factor=source.downscale)
-    manager = AbcdDataManagerConfig(data=source.data, dataparser=parser).setup(device="cpu", test_mode="val")
+    parser = AbcdDataParserConfig(downscale_factor=downscale)
+    manager = AbcdDataManagerConfig(data=data, dataparser=parser).setup(device="cpu", test_mode="val")
     points = manager.train_dataset.metadata["points3D_xyz"].float()
-    near = near_plane(points, views_of(manager.train_dataset.cameras))
-    sides = (_views_and_photos(dataset, near) for dataset in (manager.train_dataset, manager.eval_dataset))
+    train = training_views(manager.train_dataset.cameras, points)
+    held_out = training_views(manager.eval_dataset.cameras, points, train[0].near)
     start = gaussians_from_points(points, manager.train_dataset.metadata["points3D_rgb"])
-    return Capture(*next(sides), *next(sides), start)
+    photos = (_photos(dataset) for dataset in (manager.train_dataset, manager.eval_dataset))
+    return Capture(train, next(photos), held_out, next(photos), start)
 
 
-def _views_and_photos(dataset: AbcdDataset, near: float) -> tuple[list[View], PhotoReader]:
-    views = [replace(view, near=near) for view in views_of(dataset.cameras)]
-    photos = [dataset.photos.image(view.index).float() / 255 for view in views]
-    return views, lambda view, crop: photos[view][crop.slices]
+def _photos(dataset: AbcdDataset) -> PhotoReader:
+    photos = [dataset.photos.image(row).float() / 255 for row in range(len(dataset))]
+    return lambda view, crop: photos[view][crop.slices]
 
 
 def begin(
@@ -257,21 +250,16 @@ def profile(coordinator: Coordinator, photo: PhotoReader, steps: int, top: int =
 
 def main(args: Args) -> None:
     """Run both and print the table."""
-    capture = read(args)
+    capture = read(args.data, args.downscale)
     with tempfile.TemporaryDirectory() as folder:
         one = run(capture, 1, args, Path(folder) / "one")
         several = run(capture, args.blocks, args, Path(folder) / "several")
     print_machine(f"{args.data.name}, {len(capture.views)} views, {args.seconds:g} s a run; ms a view\n")
-    print(f"| stage | 1 block | {args.blocks} blocks |\n| --- | ---: | ---: |")
+    clocks, table = (one, several), [["stage", "1 block", f"{args.blocks} blocks"]]
     for stage in STAGES:
-        print(
-            f"| {stage} | "
-            + " | ".join(f"{clock.ms_per_view()[stage]:.2f}" for clock in (one, several))
-            + " |"
-        )
-    totals = (sum(clock.seconds.values()) / clock.views for clock in (one, several))
-    print("| all | " + " | ".join(f"{1e3 * total:.2f}" for total in totals) + " |")
-    print(f"| views | {one.views} | {several.views} |")
+        table.append([stage, *(f"{clock.ms_per_view()[stage]:.2f}" for clock in clocks)])
+    table.append(["all", *(f"{1e3 * sum(clock.seconds.values()) / clock.views:.2f}" for clock in clocks)])
+    print(markdown([*table, ["views", *(str(clock.views) for clock in clocks)]]))
 
 
 if __name__ == "__main__":

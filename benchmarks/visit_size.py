@@ -23,23 +23,14 @@ import tyro
 from torch import Tensor
 
 from abcd_ns.engine.events import VisitBegan
-from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render import make_rasterizer
-from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.scaffold import blocks_at_rest
-from abcd_ns.engine.store.scene import StoredScene
-from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import passes_for_layers
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop
 from benchmarks.runs import print_machine
-from tests.reference.scenes import random_gaussians, ring_of_views
+from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 STAGES = ("survey", "attach", "layers", "steps", "end")
 
@@ -71,27 +62,25 @@ def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], 
     gaussians = random_gaussians(count, seed=args.seed, size=size, sh_degree=3)
     views = ring_of_views(args.views, width=args.width, height=2 * args.width // 3)
     noise = torch.rand(views[0].height, views[0].width, 3, generator=torch.Generator().manual_seed(args.seed))
-    tree = build_kd(gaussians.means, args.blocks)
-    store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-    store.commit(blocks_at_rest(tree, gaussians))
-    config = TrainingConfig(
-        recipe=Recipe(sh_ramp=0.0, visit_steps=args.steps),
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    coordinator = make_coordinator(
+        folder,
+        gaussians,
+        views,
+        blocks=args.blocks,
+        steps=1_000_000,
+        kind=Coordinator,
+        ram_bytes=16 << 30,
+        rasterizer=make_rasterizer("auto", device),
+        device=device,
+        sh_ramp=0.0,
+        visit_steps=args.steps,
         warmup=0.0,
         visit_views=args.views,
         commit_seconds=0.0 if args.commits else 1e9,
         density=DensityConfig(strategy="off"),
     )
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    run = TrainingRun(
-        config,
-        Budget(steps=1_000_000),
-        StoredScene(tree, store, 16 << 30),
-        views,
-        make_rasterizer("auto", device),
-        *nothing_live(3, device),
-        device=device,
-    )
-    return Coordinator(run), lambda _, crop: noise[crop.slices]
+    return coordinator, lambda _, crop: noise[crop.slices]
 
 
 def timed(seconds: Counter, stage: str, method: Callable[..., Any]) -> Callable[..., Any]:

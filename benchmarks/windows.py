@@ -13,7 +13,7 @@ Trains the same scene with windows of each side, by the torch rasterizer and for
 
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -30,31 +30,25 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from benchmarks.runs import whole, write_runs
+from abcd_ns.lab.results.tables import markdown
+from abcd_ns.lab.stability.lab import merged
+from benchmarks.runs import Asked, write_runs
 from benchmarks.visit import Capture, begin, read
 
 COUNTED = 10
 """Fragments are counted in one of so many steps."""
 
 
-@dataclass
-class Args:
+@dataclass(kw_only=True)
+class Args(Asked):
     """What to compare."""
 
-    data: Path
-    """The scene, as for `ns-train abcd --data`."""
     downscale: int = 1
-    """Divides the photos' width and height."""
-    blocks: int = 8
-    """Of the scene."""
     steps: int = 200
-    """Of each run."""
     seeds: tuple[int, ...] = (0, 1)
     """A pair of runs for each."""
     sides: tuple[int, ...] = (4, 16)
     """Of the windows' tiles, px; multiples of 4."""
-    out: Path | None = None
-    """Where to write the results, JSON."""
 
 
 @dataclass
@@ -79,7 +73,7 @@ class Row:
     """Of the fragments that a step draws."""
     ms_per_view: float
     gaussians: int
-    steps: int = field(default=0)
+    steps: int
 
 
 def count(rasterizer: TorchRasterizer, own: Gaussians, samples: tuple[Sample, ...], counts: Counts) -> None:
@@ -100,7 +94,7 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
         options = {"steps": args.steps, "seed": seed, "rasterizer": rasterizer}
         coordinator = begin(capture, args.blocks, Path(folder), **options)
         train(coordinator, capture, rasterizer, counts)
-        gaussians, tree = whole(coordinator), coordinator.scene.tree
+        gaussians, tree = merged(coordinator), coordinator.scene.tree
         coordinator.close()
     painter = Painter(
         MemoryScene(tree, gaussians), capture.held_out, rasterizer, ownership="fragments", pass_gaussians=0
@@ -108,10 +102,10 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
     errors, gaps = [], []
     for view in capture.held_out:
         with torch.no_grad():
-            merged = rasterizer(gaussians, view, sh_degree=3).color.clamp(0, 1)
+            picture = rasterizer(gaussians, view, sh_degree=3).color.clamp(0, 1)
         composited = painter.picture(view, PaintSettings(3)).color.clamp(0, 1)
-        errors.append(psnr(merged, capture.held_out_photo(view.index, view.full)))
-        gaps.append(psnr(merged, composited))
+        errors.append(psnr(picture, capture.held_out_photo(view.index, view.full)))
+        gaps.append(psnr(picture, composited))
     drawn = max(counts.own + counts.frozen, 1)
     return Row(
         side=side,
@@ -142,20 +136,18 @@ def train(coordinator: Coordinator, capture: Capture, rasterizer: TorchRasterize
 
 def main(args: Args) -> None:
     """Run all pairs, print the table, write the file."""
-    capture, rows = read(args), []
+    capture, rows = read(args.data, args.downscale), []
     TorchRasterizer().warm_up()
     for k, seed in enumerate(args.seeds):
         for side in args.sides if k % 2 == 0 else args.sides[::-1]:  # the machine's speed drifts
             rows.append(run(capture, side, seed, args))
             print(rows[-1], flush=True)
-    print("| side | seed | PSNR | gap | frozen | ms a view | Gaussians |\n| ---: " + "| ---: " * 6 + "|")
+    table = [["side", "seed", "PSNR", "gap", "frozen", "ms a view", "Gaussians"]]
     for row in sorted(rows, key=lambda row: (row.side, row.seed)):
-        print(
-            f"| {row.side} | {row.seed} | {row.psnr:.2f} | {row.gap:.1f} | {row.frozen_share:.1%} "
-            f"| {row.ms_per_view:.1f} | {row.gaussians:,} |"
-        )
-    asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks}
-    write_runs(args.out, {**asked, "steps": args.steps}, rows)
+        table.append([f"{row.side}", f"{row.seed}", f"{row.psnr:.2f}", f"{row.gap:.1f}"])
+        table[-1] += [f"{row.frozen_share:.1%}", f"{row.ms_per_view:.1f}", f"{row.gaussians:,}"]
+    print(markdown(table))
+    write_runs(args.out, {"data": args.data.name, **args.of_all_runs}, rows)
 
 
 if __name__ == "__main__":

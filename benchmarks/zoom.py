@@ -7,7 +7,7 @@ cameras: at twice the size pixels are half as large, as if the camera stood at h
 """
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
@@ -18,28 +18,19 @@ from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from benchmarks.runs import whole, write_runs
+from abcd_ns.lab.results.tables import markdown
+from abcd_ns.lab.stability.lab import merged
+from benchmarks.runs import Asked, write_runs
 from benchmarks.visit import Capture, begin, read
 
 
-@dataclass
-class Args:
+@dataclass(kw_only=True)
+class Args(Asked):
     """What to train and draw."""
 
-    data: Path
-    """The scene, as for `ns-train abcd --data`."""
-    downscale: int = 4
-    """Divides the photos' width and height for training."""
     drawn: tuple[int, ...] = (16, 8, 4, 2)
-    """The same for the pictures that are scored."""
-    blocks: int = 8
-    """Of the scene."""
+    """As `downscale`, for the pictures that are scored."""
     steps: int = 1000
-    """Of each run."""
-    seeds: tuple[int, ...] = (0,)
-    """A pair of runs for each."""
-    out: Path | None = None
-    """Where to write the results, JSON."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +52,7 @@ def run(captures: dict[int, Capture], antialiased: bool, seed: int, args: Args) 
         coordinator = begin(capture, args.blocks, Path(folder), rasterizer=rasterizer, **options)
         while not coordinator.finished:
             train_step(coordinator, capture.photo)
-        gaussians = whole(coordinator)
+        gaussians = merged(coordinator)
         coordinator.close()
     scores = {size: score(gaussians, captures[size], rasterizer, antialiased) for size in args.drawn}
     return Row(antialiased, seed, scores, len(gaussians))
@@ -79,17 +70,17 @@ def score(gaussians: Gaussians, capture: Capture, rasterizer: TorchRasterizer, a
 
 def main(args: Args) -> None:
     """Run all pairs, print the table, write the file."""
-    captures = {size: read(replace(args, downscale=size)) for size in {args.downscale, *args.drawn}}
+    captures = {size: read(args.data, size) for size in {args.downscale, *args.drawn}}
     rows = []
-    print("| antialiased | seed | Gaussians |" + "".join(f" 1/{size} |" for size in args.drawn))
-    print("| --- | ---: | ---: |" + " ---: |" * len(args.drawn))
+    table = [["antialiased", "seed", "Gaussians", *(f"1/{size}" for size in args.drawn)]]
     for seed in args.seeds:
         for antialiased in (False, True):
             rows.append(row := run(captures, antialiased, seed, args))
-            scores = "".join(f" {row.psnr[size]:.2f} |" for size in args.drawn)
-            print(f"| {'yes' if antialiased else 'no'} | {seed} | {row.gaussians:,} |{scores}", flush=True)
-    asked = {"data": args.data.name, "downscale": args.downscale, "blocks": args.blocks}
-    write_runs(args.out, {**asked, "steps": args.steps}, rows)
+            scores = [f"{row.psnr[size]:.2f}" for size in args.drawn]
+            table.append(["yes" if antialiased else "no", str(seed), f"{row.gaussians:,}", *scores])
+            print(row, flush=True)
+    print(markdown(table))
+    write_runs(args.out, {"data": args.data.name, **args.of_all_runs}, rows)
 
 
 if __name__ == "__main__":

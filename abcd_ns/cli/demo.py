@@ -32,6 +32,7 @@ CLOSING = "court.png"
 """A held-out view, as the photo has it and as the Gaussians draw it."""
 CLOSING_INCHES = 6.4
 """Width of either."""
+Pair = tuple[PictureArray, PictureArray]
 
 
 class StepFailed(Exception):
@@ -114,7 +115,8 @@ def demo(
     if blocks < 1:
         raise UserError(f"--blocks is {blocks}; it must be at least 1.")
     console = Console()
-    _claim(out)
+    take_folder(out, out / MARKER, "demo")
+    (out / MARKER).write_text("Made by `abcd demo`. Everything here may be deleted.\n", encoding="utf-8")
     logs = out / "logs"
     logs.mkdir(exist_ok=True)
     try:
@@ -138,10 +140,9 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     ply = out / "splat.ply"
     export = [_tool("ns-export"), "gaussian-splat", "--load-config", str(trained.config)]
     steps.run("ns-export", [*export, "--output-dir", str(out), "--output-filename", ply.name])
-    pictures = [
-        _draw_closing(out, f"{blocks} blocks, {seconds:g} s of training on this machine"),
-        *_draw(out),
-    ]
+    pairs = _pairs(out)
+    how = f"{blocks} blocks, {seconds:g} s of training on this machine"
+    pictures = [_draw_closing(out, pairs, how), *_draw(out, pairs)]
     steps.begin("5/5  A report about the run")
     page = out / "report.html"
     where = ["--data", str(scene), "--out", str(page)]
@@ -160,12 +161,6 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     }
     _print_facts(facts, console)
     _print_next(trained.config, console)
-
-
-def _claim(out: Path) -> None:
-    """Make `out` a folder of this command."""
-    take_folder(out, out / MARKER, "demo")
-    (out / MARKER).write_text("Made by `abcd demo`. Everything here may be deleted.\n", encoding="utf-8")
 
 
 def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) -> Trained:
@@ -190,15 +185,15 @@ def _evaluate(steps: Steps, out: Path, trained: Trained) -> dict[str, float]:
     return json.loads(found.read_text(encoding="utf-8"))["results"]
 
 
-def _pairs(out: Path) -> list[tuple[PictureArray, PictureArray]]:
+def _pairs(out: Path) -> list[Pair]:
     """Photo and rendering of each held-out view, which ns-eval leaves side by side."""
     wide = [read_picture(path) for path in sorted((out / "eval").glob("eval_img_*.png"))]
     return [(pair[:, : pair.shape[1] // 2], pair[:, pair.shape[1] // 2 :]) for pair in wide]
 
 
-def _draw_closing(out: Path, how: str) -> Path:
+def _draw_closing(out: Path, pairs: Sequence[Pair], how: str) -> Path:
     """A view of average quality, large: neither the best nor the worst."""
-    pairs = sorted(_pairs(out), key=lambda pair: psnr_of(*pair))
+    pairs = sorted(pairs, key=lambda pair: psnr_of(*pair))
     photo, picture = pairs[len(pairs) // 2]
     captions = ("photo, held out from training", f"{how}: {psnr_of(picture, photo):.1f} dB")
     height = CLOSING_INCHES * photo.shape[0] / photo.shape[1]
@@ -212,9 +207,8 @@ def _draw_closing(out: Path, how: str) -> Path:
     return out / CLOSING
 
 
-def _draw(out: Path) -> list[Path]:
+def _draw(out: Path, pairs: Sequence[Pair]) -> list[Path]:
     """Photo, picture and error of a few held-out views."""
-    pairs = _pairs(out)
     folder = out / "pictures"
     folder.mkdir(exist_ok=True)
     paths = []

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
@@ -117,14 +118,7 @@ def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> n
         raise InputError(
             f"{label} has a pose with NaN, infinity or a zero quaternion; remove the photo from the model."
         )
-    w, x, y, z = quat / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = Rotation.from_quat(np.roll(quat, -1)).as_matrix()
     pose = np.concatenate([rotation.T * [1, -1, -1], -rotation.T @ translation[:, None]], axis=1)
     return rigid(Z_UP[:, :3] @ pose, label)
 

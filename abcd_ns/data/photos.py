@@ -3,7 +3,6 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -161,42 +160,26 @@ def _read_mask(source: PhotoSource) -> Tensor:
 
 
 class _ByteCache:
-    """Least recently used tensors go first. Two threads that want one tensor make it once."""
+    """Least recently used tensors go first. Two threads may both make one."""
 
     def __init__(self, budget: int):
         self.budget = budget
         self.used = 0
         self._lock = threading.Lock()
         self._kept: OrderedDict[tuple[Literal["image", "mask"], int], Tensor] = OrderedDict()
-        self._making: dict[tuple[str, int], Future[Tensor]] = {}
 
     def get(self, key: tuple[Literal["image", "mask"], int], make: Callable[[], Tensor]) -> Tensor:
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-            future = self._making.get(key)
-            mine = future is None
-            if mine:
-                future = self._making[key] = Future()
-        if not mine:
-            return future.result()
-        try:
-            value = make()
-        except BaseException as error:
-            # Whoever waits must get the error as well, whatever it is; it is raised here too.
-            with self._lock:
-                del self._making[key]
-            future.set_exception(error)
-            raise
+        value = make()  # not under the lock: several threads decode at once
         with self._lock:
-            del self._making[key]
             self._keep(key, value)
-        future.set_result(value)
         return value
 
     def _keep(self, key: tuple[Literal["image", "mask"], int], value: Tensor) -> None:
-        if value.nbytes > self.budget:
+        if value.nbytes > self.budget or key in self._kept:
             return
         self._kept[key] = value
         self.used += value.nbytes

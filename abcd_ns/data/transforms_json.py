@@ -221,6 +221,4 @@ def _photo_folder(root: Path, frames: list[Frame]) -> tuple[Path, list[Frame]]:
     if len(tops) != 1 or any(len(Path(frame.name).parts) < 2 for frame in frames):
         return root, frames
     top = tops.pop()
-    return root / top, [
-        Frame(str(Path(f.name).relative_to(top)), f.camera_to_world, f.lens, f.mask_path) for f in frames
-    ]
+    return root / top, [replace(f, name=str(Path(f.name).relative_to(top))) for f in frames]

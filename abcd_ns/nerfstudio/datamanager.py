@@ -1,7 +1,7 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from torch.utils.data import DataLoader
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -187,8 +188,6 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:  # noqa: ARG002 - the coordinator counts
         """The next batch: its first camera with all of it in the metadata, and the crops of the photos."""
-        if self._coordinator is None:
-            raise RuntimeError("training samples come from a coordinator: call follow() first")
         samples = self._coordinator.next_batch()
         rows = [sample.view.index for sample in samples.samples]
         camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
@@ -204,9 +203,10 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         return self._held_out(self._eval_order.randrange(len(self.eval_dataset)))
 
     @property
-    def fixed_indices_eval_dataloader(self) -> "HeldOut":
+    def fixed_indices_eval_dataloader(self) -> DataLoader:
         """All held-out cameras and photos in order, read one at a time."""
-        return HeldOut(self)
+        rows, own = range(len(self.eval_dataset)), torch.Generator()  # a loader draws a seed
+        return DataLoader(rows, batch_size=None, collate_fn=self._held_out, generator=own)
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a training photo; nerfstudio's logs divide by it."""
@@ -217,16 +217,3 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         camera = self.eval_dataset.cameras[row : row + 1].to(self.device)
         data = self.eval_dataset.get_data(row, image_type="uint8")
         return camera, {**data, "image": data["image"].to(self.device)}
-
-
-class HeldOut:
-    """The held-out set as a sequence that holds one photo at a time."""
-
-    def __init__(self, datamanager: AbcdDataManager) -> None:
-        self._datamanager = datamanager
-
-    def __len__(self) -> int:
-        return len(self._datamanager.eval_dataset)
-
-    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        return (self._datamanager._held_out(row) for row in range(len(self)))

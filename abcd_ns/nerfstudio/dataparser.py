@@ -114,19 +114,9 @@ class AbcdDataParser(DataParser):
         check_masks(self.prepared().sources)
 
     @property
-    def largest_image(self) -> int:
-        """Pixels of the largest photo as it is trained on."""
-        return max(width * height for width, height in (source.size for source in self.prepared().sources))
-
-    @property
     def factor(self) -> int:
         """By which the photos' width and height are divided."""
         return self.prepared().factor
-
-    @property
-    def points(self) -> int:
-        """How many the scene has; 0 where Gaussians begin at random."""
-        return len(self.prepared().points_in_model)
 
     def prepared(self) -> Prepared:
         """The whole scene, read and checked at the first call.

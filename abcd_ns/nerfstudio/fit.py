@@ -1,5 +1,6 @@
 """What fits this machine: how many blocks, how much of a photo a step draws, and what is kept in RAM."""
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -222,13 +223,10 @@ def _refusal(budget: int, demand: Demand) -> str:
 def _least_budget(budget: int, demand: Demand) -> float:
     """The least that suffices, GB to two digits."""
     step = GB // 100
-    low, high = budget // step, 2 * (budget // step + 1)
+    low = high = budget // step + 1
     while _fit(high * step, demand) is None:
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if _fit(middle * step, demand) is not None else (middle, high)
-    return high / 100
+        high *= 2
+    return bisect_left(range(high), True, low, key=lambda n: _fit(n * step, demand) is not None) / 100
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.prepare import check_masks
 from abcd_ns.nerfstudio.datamanager import reader_name
-from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 
 TROUBLE = (
     ArithmeticError,
@@ -21,7 +20,7 @@ TROUBLE = (
     TypeError,
     ValueError,
 )
-"""What readers of nerfstudio's end with where data is not what they expect."""
+"""What readers end with where data is not what they expect."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,8 @@ def inspect(config: DataParserConfig) -> Inspected:
         InputError: the data cannot be used.
     """
     parser = config.setup()
-    if isinstance(parser, AbcdDataParser):
-        parser.check()
-        return Inspected(parser.largest_image, parser.points, parser.factor)
     parts = [with_photos(_read(parser, split)) for split in ("train", "val")]
-    sources = [source for part in parts for source in part.metadata[PHOTOS]]
+    sources = list(dict.fromkeys(source for part in parts for source in part.metadata[PHOTOS]))
     if not parts[0].image_filenames:
         raise InputError(f"{config.data} has no photos to train on.")
     check_masks(sources)

@@ -38,9 +38,9 @@ PEER_BLOCKS = 8
 """Of the methods to compare with: they are about blocks, needed or not."""
 
 
-def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
-    return AbcdTrainerConfig(
-        method_name=method_name,
+def _method(name: str, description: str, **pipeline) -> MethodSpecification:
+    config = AbcdTrainerConfig(
+        method_name=name,
         steps_per_eval_image=500,
         steps_per_eval_batch=0,
         steps_per_eval_all_images=2000,
@@ -55,51 +55,43 @@ def _trainer(method_name: str, **pipeline) -> AbcdTrainerConfig:
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host=THIS_MACHINE),
         vis="viewer",
     )
-
-
-def _quiet(config: AbcdTrainerConfig) -> AbcdTrainerConfig:
     # ABCD reports its own progress, by visit; nerfstudio's table would run through it.
     config.logging.local_writer.enable = False
-    return config
+    return MethodSpecification(config, description)
 
 
-abcd = MethodSpecification(
-    config=_quiet(_trainer("abcd")),
-    description="ABCD: Gaussian Splatting block by block, each within alpha-composited frozen layers.",
+abcd = _method("abcd", "ABCD: Gaussian Splatting block by block, each within alpha-composited frozen layers.")
+abcd_ablated = _method(
+    "abcd-ablated",
+    "ABCD without its layers: each block alone against the photos (the paper's ablation).",
+    blocks=PEER_BLOCKS,
+    training=TrainingConfig(recipe=Recipe(layers=False)),
 )
-abcd_ablated = MethodSpecification(
-    config=_quiet(
-        _trainer("abcd-ablated", blocks=PEER_BLOCKS, training=TrainingConfig(recipe=Recipe(layers=False)))
+abcd_partition = _method(
+    "abcd-partition",
+    "Partition, train, merge: overlapping blocks, each trained once and by itself.",
+    blocks=PEER_BLOCKS,
+    training=TrainingConfig(
+        recipe=Recipe(layers=False, overlap=0.2, migrate=False),
+        warmup=0.0,
+        density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
     ),
-    description="ABCD without its layers: each block alone against the photos (the paper's ablation).",
 )
-abcd_partition = MethodSpecification(
-    config=_quiet(
-        _trainer(
-            "abcd-partition",
-            blocks=PEER_BLOCKS,
-            training=TrainingConfig(
-                recipe=Recipe(layers=False, overlap=0.2, migrate=False),
-                warmup=0.0,
-                density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
-            ),
-        )
-    ),
-    description="Partition, train, merge: overlapping blocks, each trained once and by itself.",
+abcd_exact = _method(
+    "abcd-exact",
+    "Exact joint training over blocks, one on the device at a time: slow, the reference.",
+    blocks=PEER_BLOCKS,
+    training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0),
 )
-abcd_exact = MethodSpecification(
-    config=_quiet(
-        _trainer(
-            "abcd-exact", blocks=PEER_BLOCKS, training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0)
-        )
-    ),
-    description="Exact joint training over blocks, one on the device at a time: slow, the reference.",
+abcd_paper = _method(
+    "abcd-paper",
+    "ABCD by its paper's recipe: MSE, fixed steps for each cell, a new Adam at each visit.",
+    blocks=PEER_BLOCKS,
+    partition="grid",
+    training=PAPER,
 )
-abcd_paper = MethodSpecification(
-    config=_quiet(_trainer("abcd-paper", blocks=PEER_BLOCKS, partition="grid", training=PAPER)),
-    description="ABCD by its paper's recipe: MSE, fixed steps for each cell, a new Adam at each visit.",
-)
-abcd_monolithic = MethodSpecification(
-    config=_quiet(_trainer("abcd-monolithic", blocks=1)),
-    description="3D Gaussian Splatting in ABCD's engine: one block, no layers. Runs without a GPU.",
+abcd_monolithic = _method(
+    "abcd-monolithic",
+    "3D Gaussian Splatting in ABCD's engine: one block, no layers. Runs without a GPU.",
+    blocks=1,
 )

@@ -31,7 +31,6 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import BlockScene, ChangedScene, MemoryScene, StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
-from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
@@ -203,19 +202,12 @@ class AbcdModel(SplatfactoModel):
         """The crops of a training batch where the camera carries one, else the whole picture."""
         batch = (camera.metadata or {}).get(BATCH)
         if self.training and batch is not None:
-            return self._batch_outputs(batch)
+            return rendered_outputs(batch, self._coordinator.render(batch))
         return self._whole_outputs(self.view(camera))
 
     def view(self, camera: Cameras) -> View:
         """The camera as the engine draws it: from the scene's near plane on, and on the CPU."""
         return replace(view_of(camera.to("cpu")), near=self.near)
-
-    def _batch_outputs(self, batch: Batch) -> dict[str, Any]:
-        if self._coordinator is None:
-            raise RuntimeError(
-                "a training batch needs the coordinator that it came from: call follow() first"
-            )
-        return rendered_outputs(batch, self._coordinator.render(batch))
 
     def _whole_outputs(self, view: View) -> dict[str, Tensor]:
         # ns-render's crop has a background of its own.

@@ -1,6 +1,7 @@
 """What a model says of a whole picture: what nerfstudio's tools read, and what is drawn when one asks."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import UserDict
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from abcd_ns.engine.train.step.batch import Batch, Rendered
 from abcd_ns.engine.types import Layer
 
 
-class Outputs(dict[str, Tensor]):
+class Outputs(UserDict[str, Tensor]):
     """Outputs by name, some of which are drawn when they are first read. Names are there from the start.
 
     Args:
@@ -35,20 +36,6 @@ class Outputs(dict[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         self.draw([name])
         return super().__getitem__(name)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """As of any dict."""
-        if name not in self:
-            return default
-        return self[name]
-
-    def items(self) -> Iterator[tuple[str, Tensor]]:
-        """All, drawn one after the other."""
-        return ((name, self[name]) for name in list(self))
-
-    def values(self) -> Iterator[Tensor]:
-        """All, drawn one after the other."""
-        return (value for _, value in self.items())
 
 
 def pictured(layer: Layer, raster: Raster, background: Float[Tensor, "3"]) -> dict[str, Tensor]:

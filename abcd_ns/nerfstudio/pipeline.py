@@ -116,40 +116,36 @@ class AbcdPipeline(VanillaPipeline):
         # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
         guard.install()
         super().__init__(config, *args, **kwargs)
-        self._coordinator: Trainer | None = None
+        self.coordinator: Trainer | None = None
+        """Drives the training, once it has begun."""
         self._rendered: Rendered | None = None
         self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
-
-    @property
-    def coordinator(self) -> Trainer | None:
-        """Drives the training, once it has begun."""
-        return self._coordinator
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Everything exists by now, checkpoint included: begin, or go on, and drive the coordinator."""
         trainer = training_callback_attributes.trainer
-        self._coordinator = self._begin(trainer.run, training_callback_attributes.optimizers.optimizers)
-        self.datamanager.follow(self._coordinator)
-        self.model.follow(self._coordinator)
-        report = ProgressReport(self._coordinator)
-        self._coordinator.announce.subscribe(report)
+        self.coordinator = self._begin(trainer.run, training_callback_attributes.optimizers.optimizers)
+        self.datamanager.follow(self.coordinator)
+        self.model.follow(self.coordinator)
+        report = ProgressReport(self.coordinator)
+        self.coordinator.announce.subscribe(report)
         photos = self.datamanager.train_dataset.photos
-        log = keep_log(trainer.run, photos, self._coordinator)
-        self._coordinator.announce.subscribe(log)
-        self.panel.follow(self._coordinator)
+        log = keep_log(trainer.run, photos, self.coordinator)
+        self.coordinator.announce.subscribe(log)
+        self.panel.follow(self.coordinator)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
 
         def end_step(step: int) -> None:
             self._after_step()
             if step_check(step, trainer.config.logging.steps_per_log, run_at_zero=True):
                 writer.put_dict("ABCD", report.scalars(), step)
-            if self._coordinator.finished:
+            if self.coordinator.finished:
                 trainer.stop_training = True
 
         def end_run(step: int) -> None:  # noqa: ARG001
-            self._coordinator.dismiss()
+            self.coordinator.dismiss()
             report.close()
             log.close()
 
@@ -166,8 +162,8 @@ class AbcdPipeline(VanillaPipeline):
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's; while training, it is no training time."""
-        if self._coordinator is not None:
-            self._coordinator.pause()
+        if self.coordinator is not None:
+            self.coordinator.pause()
         self.datamanager.take_poses(self.model.poses)
         return super().get_eval_image_metrics_and_images(step)
 
@@ -175,12 +171,12 @@ class AbcdPipeline(VanillaPipeline):
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
         """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
-        if self._coordinator is not None:
-            self._coordinator.pause()
+        if self.coordinator is not None:
+            self.coordinator.pause()
         self.datamanager.take_poses(self.model.poses)
         found = super().get_average_eval_image_metrics(step, output_path, get_std)
-        if self._coordinator is not None:
-            self._coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
+        if self.coordinator is not None:
+            self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
             found |= {"lpips": None, "lpips_missing": lpips_missing()}
         return found
@@ -191,12 +187,9 @@ class AbcdPipeline(VanillaPipeline):
         self.datamanager.take_poses(self.model.poses)
 
     def _after_step(self) -> None:
-        if self._coordinator is None:
-            raise RuntimeError("training has not begun")
-        if self._rendered is None:  # workers took the step
-            return
-        self._coordinator.after_step(self._rendered, self._psnrs)
-        self._rendered = None
+        if self._rendered is not None:  # else workers took the step
+            self.coordinator.after_step(self._rendered, self._psnrs)
+            self._rendered = None
 
     # -- set-up --------------------------------------------------------------------------------------
 

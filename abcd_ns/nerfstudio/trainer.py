@@ -244,8 +244,6 @@ class AbcdTrainer(Trainer):
             UserError: the disk refused; the run can still be gone on with.
         """
         coordinator = self.pipeline.coordinator
-        if coordinator is None:
-            raise RuntimeError("there is nothing to save before training has begun")
         coordinator.pause()
         coordinator.save(pin=pin_name(step))
         crash_points.reached(crash_points.CHECKPOINT_PINNED)

@@ -100,9 +100,8 @@ def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int
             "ask for fewer."
         )
     connect(pipeline.cluster, cores=count * threads)
-    from abcd_ns.cluster.ray_workers import (
-        RayWorkers,
-    )  # imports Ray, which reads the environment that this set
+    # Imports Ray, which reads the environment that `connect` has set.
+    from abcd_ns.cluster.ray_workers import RayWorkers
 
     make = partial(make_worker, config, setup, 0 if not on_gpu else int(PHOTO_SHARE * budget))
     workers = RayWorkers(count, make, gpus=int(on_gpu), cores=threads)

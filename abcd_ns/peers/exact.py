@@ -158,15 +158,7 @@ class ExactTrainer(Trainer):
             self.rest(self.config.commit_seconds)
 
     def gradients(self) -> Gradients:
-        """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given.
-
-        Raises:
-            RuntimeError: `render` was not called before, or its pictures have no gradient.
-        """
-        if self._batch is None or not self._pictures or self._pictures[0].grad is None:
-            raise RuntimeError(
-                "there is no gradient to hand on: call render, and backward of the loss, first"
-            )
+        """Pass 2: every layer again, between its F and B, with the gradient that the pictures were given."""
         gradients = Gradients.zero(self._all.gaussians, len(self._pictures))
         for block, rows, gaussians in self._cells():
             leaves = Gaussians(**{name: v.detach().requires_grad_() for name, v in gaussians.items()})

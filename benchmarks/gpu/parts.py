@@ -166,7 +166,7 @@ def visits(task: Task) -> Iterator[Found]:
     """Where a visit's time goes, by stage and by kernel."""
     size = task.size
     args = visit.Args(Path(task.data), seconds=size.visit_seconds, seed=task.seed)
-    capture = visit.read(args)
+    capture = visit.read(args.data, args.downscale)
     found: Found = {"scene": args.data.name, "seconds": args.seconds, "by_blocks": []}
     for blocks in size.visit_blocks:
         rows: list[Found] = []

@@ -8,7 +8,15 @@ from tests.reference.colmap_scene import write_scene
 
 def test_runs_are_made_once_and_told_in_a_table(tmp_path, capsys):
     out = tmp_path / "out.json"
-    args = Args(write_scene(tmp_path / "scene"), 1, visits=(2,), blocks=4, steps=16, seeds=(0,), out=out)
+    args = Args(
+        data=write_scene(tmp_path / "scene"),
+        downscale=1,
+        visits=(2,),
+        blocks=4,
+        steps=16,
+        seeds=(0,),
+        out=out,
+    )
     main(args)
     (row,) = json.loads(out.read_text())["runs"]
     assert (row["at_once"], row["most_out"], row["steps"]) == (2, 2, 16)

@@ -12,7 +12,7 @@ def test_a_pair_of_runs_is_made_for_each_seed(tmp_path, capsys, monkeypatch):
     views, truth = ring_of_views(6), random_gaussians(60, seed=1, sh_degree=3)
     photos, out = Photos(truth, views), tmp_path / "out.json"
     start = random_gaussians(60, seed=2, sh_degree=3)
-    monkeypatch.setattr(windows, "read", lambda _: Capture(views[:4], photos, views[4:], photos, start))
+    monkeypatch.setattr(windows, "read", lambda *_: Capture(views[:4], photos, views[4:], photos, start))
     main(Args(data=tmp_path / "scene", blocks=2, steps=24, seeds=(0,), out=out))
     found = json.loads(out.read_text())
     assert [(row["side"], row["seed"]) for row in found["runs"]] == [(4, 0), (16, 0)]

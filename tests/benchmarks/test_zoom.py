@@ -1,6 +1,7 @@
 """Runs of either kind are scored at every size."""
 
 import json
+from pathlib import Path
 
 from benchmarks import zoom
 from benchmarks.visit import Capture
@@ -11,8 +12,8 @@ from tests.reference.scenes import Photos, random_gaussians, ring_of_views
 def test_runs_of_either_kind_are_scored_at_every_size(tmp_path, capsys, monkeypatch):
     truth, start = (random_gaussians(60, seed=seed, sh_degree=3) for seed in (1, 2))
 
-    def read(args: Args) -> Capture:
-        views = ring_of_views(6, width=96 // args.downscale, height=72 // args.downscale)
+    def read(_: Path, downscale: int) -> Capture:
+        views = ring_of_views(6, width=96 // downscale, height=72 // downscale)
         photos = Photos(truth, views)
         return Capture(views[:4], photos, views[4:], photos, start)
 

@@ -139,8 +139,8 @@ def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
 
 
 @pytest.mark.parametrize(
-    "option", [{"blocks": -1}, {"downscale": 0}, {"steps": 0}, {"max_gaussians": -5}, {"workers": 0}]
+    "option", [{"blocks": -1}, {"steps": 0}, {"max_gaussians": -5}, {"workers": 0}, {"downscale": 0}]
 )
 def test_options_out_of_range_are_refused(tmp_path, option):
     with pytest.raises(UserError, match=next(iter(option)).replace("_", "-")):
-        plan(tmp_path, **option)
+        plan(tmp_path, Wanted(**option) if "downscale" not in option else Wanted(), option.get("downscale"))

@@ -6,15 +6,13 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from abcd_ns.cli.check.looks import Look, copies, look_at_all
 from abcd_ns.cli.check.visibility import Visibility, visibility
 from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.prepare import Prepared
-from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser, AbcdDataParserConfig
-from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.nerfstudio.views import training_views
 
 
 class QuietParser(AbcdDataParser):
@@ -75,13 +73,12 @@ def survey(data: Path, downscale: int | None) -> Survey:
     parser.check()
     prepared = parser.prepared()
     outputs = parser.get_dataparser_outputs("train")
-    points = outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
     return Survey(
         data=data,
         prepared=prepared,
         train=parser.rows("train"),
         held_out=parser.rows("test"),
-        near=near_plane(points, views_of(outputs.cameras)),
+        near=training_views(outputs.cameras, outputs.metadata.get("points3D_xyz"))[0].near,
         seen=visibility(prepared),
         looks=look_at_all(prepared.sources),
         copies=copies(prepared.sources),

@@ -1,11 +1,10 @@
 """All that `abcd doctor` knows of a machine."""
 
 import dataclasses
-import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+from abcd_ns import machine
 from abcd_ns.cli.doctor.hardware import Hardware, look_at_hardware
 from abcd_ns.cli.doctor.kernels import Kernels, look_at_kernels
 from abcd_ns.cli.doctor.packages import STARTED, Packages, look_at_packages
@@ -39,9 +38,8 @@ def gather() -> Facts:
 
 def without_home(value: Any) -> Any:
     """`value`, a record or a text, with ~ for the user's home folder in all its texts: fit to be shown."""
-    home = re.escape(str(Path.home()))
     if isinstance(value, str):
-        return re.sub(rf"(?<![\w.-]){home}(?![\w.-])", "~", value)
+        return machine.without_home(value)
     if isinstance(value, dict):
         return {without_home(key): without_home(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,9 +1,8 @@
 """`abcd mesh`: a trained scene's surface as a mesh of triangles."""
 
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,7 +13,7 @@ import tyro
 from abcd_ns.cli.export.command import check_request, open_store, tell_rounding, to_data
 from abcd_ns.cli.export.formats import GENERATOR
 from abcd_ns.cli.export.shown import Box, check_trained
-from abcd_ns.cli.mesh.depth_maps import DepthMaps, draw
+from abcd_ns.cli.mesh.depth_maps import draw
 from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
 from abcd_ns.cli.report.run_folder import find_run, pipeline_config, read_settings
 from abcd_ns.engine.gaussians.frames import Frame
@@ -143,11 +142,6 @@ class Seen:
     settings: PaintSettings
     views: list[View]
 
-    def draw(self, folder: Path, median: bool, advance: Callable[[], None]) -> DepthMaps:
-        """Depth and colour of all views, kept in `folder`."""
-        found = (lambda view: median_depth(self.painter, view, self.settings)) if median else None
-        return draw(WholePictures(self.painter, self.settings), self.views, folder, advance, found)
-
 
 def _surface(seen: Seen, wanted: Wanted) -> tuple[Piece, float]:
     """The mesh in the frame that is asked for, and the side of its voxels there."""
@@ -155,17 +149,19 @@ def _surface(seen: Seen, wanted: Wanted) -> tuple[Piece, float]:
 
     views = seen.views
     with tempfile.TemporaryDirectory(prefix=".abcd-mesh-", dir=wanted.out.absolute().parent) as folder:
-        with _bar("drawing", len(views)) as advance:
-            maps = seen.draw(Path(folder), wanted.median, advance)
+        pictures = WholePictures(seen.painter, seen.settings)
+        median = partial(median_depth, seen.painter, settings=seen.settings) if wanted.median else None
+        with ProgressBar("drawing", len(views)) as bar:
+            maps = draw(pictures, views, Path(folder), bar.advance, median)
         footprints = maps.footprints()
         if not len(footprints):
             raise UserError("There is no surface: what the training views show is too transparent.")
         side = wanted.voxel or VOXEL_PIXELS * float(np.median(footprints))
         fusion = Fusion(maps, side)
-        with _bar("looking for surfaces", len(views)) as advance:
-            fusion.find_boxes(advance)
-        with _bar("fusing", fusion.parts * len(views)) as advance:
-            welded = weld([wanted.within(piece) for piece in fusion.pieces(advance)])
+        with ProgressBar("looking for surfaces", len(views)) as bar:
+            fusion.find_boxes(bar.advance)
+        with ProgressBar("fusing", fusion.parts * len(views)) as bar:
+            welded = weld([wanted.within(piece) for piece in fusion.pieces(bar.advance)])
     if (far := float((footprints > FAR * side).mean())) > MANY:
         print(f"{far:.0%} of the pixels show what is too far for such voxels; a larger --voxel takes it in.")
     if not len(welded.faces):
@@ -199,9 +195,3 @@ def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> Seen:
     )
     settings = PaintSettings(config.training.sh_degree, config.training.antialiased)
     return Seen(painter, settings, views)
-
-
-@contextmanager
-def _bar(what: str, total: int) -> Iterator[Callable[[], None]]:
-    with ProgressBar(what, total) as bar:
-        yield bar.advance

@@ -17,7 +17,7 @@ from open3d import core
 from torch import Tensor
 
 from abcd_ns.cli.mesh.depth_maps import DepthMaps
-from abcd_ns.cli.mesh.surface import Piece
+from abcd_ns.cli.mesh.surface import Piece, with_faces
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.types import View
 
@@ -98,9 +98,8 @@ class Fusion:
         vertices, faces = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int64)
         middles = vertices[faces].mean(axis=1, dtype=np.float64)
         boxes = np.floor(np.floor(middles / self._voxel) / BOX)
-        faces = faces[(self._tree.assign(self._centers(boxes)) == part).numpy()]
-        used, faces = np.unique(faces, return_inverse=True)
-        return Piece(vertices[used], mesh.vertex.colors.numpy()[used], faces.reshape(-1, 3))
+        own = (self._tree.assign(self._centers(boxes)) == part).numpy()
+        return with_faces(Piece(vertices, mesh.vertex.colors.numpy(), faces), own)
 
     def _centers(self, boxes: np.ndarray) -> Float64[Tensor, "n 3"]:
         return torch.from_numpy((boxes.astype(np.float64) + 0.5) * (BOX * self._voxel))

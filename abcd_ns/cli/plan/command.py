@@ -1,11 +1,10 @@
 """`abcd plan`: what a run on these photos will need, and what would not fit."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import psutil
 import torch
@@ -29,32 +28,44 @@ from abcd_ns.cli.plan.forecast import (
 from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
-from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
+from abcd_ns.lab.runs.checks import check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.fit import GB, Demand, Fit, device_budget, find_fit
-from abcd_ns.nerfstudio.views import views_of
+from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.nerfstudio.workers import BLOCKS_EACH
 
-R = TypeVar("R")
+Number = Annotated[int, tyro.conf.arg(metavar="N")]
 FEW_VIEWS = 3
 """Blocks that fewer views see are said to be under-observed."""
 
 
-@tyro.conf.configure(tyro.conf.FlagCreatePairsOff)
+@dataclass(frozen=True)
+class Wanted:
+    """What a run is to be like."""
+
+    blocks: Number = 0
+    """number of blocks; 0 takes as few as the device's budget allows."""
+    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0
+    """memory of the device that training may take; 0 takes what is free."""
+    max_gaussians: Number = 0
+    """limit on Gaussians in the whole scene; 0 is none, and five for each point are expected."""
+    steps: Number = 30_000
+    """of the run."""
+    workers: Number = 1
+    """blocks trained at once, each by a process on a GPU of its own or on a part of the cores."""
+
+
+@tyro.conf.configure(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
 def plan(
     data: Annotated[Path, tyro.conf.arg(metavar="PATH")],
+    wanted: Annotated[Wanted, tyro.conf.arg(name="")],
     downscale: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
-    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0,
-    max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
-    steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000,
-    workers: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
     verbose: bool = False,
 ) -> int:
     """Say what a run on these photos will need, and what would not fit; trains nothing, writes nothing.
@@ -67,12 +78,8 @@ def plan(
 
     Args:
         data: the scene, as for `ns-train abcd --data`.
+        wanted: what the run is to be like.
         downscale: divides the photos' width and height; left out, no side is over 1600 px, as in training.
-        blocks: number of blocks; 0 takes as few as the device's budget allows.
-        device_budget_gb: memory of the device that training may take; 0 takes what is free.
-        max_gaussians: limit on Gaussians in the whole scene; 0 is none, and five for each point are expected.
-        steps: of the run.
-        workers: blocks trained at once, each by a process on a GPU of its own or on a part of the cores.
         verbose: show what takes the room, and how points and views are spread over the blocks.
 
     Returns:
@@ -81,28 +88,14 @@ def plan(
     Raises:
         UserError: the data cannot be used, or an option is out of range.
     """
-    for option, value in (("--blocks", blocks), ("--max-gaussians", max_gaussians)):
-        if value < 0:
-            raise UserError(f"{option} is {value}; it must be 0 or more.")
-    for option, value in (("--downscale", downscale), ("--steps", steps), ("--workers", workers)):
-        if value is not None and value < 1:
-            raise UserError(f"{option} is {value}; it must be at least 1.")
+    if wanted.blocks < 0:
+        raise UserError(f"--blocks is {wanted.blocks}; it must be 0 or more.")
+    given = {name: getattr(wanted, name) for name in ("max_gaussians", "steps", "workers")}
+    check_ranges({**given, "downscale": downscale})
     console = Console()
-    options = (blocks, device_budget_gb, max_gaussians, steps, workers)
-    found = forecast(read(data, downscale, console), Wanted(*options), console)
+    found = forecast(read(data, downscale, console), wanted, console)
     print_forecast(found, console, verbose)
     return 1 if found.warnings else 0
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """The options of `plan`."""
-
-    blocks: int = 0
-    device_budget_gb: float = 0.0
-    max_gaussians: int = 0
-    steps: int = 30_000
-    workers: int = 1
 
 
 @dataclass(frozen=True)
@@ -125,18 +118,14 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
     parser = AbcdDataParserConfig(downscale_factor=downscale)
     config = AbcdDataManagerConfig(data=data, dataparser=parser)
 
-    def work() -> Capture:
+    with console.status("Reading the capture"):
         manager = config.setup(device="cpu", test_mode="val")
         dataset = manager.train_dataset
         points = dataset.metadata["points3D_xyz"].float()
-        views = views_of(dataset.cameras)
-        near = near_plane(points, views)
-        views = [replace(view, near=near) for view in views]
+        views = training_views(dataset.cameras, points)
         pixels = methods.abcd.config.pipeline.training.point_pixels
         thinned = thin_points(points, dataset.metadata["points3D_rgb"].float(), views, pixels)
         return Capture(*thinned, views, manager.dataparser.factor)
-
-    return _said(console, "Reading the capture", work)
 
 
 def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
@@ -157,7 +146,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     training = replace(training, limits=replace(training.limits, **fit.limits))
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
-    seen = _said(console, "Looking which view sees which block", lambda: views_of_blocks(tree, points, views))
+    with console.status("Looking which view sees which block"):
+        seen = views_of_blocks(tree, points, views)
     batch = views_per_step(training.batch, fit.blocks, training.limits.batch_limit)
     options = (training.sh_degree, training.limits.crop_pixels, levels_of(fit.blocks), not on_cpu)
     drawn = training.primitive, drawings_of(training)
@@ -165,7 +155,8 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     fullest = owner == owner.bincount(minlength=fit.blocks).argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
-    seconds = _said(console, "Timing a step", lambda: time_steps(gaussians, spread, training, batch))
+    with console.status("Timing a step"):
+        seconds = time_steps(gaussians, spread, training, batch)
     shares = {
         "device": device_shares(fit, needs),
         "ram": ram_shares(
@@ -256,12 +247,6 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
     if not (found.warnings or verbose):
         console.print("\nAll of it fits. What takes the room: abcd plan --verbose", highlight=False)
-
-
-def _said(console: Console, what: str, work: Callable[[], R]) -> R:
-    """Do something that may take seconds, and say what meanwhile."""
-    with console.status(what):
-        return work()
 
 
 def _total(shares: tuple[Share, ...]) -> int:

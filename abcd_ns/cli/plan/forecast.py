@@ -15,6 +15,7 @@ from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.fit import Fit
+from abcd_ns.viewer.scenery import in_image
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
@@ -72,11 +73,7 @@ def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple
     """
     owner, counts = tree.assign(points), torch.zeros(tree.num_blocks, dtype=torch.int64)
     for view in views:
-        at = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        pixel = at[:, :2] / at[:, 2:] * view.K.diagonal()[:2] + view.K[:2, 2]
-        size = torch.tensor([view.width, view.height])
-        inside = (at[:, 2] > view.near) & ((pixel >= 0) & (pixel < size)).all(dim=1)
-        counts[owner[inside].unique()] += 1
+        counts[owner[in_image(points, view)].unique()] += 1
     return tuple(counts.tolist())
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
-from abcd_ns.cli.poses.mapping import MappingFailed, Model, Order, Progress, Stage, Task, find_poses
+from abcd_ns.cli.poses.mapping import Model, Order, Progress, Stage, Task, find_poses
 from abcd_ns.data.input_errors import Problems
 from abcd_ns.data.picture_files import SUFFIXES, check_complete, read_header
 from abcd_ns.errors import UserError
@@ -126,10 +126,7 @@ def _with_bars(task: Task, console: Console) -> Model | None:
             bars.start_task(bar)
             bars.update(bar, total=progress.total, completed=progress.done)
 
-        try:
-            found = find_poses(task, show)
-        except MappingFailed as error:
-            raise UserError(f"pycolmap could not find poses: {error}.") from None
+        found = find_poses(task, show)
         bars.update(shown[Stage.POSES], completed=len(found.posed) if found else 0)
         return found
 

@@ -13,6 +13,8 @@ from typing import Literal
 
 import pycolmap
 
+from abcd_ns.errors import UserError
+
 ENOUGH = 0.9
 """Once so large a share of the photos has a pose, no other focal length is tried."""
 FOCAL_FACTORS = (1.2, 0.72, 0.5)
@@ -80,10 +82,6 @@ class Progress:
     total: int
 
 
-class MappingFailed(Exception):
-    """pycolmap gave up; the message is its own."""
-
-
 def find_poses(task: Task, show: Callable[[Progress], None]) -> Model | None:
     """Features, matches and poses; None where no two photos fit together.
 
@@ -91,7 +89,7 @@ def find_poses(task: Task, show: Callable[[Progress], None]) -> Model | None:
         show: is told several times a second how far it is.
 
     Raises:
-        MappingFailed: pycolmap raised, or its process died.
+        UserError: pycolmap raised, or its process died; the message is its own.
     """
     context = multiprocessing.get_context("spawn")
     stage, posed = context.Value("i", 0), context.Value("i", 0)
@@ -103,7 +101,7 @@ def find_poses(task: Task, show: Callable[[Progress], None]) -> Model | None:
         return found.result()
     except (RuntimeError, ValueError, IndexError, OSError) as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise MappingFailed(reason[0]) from error
+        raise UserError(f"pycolmap could not find poses: {reason[0]}.") from error
     finally:
         for process in multiprocessing.active_children():  # pycolmap does not listen to Ctrl-C
             process.kill()

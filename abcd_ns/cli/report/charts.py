@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
 from abcd_ns.cli.report.story import Story, Visit
-from abcd_ns.lab.results.style import COLORS, in_style, label_ends, lay_grid
+from abcd_ns.lab.results.style import COLORS, in_style, label_ends, lay_grid, short
 from abcd_ns.lab.results.tables import GIB
 
 WIDTH, HEIGHT = 4.9, 2.7
@@ -94,8 +94,8 @@ def draw_gaussians(story: Story) -> Figure | None:
     axes.set_ylim(bottom=0)
     axes.margins(y=0.1)
     axes.set_ylabel("Gaussians")
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
-    _label(axes, story, ends, {"Gaussians": STEPS, "limit": LAYERS}, lambda name, n: f"{_short(n)}\n{name}")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+    _label(axes, story, ends, {"Gaussians": STEPS, "limit": LAYERS}, lambda name, n: f"{short(n)}\n{name}")
     return figure
 
 
@@ -241,13 +241,6 @@ def _label_median(axes: Axes, story: Story, blocks: Sequence[Sequence[tuple[floa
 
 def _ends_of(visits: Sequence[Visit]) -> list[tuple[float, float]]:
     return [(visit.ended, visit.psnr) for visit in visits if visit.psnr is not None]
-
-
-def _short(count: float) -> str:
-    """32400 as 32.4k."""
-    if count >= 1e6:
-        return f"{count / 1e6:.3g}M"
-    return f"{count / 1e3:.3g}k" if count >= 1000 else f"{count:.0f}"
 
 
 def visit_titles(story: Story) -> dict[str, str]:

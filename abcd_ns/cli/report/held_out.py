@@ -1,7 +1,7 @@
 """Held-out views of a run: scores of all of them, and pictures of a few."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 
@@ -9,13 +9,13 @@ import matplotlib
 import numpy as np
 from PIL import Image
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray, error_map
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap, score, squared_gap
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.progress_bar import ProgressBar
 
 PAGE_PIXELS = 6_000_000
 """Of all pictures of a page together; larger ones are reduced. As JPEG that is some 3 MB."""
@@ -104,15 +104,15 @@ def _in_words(rank: int, count: int) -> str:
     return "median" if rank == (count - 1) // 2 or 2 * rank == count else f"{rank + 1} of {count}"
 
 
-def _with_progress(pipeline: AbcdPipeline, title: str, console: Console, rows: Sequence[int] | None = None):
-    """The held-out views that were asked for, drawn; a line in the terminal says how long it will take."""
+def _with_progress(
+    pipeline: AbcdPipeline, title: str, console: Console, rows: Collection[int] | None = None
+) -> Iterator[Drawn]:
+    """The held-out views that were asked for, drawn."""
     views = len(pipeline.datamanager.eval_dataset) if rows is None else len(rows)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(title, total=views)
+    with ProgressBar(title, views, console) as bar:
         for drawn in draw_held_out(pipeline, rows):
             yield drawn
-            progress.advance(task)
+            bar.advance()
 
 
 def _show(drawn: Drawn, scored: ViewScore, place: str, count: int) -> Shown:

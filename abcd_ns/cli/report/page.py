@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -16,9 +15,9 @@ from matplotlib.figure import Figure
 
 from abcd_ns import __version__
 from abcd_ns.cli.report import charts
-from abcd_ns.cli.report.blocks import Block, describe_blocks
+from abcd_ns.cli.report.blocks import describe_blocks
 from abcd_ns.cli.report.headline import headline
-from abcd_ns.cli.report.held_out import HeldOut, Shown
+from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.options import as_text, changed_options, training_command
 from abcd_ns.cli.report.plan import Plan, draw_plan
 from abcd_ns.cli.report.run_folder import RunFolder
@@ -55,10 +54,9 @@ def render_page(run: RunFolder, held_out: HeldOut | None, plan: Plan | None, not
     """
     settings, story = run.settings, run.story
     script = (HERE / "page.js").read_text(encoding="utf-8")
-    page = Environment(
-        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined
-    ).get_template("page.html")
-    return page.render(
+    pages = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
+    pages.filters |= {"known": _known, "spark": sparkline}
+    return pages.get_template("page.html").render(
         generator=f"{GENERATOR} {__version__}",
         script=Markup(script),
         script_hash=_csp_hash(script),
@@ -71,12 +69,12 @@ def render_page(run: RunFolder, held_out: HeldOut | None, plan: Plan | None, not
         headline=headline(run, held_out),
         notes=[without_home(note) for note in notes],
         charts=_charts(run, held_out),
-        views=[] if held_out is None else [_view(shown) for shown in held_out.shown],
+        views=[] if held_out is None else held_out.shown,
         view_count=0 if held_out is None else len(held_out.scores),
         error_colors=", ".join(to_hex(matplotlib.colormaps[ERROR_COLORS](k / 8)) for k in range(9)),
         error_limit=f"{100 / ERROR_GAIN:g}%",
         plans=_plans(plan),
-        blocks=[_row(block) for block in describe_blocks(run)],
+        blocks=describe_blocks(run),
         changed=changed_options(settings),
         options=[(name, as_text(value)) for name, value in sorted(settings.options.items())],
         command=without_home(training_command(settings)),
@@ -154,33 +152,12 @@ def _chart(name: str, title: str, text: str, figure: Figure, titles: dict[str, s
     return Chart(title, text, Markup(inline_svg(figure, name, f"Chart: {title}. {text}", titles)))
 
 
-# -- tables ------------------------------------------------------------------------------------------
+# -- what the template writes with -------------------------------------------------------------------
 
 
-def _view(shown: Shown) -> dict[str, Any]:
-    psnr, ssim = shown.score.psnr_merged, shown.score.ssim_merged
-    pictures = {name: getattr(shown, name) for name in ("place", "photo", "picture", "error")}
-    size = {"width": shown.width, "height": shown.height}
-    scores = {"psnr": f"{psnr:.2f} dB", "ssim": "" if ssim is None else f"{ssim:.3f}"}
-    return {"name": shown.score.name, **pictures, **size, **scores}
-
-
-def _row(block: Block) -> dict[str, Any]:
-    share = f"{block.layer_seconds / block.seconds:.0%}" if block.seconds else NOTHING
-    return {
-        "number": block.number,
-        "gaussians": NOTHING if block.gaussians is None else f"{block.gaussians:,}",
-        "parameters": NOTHING if block.parameters is None else f"{block.parameters:,}",
-        "shed": NOTHING if block.shed is None else f"{block.shed:,}",
-        "filled": NOTHING if block.filled is None else f"{block.filled:.1f} px",
-        "views": NOTHING if block.views is None else f"{block.views:,}",
-        "visits": f"{block.visits:,}",
-        "time": f"{block.seconds:.1f} s" if block.seconds else NOTHING,
-        "layers": share,
-        "psnr": f"{block.psnrs[-1]:.2f} dB" if block.psnrs else NOTHING,
-        "spark": sparkline(block.psnrs),
-        "state": block.state,
-    }
+def _known(value: float | None, form: str = "{:,}") -> str:
+    """A number in this form, where there is one."""
+    return NOTHING if value is None else form.format(value)
 
 
 def sparkline(values: Sequence[float]) -> Markup:

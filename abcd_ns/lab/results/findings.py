@@ -72,12 +72,12 @@ def findings_of(results: Results) -> tuple[str, ...]:
     """What the experiment says, a sentence each."""
     find = {
         "study of blocks": _of_blocks,
-        "study of gaussians": _of_gaussians,
+        "study of gaussians": frontier.findings,
         "study of options": _of_options,
         "study of scale": _of_scale,
         "stability report": _of_outcomes,
     }.get(results.kind)
-    return find(results) if find else ()
+    return tuple(find(results)) if find else ()
 
 
 def _of_blocks(results: Results) -> tuple[str, ...]:
@@ -89,10 +89,6 @@ def _of_blocks(results: Results) -> tuple[str, ...]:
         f"Best: {_blocks(gap.best)}, {gap.best.psnr:.2f} dB. Worst: {_blocks(gap.worst)}, "
         f"{gap.worst.psnr:.2f} dB. Gap: {gap.decibels:.2f} dB, {verdict} the {GOAL_DB:g} dB of the goal.",
     )
-
-
-def _of_gaussians(results: Results) -> tuple[str, ...]:
-    return tuple(frontier.findings(results))
 
 
 def _of_options(results: Results) -> tuple[str, ...]:

@@ -13,24 +13,17 @@ from nerfstudio.engine.trainer import TrainerConfig
 from abcd_ns import methods
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.errors import UserError
-from abcd_ns.lab.job import HELD_OUT_EVERY, Job
+from abcd_ns.lab.job import HELD_OUT_EVERY, METHODS, Job
 from abcd_ns.lab.runs.options import change_options
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
 ENDLESS = 10**9
 """Steps of a run that its seconds end."""
 
-
-_REGISTERED = {
-    "abcd": methods.abcd,
-    "abcd-ablated": methods.abcd_ablated,
-    "abcd-partition": methods.abcd_partition,
-    "abcd-exact": methods.abcd_exact,
-    "abcd-paper": methods.abcd_paper,
-    "abcd-monolithic": methods.abcd_monolithic,
-}
+_REGISTERED = {name: getattr(methods, name.replace("-", "_")) for name in METHODS if name != "splatfacto"}
 
 
 class SplatfactoData(FullImageDatamanager[AbcdDataset]):
@@ -59,7 +52,7 @@ def check_scene(job: Job) -> None:
     Raises:
         UserError: it cannot be trained on.
     """
-    _parser(job).setup().check()
+    inspect(_parser(job))
 
 
 def check_options(job: Job) -> None:

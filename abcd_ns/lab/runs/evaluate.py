@@ -1,7 +1,7 @@
 """Held-out views, drawn and scored without leaving a trace in the training that goes on around it."""
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -19,7 +19,6 @@ from abcd_ns.nerfstudio.metrics import image_metrics
 from abcd_ns.nerfstudio.model import AbcdModel
 
 Picture = Float[Tensor, "h w 3"]
-Drawer = Callable[[Cameras], Picture]
 
 
 @dataclass(frozen=True)
@@ -51,35 +50,35 @@ def held_out_views(pipeline: VanillaPipeline) -> Iterator[HeldOutView]:
         yield HeldOutView(row, dataset.image_filenames[row].name, camera, photo)
 
 
-def merged_drawer(model: SplatfactoModel) -> Drawer:
-    """Draws all Gaussians at once, as any viewer does."""
+def draw_merged(model: SplatfactoModel, camera: Cameras) -> Picture:
+    """All Gaussians at once, as any viewer draws them."""
     if isinstance(model, AbcdModel):
-        return lambda camera: _on_background(model.draw_merged(model.view(camera)).layer, model)
-    return lambda camera: model.get_outputs_for_camera(camera)["rgb"]
+        return _on_background(model.draw_merged(model.view(camera)).layer, model)
+    return model.get_outputs_for_camera(camera)["rgb"]
 
 
-def composited_drawer(model: SplatfactoModel) -> Drawer:
-    """Draws block by block, through layers; a model without blocks has one way to be drawn only."""
+def draw_composited(model: SplatfactoModel, camera: Cameras) -> Picture:
+    """Block by block, through layers; a model without blocks has one way to be drawn only."""
     if isinstance(model, AbcdModel):
-        return lambda camera: _on_background(model.draw_composited(model.view(camera)), model)
-    return merged_drawer(model)
+        return _on_background(model.draw_composited(model.view(camera)), model)
+    return draw_merged(model, camera)
 
 
 def mean_psnr(pipeline: VanillaPipeline) -> float:
     """Mean over the held-out views of the merged pictures' PSNR, dB."""
-    draw = merged_drawer(pipeline.model)
     with undisturbed(pipeline):
-        scores = [float(psnr(draw(view.camera), view.photo)) for view in held_out_views(pipeline)]
+        views = held_out_views(pipeline)
+        scores = [float(psnr(draw_merged(pipeline.model, view.camera), view.photo)) for view in views]
     return sum(scores) / len(scores)
 
 
 def draw_held_out(pipeline: VanillaPipeline, rows: Collection[int] | None = None) -> Iterator[Drawn]:
     """Every held-out view, or those at `rows`, drawn both ways, in the order of the rows."""
-    merged, composited = merged_drawer(pipeline.model), composited_drawer(pipeline.model)
+    model = pipeline.model
     with undisturbed(pipeline):
         for view in held_out_views(pipeline):
             if rows is None or view.row in rows:
-                yield Drawn(view, merged(view.camera), composited(view.camera))
+                yield Drawn(view, draw_merged(model, view.camera), draw_composited(model, view.camera))
 
 
 def score(drawn: Drawn) -> ViewScore:

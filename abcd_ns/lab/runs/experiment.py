@@ -22,16 +22,12 @@ LeaveOut = Callable[[Job, Run | Failure | None], LeftOut | None]
 """Why a job's method is left out from now on, if it is; asked before the job, and with what came of it."""
 
 
-def leave_none_out(job: Job, outcome: Run | Failure | None) -> None:
-    """Leaves nothing out."""
-
-
 def carry_out(
     plan: Plan,
     console: Console,
     draw: Draw,
     overwrite: bool = False,
-    leave_out: LeaveOut = leave_none_out,
+    leave_out: LeaveOut = lambda *_: None,
 ) -> int:
     """Do all jobs of the plan and write what came of them; exit code 1 if a run failed.
 
@@ -45,7 +41,7 @@ def carry_out(
 
 
 def run_jobs(
-    plan: Plan, console: Console, overwrite: bool = False, leave_out: LeaveOut = leave_none_out
+    plan: Plan, console: Console, overwrite: bool = False, leave_out: LeaveOut = lambda *_: None
 ) -> Iterator[Results]:
     """Do the plan's jobs, one by one; after each, all that was found so far."""
     machine, found, left_out = describe_machine(), [], []

@@ -1,7 +1,6 @@
 """A training run that is watched: its clock, its curve of held-out quality, and what it reports of itself."""
 
 import time
-from collections.abc import Callable
 
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
@@ -13,52 +12,11 @@ from abcd_ns.lab.results.run import CurvePoint
 from abcd_ns.lab.runs.evaluate import mean_psnr
 
 
-class CurveRecorder:
-    """Scores the held-out views at given moments of a run, while the run's stopwatch is paused.
-
-    Args:
-        moments: shares of the run, rising; 1 and above are left to whoever ends the run.
-        pause: stops the stopwatch, unless training goes on meanwhile.
-        progress: the share of the run that is done.
-        steps: optimisation steps taken.
-        measure: the score, dB.
-        count: Gaussians that are drawn.
-    """
-
-    def __init__(
-        self,
-        moments: tuple[float, ...],
-        stopwatch: Stopwatch,
-        pause: Callable[[], None],
-        progress: Callable[[], float],
-        steps: Callable[[], int],
-        measure: Callable[[], float],
-        count: Callable[[], int],
-    ) -> None:
-        self.points: list[CurvePoint] = []
-        self.seconds = 0.0
-        """Spent on evaluation."""
-        self._left = [moment for moment in moments if moment < 1]
-        self._stopwatch, self._progress, self._steps = stopwatch, progress, steps
-        self._pause = pause
-        self._measure, self._count = measure, count
-
-    def look(self) -> None:
-        """Call after every step."""
-        progress = self._progress()
-        if progress >= 1 or not self._left or progress < self._left[0]:
-            return
-        self._left = [moment for moment in self._left if moment > progress]
-        self._pause()
-        began = time.perf_counter()
-        seconds, steps = self._stopwatch.seconds, self._steps()
-        self.points.append(CurvePoint(seconds, steps, self._measure(), self._count()))
-        self.seconds += time.perf_counter() - began
-        self._stopwatch.start()
-
-
 class Training:
-    """A trainer that is set up, with a curve recorder in it."""
+    """A trainer that is set up, whose held-out views are scored at the settings' moments of the run.
+
+    The run's stopwatch is paused meanwhile. The end is left to whoever ends the run.
+    """
 
     def __init__(self, trainer: Trainer, settings: Settings) -> None:
         self.trainer, self.pipeline = trainer, trainer.pipeline
@@ -67,15 +25,11 @@ class Training:
         ours = self.coordinator is not None
         self.stopwatch = self.coordinator.stopwatch if ours else Stopwatch()
         self._budget = Budget(settings.steps, settings.seconds)
-        self.recorder = CurveRecorder(
-            settings.moments,
-            self.stopwatch,
-            self.coordinator.pause if ours else self.stopwatch.pause,
-            lambda: self.progress,
-            lambda: self.steps,
-            self._score_aloud if ours else lambda: mean_psnr(self.pipeline),
-            lambda: self.gaussians,
-        )
+        self._pause = self.coordinator.pause if ours else self.stopwatch.pause
+        self.points: list[CurvePoint] = []
+        self.seconds_of_looks = 0.0
+        """Spent on evaluation."""
+        self._moments = [moment for moment in settings.moments if moment < 1]
         if ours:
             self.coordinator.announce.subscribe(self._listen)
         else:
@@ -85,12 +39,22 @@ class Training:
         if isinstance(event, VisitEnded):
             self.layer_seconds += event.layer_seconds
         if isinstance(event, (StepTaken, VisitEnded)):
-            self.recorder.look()
+            self._look()
 
-    def _score_aloud(self) -> float:
+    def _look(self) -> None:
+        """After every step: score, if the next moment has come."""
+        progress = self.progress
+        if progress >= 1 or not self._moments or progress < self._moments[0]:
+            return
+        self._moments = [moment for moment in self._moments if moment > progress]
+        self._pause()
+        began, seconds, steps = time.perf_counter(), self.stopwatch.seconds, self.steps
         found = mean_psnr(self.pipeline)
-        self.coordinator.announce(HeldOutScored(found, None))
-        return found
+        if self.coordinator is not None:
+            self.coordinator.announce(HeldOutScored(found, None))
+        self.points.append(CurvePoint(seconds, steps, found, self.gaussians))
+        self.seconds_of_looks += time.perf_counter() - began
+        self.stopwatch.start()
 
     def _follow_steps(self) -> None:
         """For a trainer that is not ABCD's: count the time here, and stop when it is up."""
@@ -100,7 +64,7 @@ class Training:
 
         def end_step(step: int) -> None:
             self._steps = step + 1  # the trainer's own count is one higher once it has been stopped
-            self.recorder.look()
+            self._look()
             if self.progress >= 1:
                 self.stopwatch.pause()
                 self.trainer.stop_training = True

@@ -48,7 +48,7 @@ def run(job: Job, folder: Path) -> Run:
     """
     training = set_up(job, folder.parent.parent.parent)
     training.trainer.train()
-    total = time.time() - psutil.Process().create_time() - training.recorder.seconds
+    total = time.time() - psutil.Process().create_time() - training.seconds_of_looks
     memory = memory_of_run()
     scores, gaps = score_held_out(training, job, folder / "pictures")
     return _record(job, training, total, scores, gaps, folder, memory)
@@ -131,7 +131,7 @@ def _record(
         **memory,
         store_bytes=disk_bytes(folder / "abcd" / STORE),
         layer_seconds=training.layer_seconds,
-        curve=(*training.recorder.points, end),
+        curve=(*training.points, end),
         views=tuple(scores),
         versions=describe_versions(),
     )

@@ -6,8 +6,8 @@ from functools import partial
 
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.lab.results.results import Curve, Line
-from abcd_ns.lab.stability.lab import Lab, Method, Stage
-from abcd_ns.lab.stability.scenarios.captures import PAIR, table, with_gains, with_noisy_poses
+from abcd_ns.lab.stability.lab import Lab, Method, Stage, make_stage
+from abcd_ns.lab.stability.scenarios.captures import PAIR, with_gains, with_noisy_poses
 from abcd_ns.lab.stability.scenarios.freshness import BLOCKS, train_stale
 
 VIEWS = (3, 8, 16)
@@ -55,7 +55,7 @@ class Study:
 
 def studies() -> tuple[Study, ...]:
     """All of them, on the table with its balls."""
-    stage = table()
+    stage = make_stage()
     clean = {method: _call(stage, method, name="table") for method in PAIR}
     return (*_of_training(stage, clean["abcd-monolithic"]), *_of_captures(stage, clean))
 

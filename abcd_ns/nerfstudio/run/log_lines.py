@@ -1,6 +1,8 @@
-"""The lines of a run's log: what each kind of them says."""
+"""The lines of a run's log: what each kind of them says; some are an event of the engine's."""
 
 from dataclasses import dataclass
+
+from abcd_ns.engine.events import ShedAtEnd, SweepEnded, VisitBegan, WorkerLost
 
 SCHEMA = 1
 """Raised whenever a line changes its form or meaning."""
@@ -30,17 +32,8 @@ class TrainingLine(Line):
 
 
 @dataclass(frozen=True)
-class VisitLine(Line):
+class VisitLine(VisitBegan, Line):
     """A visit began."""
-
-    visit: int
-    sweep: int
-    block: int | None
-    """None for the warm-up."""
-    steps: int
-    views: int
-    gaussians: int
-    """That are trained in it."""
 
 
 @dataclass(frozen=True)
@@ -77,33 +70,18 @@ class VisitEndLine(Line):
 
 
 @dataclass(frozen=True)
-class SweepEndLine(Line):
+class SweepEndLine(SweepEnded, Line):
     """Every block that some view sees was visited once more."""
 
-    sweep: int
-
 
 @dataclass(frozen=True)
-class ShedAtEndLine(Line):
+class ShedAtEndLine(ShedAtEnd, Line):
     """The run was complete, and what its pictures hardly miss was taken out."""
 
-    gone: int
-    """Gaussians."""
-    gaussians: int
-    """That are left."""
-    views: int
-    """Training views that told how many might go; means over them follow."""
-    before: float
-    """PSNR, dB."""
-    after: float
-
 
 @dataclass(frozen=True)
-class WorkerLostLine(Line):
+class WorkerLostLine(WorkerLost, Line):
     """A worker was lost, and the visit it was at is trained again."""
-
-    block: int
-    why: str
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.initialize import random_points
@@ -34,9 +35,7 @@ def random_turn(degrees: float, generator: torch.Generator) -> Tensor:
     """[3, 3] a rotation by a normally distributed angle about a random axis."""
     axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
     angle = math.radians(degrees) * float(torch.randn((), generator=generator))
-    x, y, z = axis.tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.matrix_exp(angle * cross)
+    return torch.from_numpy(Rotation.from_rotvec(angle * axis.numpy()).as_matrix())
 
 
 def with_noisy_poses(stage: Stage, degrees: float, shift: float, seed: int = 0) -> Stage:
@@ -60,18 +59,7 @@ def with_gains(stage: Stage, gains: tuple[float, ...] = GAINS) -> Stage:
     return replace(stage, photos=photos)
 
 
-def with_random_points(stage: Stage, count: int, extent: float) -> Stage:
-    """Without a reconstruction: points at random places."""
-    points, colors = random_points(count, extent)
-    return replace(stage, points=points, colors=colors)
-
-
 PAIR: tuple[Method, ...] = ("abcd", "abcd-monolithic")
-
-
-def table() -> Stage:
-    """What faults are put into."""
-    return make_stage()
 
 
 def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:
@@ -79,7 +67,7 @@ def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:
 
     What blocks cost without any fault is another question, see A19.
     """
-    clean = {method: lab.compared(table(), method, "table") for method in METHODS}
+    clean = {method: lab.compared(make_stage(), method, "table") for method in METHODS}
     numbers = {f"clean {method}": value for method, value in clean.items()}
     said = {method: f"{value:.2f} dB without" for method, value in clean.items()}
     passed, worse = True, False
@@ -103,8 +91,9 @@ def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:
 )
 def sparse(lab: Lab) -> Finding:
     """A11: few views; a random start."""
-    stage = table()
-    random = with_random_points(stage, len(stage.points), 1.2)
+    stage = make_stage()
+    points, colors = random_points(len(stage.points), 1.2)  # without a reconstruction
+    random = replace(stage, points=points, colors=colors)
     return lost(lab, {f"{FEW} views": stage.only(FEW), "a random start": random})
 
 
@@ -118,7 +107,7 @@ def sparse(lab: Lab) -> Finding:
 )
 def inexact(lab: Lab) -> Finding:
     """A12: poses that are off, exposures that differ."""
-    stage = table()
+    stage = make_stage()
     noisy = with_noisy_poses(stage, TURN_DEGREES, SHIFT)
     found = lost(lab, {"noisy poses": noisy, "two exposures": with_gains(stage)})
     numbers, said, passed = dict(found.numbers), dict(found.said), found.passed

@@ -10,7 +10,6 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.lab.stability.lab import BUDGET, STILL, Lab, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
-from abcd_ns.lab.stability.scenarios.captures import table
 from abcd_ns.lab.stability.scenarios.stale import stale_coordinator
 from abcd_ns.lab.world.world import ring
 
@@ -94,7 +93,7 @@ def old_layers(lab: Lab) -> Finding:
 )
 def blocks_and_cuts(lab: Lab) -> Finding:
     """A19: the defaults with 1 to 27 blocks, and with a grid whose planes cut every ball."""
-    stage = table()
+    stage = make_stage()
     psnr = {"1 block": lab.compared(stage, "abcd-monolithic", "table")}
     psnr |= {f"{k} blocks": lab.compared(stage, "abcd", blocks=k) for k in BLOCKS if k > 1}
     cut = build_grid(stage.start().means.clamp(-0.5, 0.5), counts=(2, 2, 1))

@@ -5,13 +5,14 @@ from itertools import pairwise
 
 import torch
 
-from abcd_ns.engine.events import VisitEnded, VisitUndone
+from abcd_ns.engine.events import VisitUndone
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_visit
 from abcd_ns.lab.stability.lab import Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
+from abcd_ns.lab.stability.scenarios.freshness import objectives
 from abcd_ns.lab.world.world import ring
 
 CAP = 300
@@ -65,15 +66,13 @@ def resets(lab: Lab) -> Finding:
     for name, heal in (("abcd", True), ("abcd, not healing", False)):
         options = {"budget": lab.views_drawn(600), "blocks": 3, "warmup": 0.0, "density": density}
         coordinator = lab.coordinator(stage.start(), stage.views, heal=heal, **options)
-        errors, undone = [lab.error(coordinator, stage)], []
+        undone: list[VisitUndone] = []
 
-        def listen(event, coordinator=coordinator, errors=errors, undone=undone) -> None:
-            if isinstance(event, VisitEnded):
-                errors.append(lab.error(coordinator, stage))
+        def listen(event, undone=undone) -> None:
             undone += [event] * isinstance(event, VisitUndone)
 
         coordinator.announce.subscribe(listen)
-        lab.finish(coordinator, stage)
+        errors = objectives(lab, stage, coordinator)
         worst = max(after / before - 1 for before, after in pairwise(errors))
         numbers |= {f"worst rise {name}": worst, f"undone {name}": len(undone), f"end {name}": errors[-1]}
         said[name] = f"worst visit {worst:+.0%} error, {len(undone)} of {len(errors) - 1} visits undone"

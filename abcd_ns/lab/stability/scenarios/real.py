@@ -5,7 +5,6 @@ from pathlib import Path
 
 import torch
 
-from abcd_ns.engine.space.near_plane import near_plane
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.lab.stability.lab import Lab, Stage
@@ -40,29 +39,27 @@ def read_stage(data: Path, downscale: int) -> Stage:
     # Here and not above: loads nerfstudio.
     from abcd_ns.data.photos import Photos
     from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-    from abcd_ns.nerfstudio.views import views_of
+    from abcd_ns.nerfstudio.views import training_views
 
     parser = AbcdDataParserConfig(data=data, downscale_factor=downscale).setup()
-    splits = {}
-    for split in ("train", "test"):
-        outputs = parser.get_dataparser_outputs(split)
+    splits = [parser.get_dataparser_outputs(split) for split in ("train", "test")]
+    pictures = []
+    for outputs in splits:
         photos = Photos(outputs.metadata["photos"])
-        pictures = [photos.image(row)[..., :3].float() / 255 for row in range(len(photos))]
-        splits[split] = views_of(outputs.cameras), pictures, outputs.metadata
-    views, pictures, metadata = splits["train"]
+        pictures.append([photos.image(row)[..., :3].float() / 255 for row in range(len(photos))])
+    metadata = splits[0].metadata
     if "points3D_xyz" not in metadata:
         raise UserError(f"{data} has no points to begin with; the scenarios need some.")
     points = metadata["points3D_xyz"]
-    near = near_plane(points, views)
+    views = training_views(splits[0].cameras, points)
     chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
-    held_out, truth, _ = splits["test"]
     return Stage(
-        [replace(view, near=near) for view in views],
-        dict(enumerate(pictures)),
+        views,
+        dict(enumerate(pictures[0])),
         points[chosen].double(),
         metadata["points3D_rgb"][chosen].float(),
-        [replace(view, near=near) for view in held_out],
-        truth,
+        training_views(splits[1].cameras, points, views[0].near),
+        pictures[1],
     )
 
 
