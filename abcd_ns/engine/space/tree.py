@@ -137,18 +137,6 @@ class BlockTree:
                 stack += [right[node], left[node]]
         return tuple(found)
 
-    def siblings_to_root(self, block: int) -> tuple[int, ...]:
-        """The nodes that hang off the path from a block's leaf up to the root, lowest first.
-
-        Together with the leaf they tile space: every other block lies under exactly one of them.
-        """
-        node, siblings = self.node_of(block), []
-        while node:
-            parent = int(self.parent[node])
-            siblings.append(int(self.left[parent]) + int(self.right[parent]) - node)
-            node = parent
-        return tuple(siblings)
-
     def split(self, block: int, axis: int, threshold: float) -> "BlockTree":
         """A new tree in which the block's cell is cut in two and all else is as it was.
 

@@ -158,7 +158,12 @@ def test_a_block_and_its_siblings_tile_z_too(seed, dtype):
     view = random_view(seed, dtype)
     tree = tree_around(seed, view)
     block = seed % tree.num_blocks
-    nodes = [tree.node_of(block), *tree.siblings_to_root(block)]
+    off_the_path = [
+        node
+        for node in range(1, len(tree.parent))
+        if block not in tree.leaves(node) and block in tree.leaves(int(tree.parent[node]))
+    ]
+    nodes = [tree.node_of(block), *off_the_path]
     windows = cell_windows(tree, view, pixels(view), nodes)
     z = torch.stack([end for w in windows for end in (w.near, w.far)]).nan_to_num(posinf=9.0, neginf=-9.0)
     holders = sum(((w.near <= z) & (z < w.far)).int() for w in windows)

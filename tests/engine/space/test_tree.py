@@ -254,14 +254,6 @@ def test_split_refuses_what_does_not_cut():
         tree.split(0, 3, 0.0)
 
 
-@given(SEEDS, st.integers(1, 12))
-def test_siblings_cover_all_other_blocks_once(seed, num_blocks):
-    tree = random_tree(seed, num_blocks)
-    for block in range(num_blocks):
-        others = [leaf for node in tree.siblings_to_root(block) for leaf in tree.leaves(node)]
-        assert sorted([*others, block]) == list(range(num_blocks))
-
-
 def test_boxes():
     unit = Box(torch.zeros(3).double(), torch.ones(3).double())
     assert unit.contains(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.5, 0.5], [0.5, 0.5, -1e-9]])).tolist() == [
