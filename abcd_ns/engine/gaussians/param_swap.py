@@ -27,7 +27,7 @@ LEARNING_RATES = {
 RATED_FOR = 10_000
 """Steps after which a block is trained with these rates, which are made for 30,000."""
 YOUNG_RATES = 4.0
-"""Times as large they are before, at most, in steps of one view; with the root of a step's views more."""
+"""Times as large they are before, at most; a step of four views is as large as that by itself."""
 
 STEP_PARTS = 128
 """Adam's step count is a multiple of 1 over this, which float32 counts exactly to beyond 100,000."""
@@ -149,10 +149,10 @@ def rates_of_young(views: int, batch: int) -> float:
 
     A step of Adam moves a parameter by about its rate, whatever the gradient: how far a block gets in T steps
     is bounded by rate x T. So few steps take larger rates, which fall with the root of their number until
-    they are those that steps of `batch` views have. A mean over views has less noise, and allows the more.
+    they are those that steps of `batch` views have.
     """
-    steps, most = max(views, 1) / batch, YOUNG_RATES * math.sqrt(batch)
-    return max(min(math.sqrt(RATED_FOR / steps), most) / batch, 1.0)
+    steps = max(views, 1) / batch
+    return max(min(math.sqrt(RATED_FOR / steps), YOUNG_RATES) / batch, 1.0)
 
 
 def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:

@@ -53,14 +53,14 @@ def test_a_step_grows_with_the_power_of_its_views(views, power):
 
 
 @given(views=st.integers(0, 10**6), more=st.integers(0, 10**6), batch=st.integers(1, 8))
-def test_rates_fall_to_what_was_given(views, more, batch):
-    assert rates_of_young(0, batch) == pytest.approx(max(YOUNG_RATES / math.sqrt(batch), 1.0))
+def test_rates_fall_from_four_times_to_what_was_given(views, more, batch):
+    assert rates_of_young(0, batch) == max(YOUNG_RATES / batch, 1.0)
     assert 1.0 <= rates_of_young(views + more, batch) <= rates_of_young(views, batch)
     assert rates_of_young(10**6, batch) == 1.0
 
 
 @pytest.mark.parametrize(
-    ("views", "batch", "times"), [(0, 1, 4), (2_500, 1, 2), (0, 4, 8), (2_500, 4, 4), (10_000, 1, 1)]
+    ("views", "batch", "times"), [(0, 1, 4), (2_500, 1, 2), (0, 2, 4), (2_000, 4, 4), (10_000, 1, 1)]
 )
 def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times):
     _, adam = nothing_live(sh_degree=0)
