@@ -147,6 +147,7 @@ class Coordinator(Trainer):
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""
         known, unknown = self.visit.influence.found()
+        self.visit.influence = None  # it holds on to what was live
         views = [self.views[view] for view in sorted(unknown)]
         live, options = live_gaussians(self.params).detach(), {"antialiased": self.config.antialiased}
         others = influence(live, self.scene.tree.assign(live.means), views, self.run.rasterizer, **options)

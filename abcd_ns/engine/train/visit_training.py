@@ -114,6 +114,7 @@ class VisitTraining:
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
+        """Views of several sizes may have another order in the infos: they are drawn again afterwards."""
         if self.influence is None or len(rendered.infos) != 1 or "weights" not in rendered.infos[0]:
             return
         weights = rendered.infos[0]["weights"].grad
