@@ -39,7 +39,7 @@ class VisitTraining:
     ) -> None:
         self.run, self._visits = run, visits
         self.steps = StepDrawing(run, source)
-        self.live = live or LiveBlock(run)
+        self.live = LiveBlock(run) if live is None else live  # one that is empty yet is false
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
