@@ -145,7 +145,7 @@ def test_drifting_light_costs_next_to_nothing_once_it_is_compensated(
     assert left < 0.5 * cost
 
 
-@pytest.mark.parametrize(("blocks", "steps"), [(1, 240), (4, 240)])
+@pytest.mark.parametrize(("blocks", "steps"), [(1, 200), (4, 120)])
 def test_grids_make_good_for_light_that_differs_within_a_photo(error, ring, blocks, steps):
     """A matrix for each photo cannot."""
     options, shaded = {"blocks": blocks, "steps": steps}, Shaded(TRUTH, ring)
