@@ -94,8 +94,8 @@ class Row:
 
     @property
     def is_whole(self) -> bool:
-        """Whether each visit was taken in, and once."""
-        return self.ended == list(range(len(self.ended)))
+        """Whether each visit was taken in, and once: in the order in which they were to end, not began."""
+        return sorted(self.ended) == list(range(len(self.ended)))
 
 
 class Watch:

@@ -79,6 +79,7 @@ def test_every_kill_has_its_cost_and_leaves_no_trace(tmp_path, scene, monkeypatc
 def test_what_is_lost_or_there_twice_is_told():
     calm = Row(2, ended=[0, 1, 2], digest="a")
     assert "ANOTHER" in table_of_kills(Row(2, ended=[0, 1, 2], digest="b"), calm)
+    assert "taken in once" in table_of_kills(Row(2, ended=[0, 2, 1], digest="a"), calm)
     for ended in ([0, 2], [0, 1, 1, 2]):
         assert "MISSING" in table_of_kills(Row(2, ended=ended, digest="a"), calm)
 
