@@ -48,6 +48,12 @@ TRAIN = (
 method train with checks on."""
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config):  # noqa: ARG001 - pytest-xdist's signature
+    """One more than there are cores: much of test_ray is waiting for processes that begin."""
+    return (os.cpu_count() or 1) + 1
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _shapes_are_checked(request):
     folder = request.path.parent.relative_to(Path(__file__).parent).as_posix()
