@@ -10,7 +10,7 @@ from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityControl
 from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
-from abcd_ns.engine.train.schedule import endless_order, exponential_decay, sh_degree_at
+from abcd_ns.engine.train.schedule import endless_order, exponential_decay, settling, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.scenes import Photos
 
@@ -27,9 +27,10 @@ def train_plain(
     draw, density, growth = TorchRasterizer(), DensityControl(config.density), {}
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
+        share = settling(taken / steps) * rates_of_young(taken, 1)
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, 1.0, config.means_lr_decay) if name == "means" else 1.0
-            adam[name].param_groups[0]["lr"] = rate * decay * rates_of_young(taken, 1)
+            adam[name].param_groups[0]["lr"] = rate * decay * share
         raster = draw(
             Gaussians(**{name: params[name] for name in PARAM_NAMES}),
             view,

@@ -26,6 +26,8 @@ compute."""
 COARSE, COARSE_SIDE = 2, 80
 """Influences of whole views are found in images that are so many times smaller, and those of large images in
 such as are about so many pixels long: what counts is the order of a block's views, and there may be many."""
+TINY = 1e-30
+"""Keeps a block that no view shows from being divided by."""
 DIGITS = 6
 """Decimals that are kept: a millionth of the image is less than a pixel."""
 
@@ -160,6 +162,16 @@ def _put(influence: Influence, view: int, row: Sequence[float]) -> None:
     for block, value in enumerate(row):
         if share := round(value, DIGITS):
             influence.setdefault(block, {})[view] = share
+
+
+def overlap(influence: Influence, block: int, others: Iterable[int]) -> float:
+    """How much of a block is shown where others are: the sum over these of the cosine between influences."""
+    own, found = influence.get(block, {}), 0.0
+    for other in others:
+        theirs = influence.get(other, {})
+        shared = sum(share * theirs.get(view, 0.0) for view, share in own.items())
+        found += shared / max(math.hypot(*own.values()) * math.hypot(*theirs.values()), TINY)
+    return round(found, DIGITS)
 
 
 def coarser(view: View, times: int) -> View:

@@ -8,7 +8,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
 from abcd_ns.engine.space.culling import Frusta, Optics
-from abcd_ns.engine.space.influence import worth_training
+from abcd_ns.engine.space.influence import overlap, worth_training
 from abcd_ns.engine.store.settle import has_scaffold
 from abcd_ns.engine.store.special_blocks import RESERVE, WHOLE
 from abcd_ns.engine.train.run import TrainingRun
@@ -199,11 +199,11 @@ class Planner:
             state.queue = list(plan_sweep(state.sweep, used, *steps))
             if not state.queue:
                 raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
-        busy = {visit.geometry.block for visit in state.in_flight}
-        free = next((place for place, plan in enumerate(state.queue) if plan.block not in busy), None)
-        if free is None:
+        busy = sorted({visit.geometry.block for visit in state.in_flight})
+        free = [place for place, plan in enumerate(state.queue) if plan.block not in busy]
+        if not free:
             raise BlocksBusyError
-        return state.queue.pop(free)
+        return state.queue.pop(min(free, key=lambda k: overlap(state.influence, state.queue[k].block, busy)))
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
         """As far as influences are known they tell; a visit looks again."""

@@ -45,7 +45,8 @@ class Recipe:
     split_wide: bool = True
     """Gaussians over a twentieth of a picture wide are split when their block grows, see `WIDE_ANGLE`."""
     fast_start: bool = True
-    """Learning rates are larger while a block was trained on few views, see `param_swap.rates_of_young`."""
+    """Learning rates are larger while a block was trained on few views, see `param_swap.rates_of_young`, and
+    those of a scene in one block fall at the end of the run, see `schedule.settling`."""
 
 
 @dataclass(frozen=True)

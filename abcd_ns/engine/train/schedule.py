@@ -31,6 +31,8 @@ LAYER_SHARE = 0.1
 SHORTER = 4
 """Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
 others have made of themselves meanwhile."""
+SETTLES, SETTLED = 0.6, 0.1
+"""From this share of a run on the learning rates of a scene in one block fall, to this share of them."""
 FROZEN_COST, WINDOW_COST = 0.3, 0.4
 """Of drawing a Gaussian into a layer, and of finding its block's window; a training step draws one for 1."""
 
@@ -183,6 +185,11 @@ def _one_pass(views: tuple[int, ...], number: int, seed: int) -> tuple[int, ...]
 def exponential_decay(progress: float, initial: float, final: float) -> float:
     """initial (final / initial)^progress for progress 0..1, as 3DGS decays the rate of the means."""
     return initial * (final / initial) ** min(max(progress, 0.0), 1.0)
+
+
+def settling(progress: float) -> float:
+    """A scene in one block: the share of its learning rates that is left, see SETTLES."""
+    return exponential_decay((progress - SETTLES) / (1 - SETTLES), 1.0, SETTLED)
 
 
 def reduction_at(progress: float, coarse: float, shortest: int) -> int:

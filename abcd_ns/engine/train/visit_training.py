@@ -15,7 +15,7 @@ from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.schedule import exponential_decay, warm_up_is_over
+from abcd_ns.engine.train.schedule import exponential_decay, settling, warm_up_is_over
 from abcd_ns.engine.train.step.batch import Batch, Rendered
 from abcd_ns.engine.train.step.drawing import StepDrawing
 from abcd_ns.engine.train.step.live_block import LiveBlock
@@ -75,7 +75,9 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next."""
         run = self.run
         decay = exponential_decay(run.share, 1.0, run.config.means_lr_decay)
-        self._pace.set(self.batch, self.live.clocks.adam_views, decay, run.health.damping)
+        settles = run.active.sole and run.config.recipe.fast_start
+        damping = run.health.damping * (settling(run.progress) if settles else 1.0)
+        self._pace.set(self.batch, self.live.clocks.adam_views, decay, damping)
         return self.steps.next_batch()
 
     def render(self, batch: Batch) -> Rendered:

@@ -11,6 +11,7 @@ from abcd_ns.engine.space.influence import (
     InfluenceTable,
     coarser,
     influence,
+    overlap,
     weights,
     weights_by_pixel,
     worth_training,
@@ -240,3 +241,28 @@ def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(tmp
     train(coordinator, photos)
     assert sorted(visited) == [0, 1, 2, 3]
     assert all(sorted(used) == [0, 1, 2, 3, 4] for used in visited.values())
+
+
+def test_blocks_overlap_where_the_same_views_show_them():
+    influence = {0: {1: 0.2, 2: 0.4}, 1: {1: 0.1, 2: 0.2}, 2: {3: 0.5}, 3: {2: 0.3, 3: 0.4}}
+    assert overlap(influence, 0, [1]) == pytest.approx(1.0)
+    assert overlap(influence, 0, [2]) == 0.0
+    assert overlap(influence, 0, [3]) == pytest.approx(0.4 * 0.3 / (0.5 * 0.2**0.5), abs=1e-5)
+    assert overlap(influence, 0, [1, 2, 3]) == pytest.approx(1.0 + overlap(influence, 0, [3]), abs=1e-5)
+    assert overlap(influence, 0, []) == 0.0
+    assert overlap(influence, 9, [0]) == 0.0  # nobody sees it
+
+
+def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):
+    views = ring_of_views(4)
+    run = make_coordinator(tmp_path, random_gaussians(60, seed=3), views, blocks=4, steps=80)
+    first = run.visits.begin(at_once=2)
+    state = run.state
+    queued = [plan.block for plan in state.queue]
+    out, last = first.geometry.block, queued[-1]
+    everywhere, elsewhere = {0: 0.5, 1: 0.5}, {2: 0.1, 3: 0.1}
+    state.influence = {block: elsewhere if block == last else everywhere for block in (out, *queued)}
+    state.in_flight.append(first)
+    assert run.visits.begin(at_once=2).geometry.block == last
+    state.in_flight.clear()
+    assert run.visits.begin().geometry.block == queued[0]  # one at a time goes by the sweep's order

@@ -16,6 +16,7 @@ from abcd_ns.engine.train.schedule import (
     passes_for_layers,
     passes_of_sweep,
     plan_sweep,
+    settling,
     sh_degree_at,
     view_order,
     views_per_visit,
@@ -96,6 +97,13 @@ def test_learning_rate_decays_exponentially():
     assert exponential_decay(0.5, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-5)
     assert exponential_decay(1.0, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-6)
     assert exponential_decay(7.0, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-6)
+
+
+def test_rates_of_one_block_fall_at_the_end_of_the_run():
+    assert [settling(progress) for progress in (0.0, 0.3, 0.6)] == [1.0, 1.0, 1.0]
+    assert settling(0.8) == pytest.approx(10**-0.5)
+    assert settling(1.0) == pytest.approx(0.1)
+    assert settling(3.0) == pytest.approx(0.1)  # a budget of seconds that was overdrawn
 
 
 def test_degree_of_30000_steps_is_splatfactos():
