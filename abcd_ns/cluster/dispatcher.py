@@ -31,7 +31,7 @@ from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, WorkerLost, WorkersSeen
 from abcd_ns.engine.store.lent_scene import Outlines
 from abcd_ns.engine.store.settle import has_scaffold, settle, state_for_visit
-from abcd_ns.engine.train.coordinator import Coordinator, put_to_rest, tell_of_end
+from abcd_ns.engine.train.coordinator import Coordinator, rest_after_visit
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import BlocksBusyError
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -114,7 +114,7 @@ class Dispatcher(Trainer):
     @property
     def finished(self) -> bool:
         """Whether the budget is used up, and all that was lent is taken in."""
-        return not self._lent and super().finished
+        return not self._lent and self._local.finished
 
     def pause(self) -> None:
         """No time counts until the next step, unless workers go on."""
@@ -183,9 +183,7 @@ class Dispatcher(Trainer):
         task = VisitTask(
             active=active,
             tree=scene.tree,
-            outlines=Outlines(
-                *(list(map(known, blocks)) for known in (scene.version, scene.count, scene.bounds))
-            ),
+            outlines=Outlines(*(list(map(known, blocks)) for known in (scene.count, scene.bounds))),
             step=state.planned,
             seconds=self.stopwatch.seconds,
             sweep=state.sweep,
@@ -290,7 +288,7 @@ class Dispatcher(Trainer):
         state.health[block] = outcome.health
         active.layer_seconds = outcome.layer_seconds
         updates = settle(self.scene, block, outcome.state, self.config.recipe.migrate, lent.taken)
-        tell_of_end(self.run, active, outcome.state, put_to_rest(self.run, updates), sweep)
+        rest_after_visit(self.run, active, outcome.state, updates, sweep)
         if not self._is_under_way(sweep):
             self.announce(SweepEnded(sweep, state.step))
         return True

@@ -60,8 +60,6 @@ class VisitOutcome:
     """On the CPU; Gaussians that left the cell are still among them."""
     done: int
     """Steps taken."""
-    psnr: float
-    """Mean of its steps' training crops, dB; NaN where none is known."""
     trained: int
     frozen: int
     """Gaussians of the block and around it, when the visit began."""
@@ -69,8 +67,6 @@ class VisitOutcome:
     """The influence that the block has on views that were doubtful."""
     health: BlockHealth
     layer_seconds: float
-    seconds: float
-    """That the visit took."""
 
 
 @dataclass(frozen=True)

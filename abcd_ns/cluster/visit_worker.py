@@ -1,7 +1,6 @@
 """Trains single visits of somebody else's run, on parameters of its own."""
 
 import copy
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -117,21 +116,16 @@ class VisitWorker:
         """
         scene = LentScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
         run = self._run_of(task, scene)
-        heard: list[float] = []
 
         def hear(event: Event) -> None:
-            if isinstance(event, StepTaken):
-                if listen is not None:
-                    listen(event)
-                if math.isfinite(event.psnr):
-                    heard.append(event.psnr)
+            if isinstance(event, StepTaken) and listen is not None:
+                listen(event)
 
         run.announce.subscribe(hear)
-        began = run.stopwatch.seconds
         run.stopwatch.start()
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
         training = VisitTraining(run, OnLease(run, task, len(state)), LayerSource(run, layers))
-        training.begin(run.active)
+        training.attach(run.active)
         shared = SharedResidual(run, training.steps, scene.as_drawn, task.beside, pictures)
         while not training.is_over:
             self._take_step(training, shared)
@@ -139,13 +133,11 @@ class VisitWorker:
         return VisitOutcome(
             training.finish(),
             active.done,
-            sum(heard) / len(heard) if heard else math.nan,
             run.state.trained,
             run.state.frozen,
             run.state.influence[block],
             run.state.health[block],
             active.layer_seconds,
-            run.stopwatch.seconds - began,
         )
 
     def _run_of(self, task: VisitTask, scene: LentScene) -> TrainingRun:

@@ -71,9 +71,6 @@ class BlockSplit:
     """It keeps its number and one part."""
     new: int
     """The number of the other part."""
-    gaussians: int
-    """In the part that stays."""
-    new_gaussians: int
 
 
 @dataclass(frozen=True)

@@ -160,9 +160,10 @@ def test_who_has_a_long_visit_keeps_no_other_from_beginning_the_next(make, photo
     assert heard.index((True, 3)) < heard.index((False, 0))
 
 
-def test_nobody_who_moves_meanwhile_is_lost(make, photos):
-    """Gaussians that come to wait for a block while it is out are there when it is home."""
-    run = make(workers=3, lag=5, density=STILL, steps=90)
+@pytest.mark.parametrize("limit", [0, 24])
+def test_nobody_who_moves_meanwhile_is_lost(make, photos, limit):
+    """Gaussians that come to wait for a block while it is out are there when it is home, though it be cut."""
+    run = make(workers=3, lag=5, density=STILL, steps=90, block_limit=limit)
     total, generator = run.count(), torch.Generator().manual_seed(0)
     inner = run.workers.wait
 
@@ -182,6 +183,7 @@ def test_nobody_who_moves_meanwhile_is_lost(make, photos):
         assert run.count() == total
         moved += run.scene.inbox is not None and len(run.scene.inbox) > 0
     assert moved > 0
+    assert (run.scene.tree.num_blocks > 6) == (limit > 0)
     for block in range(run.scene.tree.num_blocks):
         means = with_mail(run.scene, block).gaussians.means
         assert bool((run.scene.tree.assign(means) == block).all())

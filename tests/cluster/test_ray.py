@@ -22,7 +22,7 @@ from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
-from abcd_ns.errors import UserError
+from abcd_ns.errors import UserError, is_out_of_memory
 from tests.cluster.conftest import in_process, setup_of
 from tests.cluster.test_dispatcher import equal
 from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
@@ -62,7 +62,7 @@ def make_worker(setup, photos, seconds: float = 0.0, traps: Path | None = None) 
                 raise error
         return photos(sample.view.index, sample.crop), None
 
-    return VisitWorker(setup, TorchRasterizer(compile="off"), target)
+    return VisitWorker(setup, TorchRasterizer(), target)
 
 
 def refuse():
@@ -148,6 +148,7 @@ def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos, monkeypatc
     assert equal(whole_scene(lent), steady[0])
 
 
+@pytest.mark.slow  # test_dispatcher has the same without Ray
 def test_one_who_is_heard_again_after_it_was_given_up_changes_nothing(steady, lent, photos, monkeypatch):
     """A partition that heals: nobody could end it meanwhile, and its answer comes late."""
     monkeypatch.setattr(ray_workers, "SILENCE", 8.0)
@@ -167,14 +168,19 @@ def test_one_who_is_heard_again_after_it_was_given_up_changes_nothing(steady, le
     del actor  # with nobody who knows it, Ray ends it
 
 
-@pytest.mark.parametrize("trap", ["memory", "torch"])
-def test_a_worker_that_runs_out_of_memory_takes_nothing_along(steady, lent, photos, traps, trap):
+def test_full_ram_is_told_from_other_trouble():
+    assert is_out_of_memory(TRAPS["memory"])
+    assert is_out_of_memory(TRAPS["torch"])
+    assert not is_out_of_memory(TRAPS["cuda"])
+
+
+def test_a_worker_that_runs_out_of_memory_takes_nothing_along(steady, lent, photos, traps):
     lost = []
     lent.announce.subscribe(lambda e: lost.append(e.why) if isinstance(e, WorkerLost) else None)
-    (traps / trap).touch()
+    (traps / "torch").touch()
     train(lent, photos)
     assert lost == ["out of memory"]
-    assert not (traps / trap).exists()
+    assert not (traps / "torch").exists()
     assert equal(whole_scene(lent), steady[0])
 
 

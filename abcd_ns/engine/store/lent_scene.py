@@ -13,7 +13,6 @@ from abcd_ns.engine.types import Gaussians
 class Outlines:
     """What is known of every block without its Gaussians."""
 
-    versions: Sequence[int]
     counts: Sequence[int]
     """Gaussians."""
     bounds: Sequence[Box | None]
@@ -87,9 +86,6 @@ class LentScene:
         if block not in self._read:
             self._read[block] = self._drawn[block]()
         return self._read[block]
-
-    def version(self, block: int) -> int:
-        return self._outlines.versions[block]
 
     def count(self, block: int) -> int:
         is_live = block == self._block and self._live is not None

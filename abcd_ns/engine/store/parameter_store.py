@@ -23,7 +23,7 @@ from abcd_ns.engine.store.manifest import (
     read_manifest,
 )
 from abcd_ns.engine.store.manifest import StoreError as StoreError
-from abcd_ns.engine.store.shard import data_nbytes, link_or_copy, read_shard, verify_shard, write_shard
+from abcd_ns.engine.store.shard import link_or_copy, read_shard, verify_shard, write_shard
 from abcd_ns.engine.store.special_blocks import BlockName, in_order
 
 
@@ -198,7 +198,7 @@ class ParameterStore:
             state=old.state if state is None else state,
         )
         try:
-            self._require_space(sum(data_nbytes(tensors) for tensors, _ in updates.values()))
+            self._require_space(sum(t.nbytes for tensors, _ in updates.values() for t in tensors.values()))
             shards = {
                 block: write_shard(self.folder, block, generation, tensors, meta)
                 for block, (tensors, meta) in updates.items()

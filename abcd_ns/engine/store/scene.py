@@ -34,10 +34,6 @@ class BlockScene(Protocol):
         """The block's Gaussians, without a graph, wherever they are kept."""
         ...
 
-    def version(self, block: int) -> int:
-        """Changes whenever the block's Gaussians do."""
-        ...
-
     def count(self, block: int) -> int:
         """How many Gaussians the block has."""
         ...
@@ -89,9 +85,6 @@ class MemoryScene:
     def gaussians(self, block: int) -> Gaussians:
         return self._blocks[block]
 
-    def version(self, block: int) -> int:  # noqa: ARG002 - the scene never changes
-        return 0
-
     def count(self, block: int) -> int:
         return len(self._blocks[block])
 
@@ -114,9 +107,6 @@ class ChangedScene:
 
     def gaussians(self, block: int) -> Gaussians:
         return self._change(block, self._scene.gaussians(block))
-
-    def version(self, block: int) -> int:
-        return self._scene.version(block)
 
     def count(self, block: int) -> int:
         return self._scene.count(block)
@@ -342,6 +332,7 @@ class StoredScene:
             return self._memory.nbytes + self.unsaved_bytes
 
     def version(self, block: int) -> int:
+        """Changes whenever the block's Gaussians do."""
         return self._versions.get(block, 0)
 
     def count(self, block: int) -> int:

@@ -89,11 +89,6 @@ def link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, temporary)
 
 
-def data_nbytes(tensors: Mapping[str, Tensor]) -> int:
-    """Bytes that the tensors take in a file, without its header."""
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
-
-
 def _plain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """As safetensors wants them: on the CPU, contiguous, and none sharing memory with another."""
     plain: dict[str, Tensor] = {}

@@ -140,14 +140,13 @@ class WriteBehind:
     def _write(self, snapshot: Snapshot) -> None:
         try:
             self._store.commit(snapshot.blocks, header=snapshot.header, state=snapshot.state)
+            self._written(snapshot)
         except BaseException as error:  # whatever it is, it is for the thread that trains
             with self.lock:
                 self._waiting = snapshot if self._waiting is None else self._waiting.after(snapshot)
                 self._due, self._error = math.inf, error
             if not isinstance(error, Exception):
                 raise
-        else:
-            self._written(snapshot)
 
 
 def _try(chore: Callable[[], object]) -> None:

@@ -28,6 +28,10 @@ from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
 
+AT_ONCE = 1e-3
+"""Seconds: what a long visit puts to rest is written as soon as no other write is under way. The last one may
+have begun just now with a state of long ago; to count from that, a kill would lose twice `commit_seconds`."""
+
 
 class Coordinator(Trainer):
     """Trains one block after the other.
@@ -103,7 +107,7 @@ class Coordinator(Trainer):
             if self.finished:
                 self.shed_at_end()
         elif self.scene.is_due(self.config.commit_seconds):
-            self.rest(self.config.commit_seconds)
+            self.rest(AT_ONCE)
 
     @property
     def finished(self) -> bool:
@@ -115,7 +119,7 @@ class Coordinator(Trainer):
 
     def begin_visit(self) -> None:
         """Begin the next one."""
-        self.visit.begin(self.visits.begin())
+        self.visit.attach(self.visits.begin())
         self._read_ahead()
 
     def _read_ahead(self) -> None:
@@ -134,7 +138,7 @@ class Coordinator(Trainer):
         self.scene.clear_live()
         self.state.active = None
         crash_points.reached(crash_points.VISIT_TRAINED)
-        tell_of_end(self.run, active, state, put_to_rest(self.run, updates), self.state.sweep)
+        rest_after_visit(self.run, active, state, updates, self.state.sweep)
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
 
@@ -185,27 +189,22 @@ class Coordinator(Trainer):
             self._read_ahead()
 
 
-def put_to_rest(run: TrainingRun, updates: dict[BlockName, BlockState]) -> dict[BlockName, BlockState]:
-    """Put what a visit changed to rest, blocks that have outgrown their limit in parts; gives all of it."""
-    limits = run.config.limits.block_limit, run.config.limits.sole_limit
-    tree, updates = cut_full(run.scene, updates, run.state, *limits, run.announce)
-    split = tree is not run.scene.tree
-    run.rest(tree, updates, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
-    if split:
-        run.fit_density(tree.num_blocks)
-    return updates
-
-
-def tell_of_end(
+def rest_after_visit(
     run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], sweep: int
 ) -> None:
-    """Tell listeners that a visit has ended.
+    """Put what a visit changed to rest, blocks that have outgrown their limit in parts, and tell listeners.
 
     Args:
         state: what the visit made of its block.
-        updates: what came to rest of it.
+        updates: what comes to rest of it.
         sweep: that it belongs to.
     """
+    limits = run.config.limits.block_limit, run.config.limits.sole_limit
+    tree, parts = cut_full(run.scene, updates, run.state, *limits, run.announce)
+    split = tree is not run.scene.tree
+    run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
+    if split:
+        run.fit_density(tree.num_blocks)
     block = None if active.is_whole else active.geometry.block
     staying = len(state) if block is None else len(updates[block])
     run.announce(

@@ -49,12 +49,9 @@ class VisitTraining:
         """Views in a step of the visit that is under way."""
         return self.steps.batch
 
-    def begin(self, active: ActiveVisit) -> None:
-        """Begin a visit, which from now on is the run's active one."""
-        self.attach(active)
-
     def attach(self, active: ActiveVisit) -> None:
-        """Make its block live and draw its layers, at its beginning or where a save found it."""
+        """Make the block of the run's active visit live and draw its layers, at its beginning or where a save
+        found it."""
         run, state = self.run, self.run.state
         self.live.attach(active, self.batch)
         block, seen = None if active.is_whole else active.geometry.block, len(active.geometry.views)

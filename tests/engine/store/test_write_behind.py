@@ -121,6 +121,19 @@ def test_with_no_seconds_to_wait_all_is_durable_at_once(scene):
     assert on_disk(scene) == {"step": 1}
 
 
+def test_what_fails_after_a_write_is_said_and_nobody_waits_for_ever(scene, monkeypatch):
+    def fails(_) -> None:
+        raise MemoryError("no more")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(scene._writer, "_written", fails)
+        with pytest.raises(MemoryError):
+            scene.rest(scene.tree, {0: moved(scene.state(0), 1)}, {"step": 1}, within=0.0)
+    scene.flush()
+    assert on_disk(scene) == {"step": 1}
+    assert scene.unsaved_bytes == 0
+
+
 def test_the_thread_ends_when_all_is_written(scene):
     scene.rest(scene.tree, {}, {"step": 1}, within=PATIENCE)
     assert scene._writer._thread.is_alive()
@@ -323,3 +336,16 @@ def test_a_long_visit_is_saved_by_the_clock(tmp_path, views, photos, start):
     coordinator.close()
     again = make_coordinator(tmp_path, start, views, resume=True, steps=50)
     assert again.state.step == 10
+
+
+def test_what_a_long_visit_puts_to_rest_waits_for_no_clock(tmp_path, views, photos, start):
+    """Though the last write has only just begun, of something older: else a kill would lose twice as much."""
+    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=50, commit_seconds=60.0)
+    train(coordinator, photos, steps=3)
+    assert on_disk(coordinator.scene).get("step", 0) == 0
+    coordinator.scene._rested -= 61.0
+    train(coordinator, photos, steps=1)
+    deadline = time.monotonic() + PATIENCE
+    while on_disk(coordinator.scene).get("step") != 4 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert on_disk(coordinator.scene)["step"] == 4

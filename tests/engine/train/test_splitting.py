@@ -141,6 +141,52 @@ def test_what_need_not_be_cut_is_not_written_again(tmp_path, views, start):
     assert scene.tree.num_blocks > 1
 
 
+def test_a_block_that_was_the_whole_scene_is_cut_though_its_visit_was_under_way(
+    tmp_path, views, photos, start
+):
+    options = {"blocks": 1, "steps": 30, "density": DensityConfig(strategy="off"), "warmup": 0.0}
+    first = make_coordinator(tmp_path, start, views, **options)
+    train(first, photos, 4)
+    first.save()
+    scene, store = first.scene, first.scene.store
+    state = RunState.from_json(store.state)
+    assert state.active.saved
+    scene.clear_live()
+    cut_at_rest(scene, state, limit=40, sole=50)
+    assert scene.tree.num_blocks > 2
+    assert sum(map(scene.count, range(scene.tree.num_blocks))) == len(start)
+    store.close()
+    again = make_coordinator(tmp_path, start, views, resume=True, block_limit=40, sole_limit=50, **options)
+    assert again.state.step == 4
+    largest = 0
+    while not again.finished:
+        train_step(again, photos)
+        largest = max(largest, len(again.params["means"]))
+    assert largest <= 40
+    assert len(whole_scene(again)) == len(start)
+
+
+def test_of_several_blocks_all_are_cut_but_the_one_whose_visit_was_under_way(tmp_path, views, photos, start):
+    options = {"blocks": 2, "steps": 30, "density": DensityConfig(strategy="off"), "warmup": 0.0}
+    first = make_coordinator(tmp_path, start, views, **options)
+    train(first, photos, 4)
+    first.save()
+    scene, store, state = first.scene, first.scene.store, RunState.from_json(first.scene.store.state)
+    block, step = state.active.geometry.block, state.step
+    scene.clear_live()
+    before = scene.rows(block)
+    cut_at_rest(scene, state, limit=40)
+    assert state.active is not None
+    assert scene.rows(block) == before
+    assert scene.rows(1 - block) <= FULL * 40
+    store.close()
+    again = make_coordinator(tmp_path, start, views, resume=True, block_limit=40, **options)
+    assert again.state.step == step
+    train(again, photos)
+    assert len(whole_scene(again)) == len(start)
+    assert max(map(again.scene.rows, range(again.scene.tree.num_blocks))) <= FULL * 40
+
+
 def test_a_run_goes_on_with_a_smaller_limit(tmp_path, views, photos, start):
     options = {"blocks": 2, "steps": 30, "density": DensityConfig(strategy="off"), "warmup": 0.0}
     first = make_coordinator(tmp_path, start, views, **options)

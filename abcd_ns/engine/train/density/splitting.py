@@ -7,7 +7,7 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail, without
-from abcd_ns.engine.store.special_blocks import INBOX, BlockName
+from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
 from abcd_ns.engine.train.run_state import RunState
 
 FULL = 0.75
@@ -68,8 +68,13 @@ def with_full(
         return settled
     waiting = split_by_block(inbox, scene.tree.assign(inbox.gaussians.means))
     at_rest = {block: mail for block, mail in waiting.items() if block not in busy}
-    full = {b: mail for b, mail in at_rest.items() if scene.rows(b) + len(mail) > FULL * limit}
-    joined = {block: scene.state(block).joined_by(mail) for block, mail in full.items()}
+    # A block whose visit has just ended may have mail, too: what came while it was out.
+    rows = {block: len(settled[block]) if block in settled else scene.rows(block) for block in at_rest}
+    full = {block: mail for block, mail in at_rest.items() if rows[block] + len(mail) > FULL * limit}
+    joined = {
+        block: (settled[block] if block in settled else scene.state(block)).joined_by(mail)
+        for block, mail in full.items()
+    }
     return {**settled, **joined, INBOX: without(scene, inbox, full)} if full else settled
 
 
@@ -93,22 +98,34 @@ def cut_full(
     tree, settled, parents = split_full(scene.tree, with_full(scene, settled, limit, busy), limit, sole)
     for new, parent in parents.items():
         state.inherit(new, parent)
-        announce(BlockSplit(parent, new, len(settled[parent]), len(settled[new])))
+        announce(BlockSplit(parent, new))
     return tree, settled
 
 
 def cut_at_rest(scene: StoredScene, state: RunState, limit: int, sole: int = 0) -> None:
     """Cut the blocks of a run that goes on with smaller limits than it had; nothing where all are in order.
 
-    A block whose visit was under way is left for its end.
+    A block among others whose visit was under way is left for its end, as the warm-up is; that of a block
+    that was the whole scene is over.
 
     Args:
         limit, sole: as of `split_full`.
     """
+    active = state.active
     for block in range(scene.tree.num_blocks) if limit else ():
-        if scene.count(block) <= FULL * limit or state.active is not None:
+        in_visit = active is not None and (active.is_whole or active.geometry.block == block)
+        if in_visit and not active.sole:
             continue
-        large = {block: with_mail(scene, block), **inbox_without(scene, {block})}
+        lives = in_visit and active.saved
+        rows = scene.rows(LIVE) if lives else scene.count(block)
+        if not is_full(rows, scene.tree.num_blocks, limit, sole):
+            continue
+        if lives:
+            live = scene.state(LIVE)
+            large = {block: live, LIVE: live.nobody}
+        else:
+            large = {block: with_mail(scene, block), **inbox_without(scene, {block})}
         tree, parts = cut_full(scene, large, state, limit, sole, Announcer())
         if tree is not scene.tree:
+            state.active = active = None if active is None or active.sole else active
             scene.rest(tree, parts, state.to_json())
