@@ -106,6 +106,8 @@ def check_options(config: TrainerConfig) -> None:
     if config.is_viewer_legacy_enabled():
         raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
     pipeline.training.check()
+    if pipeline.training.recipe.overlap > 0 and pipeline.blocks == 0:
+        raise UserError("abcd-partition cuts no block that outgrows the device: give --pipeline.blocks.")
     workers = (pipeline.workers, pipeline.cluster, pipeline.blocks, pipeline.training.recipe)
     check_workers(*workers, on_gpu=config.machine.device_type == "cuda")
     refuse_changed(config, UNUSED, "")

@@ -53,7 +53,7 @@ from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import MadeFor, RunRequest, new_store, take_over
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import training_views, views_of
-from abcd_ns.nerfstudio.workers import BLOCKS_EACH, dispatcher_for, number_of_workers
+from abcd_ns.nerfstudio.workers import blocks_to_begin_with, dispatcher_for, number_of_workers
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from abcd_ns.viewer import guard
@@ -288,7 +288,8 @@ class AbcdPipeline(VanillaPipeline):
             return self.config.blocks, {name: getattr(self.config.training.limits, name) for name in FITTED}
         fit = self._fit(points)
         CONSOLE.print(fit.in_words(), highlight=False, soft_wrap=True)
-        return max(fit.blocks, BLOCKS_EACH * self.config.workers * (self.config.workers > 1)), fit.limits
+        lends = self.config.workers > 1 or self.config.cluster is not None
+        return blocks_to_begin_with(fit, self.config.workers if lends else 0), fit.limits
 
     def _views(self) -> list[View]:
         """The training views; from now on the model draws from their near plane on."""

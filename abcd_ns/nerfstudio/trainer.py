@@ -28,6 +28,7 @@ from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, find_start, pin_name
+from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
@@ -122,12 +123,15 @@ class AbcdTrainer(Trainer):
         super().__init__(config, *args, **kwargs)
         self.total_steps = config.max_num_iterations
         """Steps of the whole run, those before a resume included."""
+        self._options = flat_options(config)
         self._signals = StopSignals()
 
     @property
     def run(self) -> RunRequest:
         """What the pipeline begins."""
-        return RunRequest(self.config, self.base_dir / STATE, self.total_steps, self.resumed_from)
+        return RunRequest(
+            self.config, self.base_dir / STATE, self.total_steps, self._options, self.resumed_from
+        )
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
@@ -245,6 +249,8 @@ class AbcdTrainer(Trainer):
         """
         coordinator = self.pipeline.coordinator
         coordinator.pause()
+        # Steps of workers are counted here one after the other, but taken in visit by visit.
+        step = max(coordinator.state.step - 1, 0)
         coordinator.save(pin=pin_name(step))
         crash_points.reached(crash_points.CHECKPOINT_PINNED)
         path = self.checkpoint_dir / f"{pin_name(step)}.ckpt"

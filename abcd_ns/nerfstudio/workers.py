@@ -21,6 +21,7 @@ from abcd_ns.engine.train.memory import PHOTO_SHARE
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.fit import GB, Fit
 
 BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one that rests."""
@@ -34,6 +35,10 @@ def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe
     """
     if workers < 0:
         raise UserError(f"--pipeline.workers must be 0 or more, not {workers}.")
+    if cluster is not None and not workers:
+        raise UserError(
+            f"--pipeline.cluster {cluster} does not say how many workers: add --pipeline.workers."
+        )
     if workers <= 1 and cluster is None:
         return
     if cluster is not None or on_gpu:
@@ -47,6 +52,23 @@ def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe
             f"{workers} workers need more than {blocks} blocks: leave --pipeline.blocks out, or give "
             f"{BLOCKS_EACH * workers}."
         )
+
+
+def blocks_to_begin_with(fit: Fit, workers: int) -> int:
+    """As few as fit the device, but enough for every worker.
+
+    Args:
+        workers: 0 for none, also where one process trains.
+
+    Raises:
+        UserError: they need several blocks, and there is no room for the layers around one.
+    """
+    if workers and not fit.limit:
+        raise UserError(
+            f"{fit.budget / GB:.1f} GB of the device have no room for a block among others, which workers "
+            "need: leave --pipeline.workers out, or give smaller photos."
+        )
+    return max(fit.blocks, BLOCKS_EACH * workers)
 
 
 def _works_at_once(recipe: Recipe) -> bool:
@@ -93,7 +115,7 @@ def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int
     pipeline, on_gpu = config.pipeline, config.machine.device_type == "cuda"
     config = copy.deepcopy(config)
     config.pipeline.datamanager.photo_cache_gb = pipeline.datamanager.photo_cache_gb / count
-    threads = max(torch.get_num_threads() // count, 1)
+    threads = 1 if on_gpu else max(torch.get_num_threads() // count, 1)  # of machines that may be smaller
     if on_gpu and pipeline.cluster is None and torch.cuda.device_count() < count:
         raise WorkersError(
             f"{count} workers need {count} GPUs, one each, and this machine has {torch.cuda.device_count()}: "

@@ -33,7 +33,7 @@ from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run.resuming import MadeFor
-from abcd_ns.nerfstudio.run.settings import write_settings
+from abcd_ns.nerfstudio.run.settings import flat_options, write_settings
 from tests.nerfstudio.test_training import configure
 from tests.reference.colmap_scene import LEFT, RIGHT, write_scene
 from tests.reference.scenes import ring_of_views
@@ -152,7 +152,7 @@ def write_run(place: Path, **header: Any) -> Path:
     frame."""
     config, folder = configure(write_scene(place / "wall"), place / "out"), place / "run"
     (folder / "abcd").mkdir(parents=True)
-    write_settings(config, folder / "abcd")
+    write_settings(config, flat_options(config), folder / "abcd")
     outputs = config.pipeline.datamanager.reader().setup().get_dataparser_outputs("train")
     outputs.save_dataparser_transform(folder / TRANSFORMS)
     known = json.loads((folder / TRANSFORMS).read_text())

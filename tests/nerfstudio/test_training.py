@@ -1,6 +1,7 @@
 """ABCD through nerfstudio's own trainer and tools, in this process, on a tiny scene."""
 
 import copy
+import json
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
 from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
 
@@ -159,6 +161,18 @@ def test_resuming_a_finished_run_trains_no_further(data, tmp_path, trained):
 def test_more_steps_go_on_from_where_a_run_ended(data, tmp_path, trained):
     longer = run(configure(data, tmp_path, load_dir=trained.checkpoint_dir, steps=STEPS + 8))
     assert longer.pipeline.coordinator.state.step == STEPS + 8
+    options = json.loads((longer.base_dir / "abcd" / SETTINGS_FILE).read_text())["options"]
+    assert options["max_num_iterations"] == STEPS + 8  # as asked for, not what was left of them
+    assert options["pipeline.datamanager.photo_cache_gb"] == 0
+
+
+def test_where_workers_train_a_checkpoint_bears_the_last_step_that_was_taken_in(data, tmp_path):
+    config = configure(data, tmp_path, blocks=5, steps=40)
+    config.pipeline.workers = 2
+    trainer = run(config)
+    assert trainer.pipeline.coordinator.trains_elsewhere
+    (checkpoint,) = trainer.checkpoint_dir.iterdir()
+    assert checkpoint.name == "step-000000039.ckpt"
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ VISER_MENDED = (1, 0, 25)
 """The first version of viser that serves its own files only."""
 GIB = 2**30
 LITTLE_RAM, LITTLE_DISK = 4 * GIB, 6 * GIB
-"""Free bytes below which runs of usual size end early; layers alone may take 4 GiB of disk."""
+"""Free bytes below which runs of usual size end early."""
 SYSTEM_LIBRARIES = "sudo apt-get install libgl1 libegl1 libgomp1 libusb-1.0-0 libx11-6"
 
 
@@ -115,8 +115,8 @@ def disk(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "little-disk",
-            f"Only {facts.hardware.disk_free_bytes / GIB:.1f} GiB of disk are free here. A run's layers take "
-            "up to 4 GiB, its blocks three times the size of the scene.",
+            f"Only {facts.hardware.disk_free_bytes / GIB:.1f} GiB of disk are free here. A run's blocks "
+            "take six times the size of the scene, and each checkpoint once that.",
             "Make room, or give ns-train --output-dir FOLDER on another disk.",
         )
 

@@ -139,7 +139,7 @@ def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -
     try:
         for block in _steps([block for block, count in counts.items() if count], "writing"):
             written += _write(scene, {block: counts[block]}, out / f"block-{block:04d}{suffix}", suffix)
-    except UserError:
+    except BaseException:  # a full disk, or Ctrl-C: a part of the scene is of no use
         shutil.rmtree(out)
         raise
     return written

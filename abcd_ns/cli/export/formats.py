@@ -12,6 +12,7 @@ from abcd_ns import __version__
 from abcd_ns.cli.export.glb import glb_file
 from abcd_ns.cli.export.packed import BYTES_AT_ONCE, check_installed, packed_file
 from abcd_ns.cli.export.ply import ply_file
+from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 
@@ -72,14 +73,14 @@ def scene_file(
         count: how many there will be; most formats say so at their beginning.
         up: turns the Gaussians' frame so that y is up.
     """
-    partial, written = path.with_name(path.name + ".part"), 0
-    if suffix == ".ply":
-        made = ply_file(partial, count, sh_degree, GENERATOR)
-    elif suffix == ".glb":
-        made = glb_file(partial, count, sh_degree, GENERATOR, up)
-    else:
-        made = packed_file(partial, count, sh_degree, suffix[1:], GENERATOR)
-    try:
+    written = 0
+    with replacing(path) as partial:
+        if suffix == ".ply":
+            made = ply_file(partial, count, sh_degree, GENERATOR)
+        elif suffix == ".glb":
+            made = glb_file(partial, count, sh_degree, GENERATOR, up)
+        else:
+            made = packed_file(partial, count, sh_degree, suffix[1:], GENERATOR)
         with made as append:
 
             def counted(gaussians: Gaussians) -> None:
@@ -90,6 +91,3 @@ def scene_file(
             yield counted
             if written != count:
                 raise RuntimeError(f"{path}: {written} Gaussians, where {count} were announced")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -23,6 +23,7 @@ from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
+from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.types import View
@@ -84,12 +85,8 @@ def mesh(
     try:
         with open_store(run / STATE / STORE) as store:
             fused, side = _surface(_seen(store, pipeline_config(run, read_settings(run), data)), wanted)
-        partial = out.with_name(out.name + ".part")
-        try:
+        with replacing(out) as partial:
             write_ply(partial, fused, GENERATOR)
-            partial.replace(out)
-        finally:
-            partial.unlink(missing_ok=True)
     except StoreError as error:
         raise UserError(f"{error} If the run is training, wait until it has ended.") from None
     except OSError as error:

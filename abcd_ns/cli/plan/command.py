@@ -29,6 +29,7 @@ from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.space.partition import build_kd
+from abcd_ns.engine.train.health_record import FEW_VIEWS
 from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
@@ -38,11 +39,9 @@ from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.fit import GB, Demand, Fit, device_budget, find_fit
 from abcd_ns.nerfstudio.views import training_views
-from abcd_ns.nerfstudio.workers import BLOCKS_EACH
+from abcd_ns.nerfstudio.workers import blocks_to_begin_with
 
 Number = Annotated[int, tyro.conf.arg(metavar="N")]
-FEW_VIEWS = 3
-"""Blocks that fewer views see are said to be under-observed."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +113,7 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
 
     Raises:
         InputError: training would refuse them.
+        UserError: there are no points.
     """
     parser = AbcdDataParserConfig(downscale_factor=downscale)
     config = AbcdDataManagerConfig(data=data, dataparser=parser)
@@ -121,6 +121,8 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
     with console.status("Reading the capture"):
         manager = config.setup(device="cpu", test_mode="val")
         dataset = manager.train_dataset
+        if "points3D_xyz" not in dataset.metadata:
+            raise UserError(f"{data} has no points to plan by: training would begin at random places.")
         points = dataset.metadata["points3D_xyz"].float()
         views = training_views(dataset.cameras, points)
         pixels = methods.abcd.config.pipeline.training.point_pixels
@@ -140,9 +142,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     pixels = max(view.full.pixels for view in views)
     most, on_cpu = wanted.max_gaussians or None, device.type == "cpu"
     demand = Demand(pixels, len(points), training, most=most, factor=capture.factor, on_cpu=on_cpu)
-    fit = find_fit(device_budget(wanted.device_budget_gb, device), demand)
-    at_least = BLOCKS_EACH * wanted.workers if wanted.workers > 1 else 1
-    fit = replace(fit, blocks=wanted.blocks or max(fit.blocks, at_least))
+    fit = _fit(device_budget(wanted.device_budget_gb, device), demand, wanted)
     training = replace(training, limits=replace(training.limits, **fit.limits))
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
@@ -179,6 +179,16 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     )
 
 
+def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:
+    """As training has it: blocks whose number is given are as large as they become."""
+    if wanted.blocks:
+        limits = demand.training.limits
+        batch = views_per_step(demand.training.batch, wanted.blocks, limits.batch_limit)
+        return Fit(wanted.blocks, 0, 0, budget, demand.gaussians, batch, limits.crop_pixels)
+    fit = find_fit(budget, demand)
+    return replace(fit, blocks=blocks_to_begin_with(fit, wanted.workers if wanted.workers > 1 else 0))
+
+
 def warnings_of(
     fit: Fit,
     seen: tuple[int, ...],
@@ -203,9 +213,9 @@ def warnings_of(
             f"{needed / GB:.1f} GB of disk, but {free / GB:.1f} GB are free in this folder: use `ns-train "
             "--output-dir` on another disk."
         )
-    if few := sum(count < FEW_VIEWS for count in seen):
+    if few := sum(count <= FEW_VIEWS for count in seen):
         lines.append(
-            f"{few} of {len(seen)} blocks are seen by fewer than {FEW_VIEWS} views: use fewer blocks."
+            f"{few} of {len(seen)} blocks are seen by fewer than {FEW_VIEWS + 1} views: use fewer blocks."
         )
     return lines
 
@@ -238,7 +248,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
             spread = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"
             rows[f"{what} by block"] = spread
         rows["a step on the points"] = f"{found.seconds_per_step:.3f} s"
-        rows["limits"] = fit.in_words()
+        rows["limits"] = fit.in_words() if fit.sole else "none of a block's Gaussians, as --blocks is given"
     table = Table.grid(padding=(0, 2))
     for name, value in rows.items():
         table.add_row(name, value)

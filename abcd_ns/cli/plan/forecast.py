@@ -14,15 +14,13 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.fit import Fit
+from abcd_ns.nerfstudio.fit import Fit, ram_budget, share_out
 from abcd_ns.viewer.scenery import in_image
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
 GENERATIONS = 2
 """Of the store on disk: the one in use, and the one that the last checkpoint pins."""
-FROZEN_BYTES = 2 << 30
-"""RAM for blocks that were read, at most."""
 TIMED_STEPS = 3
 LAYER_SHARE = 0.15
 """Time for layers by the time of steps: they took 11 to 15% of runs on a CPU (docs/results, 2026-11-23)."""
@@ -91,7 +89,8 @@ def device_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
 
 def _largest(fit: Fit) -> int:
     """Gaussians of the largest block, as far as can be said."""
-    return min(-(-fit.gaussians // fit.blocks), fit.sole if fit.blocks == 1 else fit.limit)
+    share, limit = -(-fit.gaussians // fit.blocks), fit.sole if fit.blocks == 1 else fit.limit
+    return min(share, limit) if limit else share
 
 
 def sent_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
@@ -113,7 +112,7 @@ def ram_shares(
     return (
         *(lent if workers > 1 else ()),
         Share("decoded photos", min(photo_bytes, photo_budget)),
-        Share("frozen blocks", min(scene, FROZEN_BYTES)),
+        Share("frozen blocks", min(scene, share_out(ram_budget(0)).blocks)),
         Share("the whole scene, while a checkpoint is written", scene),
     )
 
@@ -151,5 +150,7 @@ def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig
             for shot, raster in zip(shots, rasters, strict=True)
         ]
         torch.stack(losses).mean().backward()
+        if gaussians.device.type == "cuda":
+            torch.cuda.synchronize(gaussians.device)
         best = min(best, time.perf_counter() - began)
     return best

@@ -14,6 +14,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import STATE, STORE
+from abcd_ns.nerfstudio.run.settings import Plain
 
 MADE_FOR = "made for"
 """The entry of a store's header that tells what it can be trained on with."""
@@ -39,6 +40,8 @@ class RunRequest:
     """For all that is ours: STATE in the run's folder."""
     total_steps: int
     """Of the whole run, those before a resume included."""
+    options: dict[str, Plain]
+    """As it was asked for, by dotted name: `config` has what follows from them, too."""
     resumed_from: Start | None
     """What it goes on from; None begins anew."""
 

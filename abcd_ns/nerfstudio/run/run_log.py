@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal
+from typing import Any
 
 import psutil
 import torch
@@ -26,6 +26,7 @@ from abcd_ns.engine.events import (
     WorkerSeen,
     WorkersSeen,
 )
+from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.machine import peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import (
@@ -86,7 +87,7 @@ class RunLog:
         self._lines: list[str] = []
         self._workers: tuple[WorkerSeen, ...] = ()
         if earlier is not None:
-            self._write(past_of(coordinator, earlier), "w")
+            self._write(past_of(coordinator, earlier), anew=True)
         self._sampled = coordinator.stopwatch.seconds
         budgets = {meter.name: meter.budget for meter in self._meters}
         limit, blocks = coordinator.config.density.limit, coordinator.scene.tree.num_blocks
@@ -185,14 +186,18 @@ class RunLog:
 
     def _flush(self) -> None:
         lines, self._lines = self._lines, []
-        self._write(lines, "a")
+        self._write(lines)
 
-    def _write(self, lines: Sequence[str], mode: Literal["w", "a"]) -> None:
+    def _write(self, lines: Sequence[str], anew: bool = False) -> None:
         if self._path is None:
             return
+        text = "".join(f"{line}\n" for line in lines)
         try:
-            with open(self._path, mode, encoding="utf-8") as file:
-                file.writelines(f"{line}\n" for line in lines)
+            if anew:  # it may be the very log that the past was read from
+                write_file(self._path, text.encode())
+                return
+            with open(self._path, "a", encoding="utf-8") as file:
+                file.write(text)
         except OSError as error:
             what = f"{self._path} cannot be written ({error.strerror}); the run's log ends here."
             CONSOLE.print(what, style="yellow", markup=False, soft_wrap=True)
@@ -219,7 +224,7 @@ def past_of(coordinator: Trainer, log: Path) -> list[str]:
 
 def keep_log(run: RunRequest, photos: Photos, coordinator: Trainer) -> RunLog:
     """Begin the log of a run, and write its settings beside it."""
-    write_settings(run.config, run.folder)
+    write_settings(run.config, run.options, run.folder)
     scene = coordinator.scene
     meters = (
         Meter("photos", lambda: photos.cached_bytes, photos.budget_bytes),

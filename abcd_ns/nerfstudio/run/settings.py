@@ -48,8 +48,12 @@ class Settings:
     """What read the data: its name on `ns-train`'s command line."""
 
 
-def write_settings(config: TrainerConfig, folder: Path) -> None:
-    """Write `folder`/settings.json about a training that is about to begin; the folder must exist."""
+def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Path) -> None:
+    """Write `folder`/settings.json about a training that is about to begin; the folder must exist.
+
+    Args:
+        options: as they were asked for.
+    """
     data = Path(config.pipeline.datamanager.data)
     path = data.resolve()
     settings = Settings(
@@ -59,7 +63,7 @@ def write_settings(config: TrainerConfig, folder: Path) -> None:
         data=str(data),
         data_path=str(path),
         begun=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        options=flat_options(config),
+        options=options,
         versions=describe_versions(),
         machine=describe_machine(),
         reader=reader_name(config.pipeline.datamanager.dataparser),
