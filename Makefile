@@ -11,7 +11,7 @@ ARGS ?=
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: help setup test lint format demo bench constraints clean
+.PHONY: help setup test lint format demo constraints clean
 
 help:  ## show this list
 	@echo "usage: make TARGET [ARGS='...'] [PYTHON=/path/to/python]"
@@ -39,9 +39,6 @@ format: setup  ## reformat the code and mend what can be mended
 
 demo: setup  ## train a small scene block by block, on the CPU, and show the result (ARGS: abcd demo's)
 	@$(BIN)/abcd demo $(ARGS)
-
-bench: setup  ## compare ABCD with its peers (ARGS: abcd compare's)
-	@$(BIN)/abcd compare $(ARGS)
 
 constraints: setup  ## pin anew, after the dependencies in pyproject.toml changed
 	@scripts/lock.sh

@@ -65,7 +65,9 @@ def runs_of(
         run: makes the row of a key; anything that can be pickled.
     """
     found = json.loads(out.read_text()) if out is not None and out.exists() else {"runs": []}
-    rows = [kind(**row) for row in found["runs"] if asked.items() <= found.items()]
+    if found["runs"] and not asked.items() <= found.items():
+        raise SystemExit(f"{out} answers another question; name another file, or remove it.")
+    rows = [kind(**row) for row in found["runs"]]
     made = {tuple(asdict(row).values())[: len(keys[0])]: row for row in rows}
     for key in keys:
         if key not in made:

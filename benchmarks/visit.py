@@ -23,7 +23,6 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity
 
 from abcd_ns.data.dataset import AbcdDataset
-from abcd_ns.engine.events import VisitEnded
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render import Rasterizer, make_rasterizer
@@ -170,27 +169,22 @@ def run(
         afterwards: given the coordinator when the clock has stopped.
     """
     coordinator = begin(capture, blocks, folder, seconds=args.seconds, seed=args.seed)
-    scene = coordinator.scene
-    clock, layers = StageClock(), 0.0
+    clock = StageClock()
 
-    def note(event: object) -> None:
-        nonlocal layers
-        if isinstance(event, VisitEnded):
-            layers += event.layer_seconds
+    def timed(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any) -> Any:
+            with clock.stage(stage):  # of the clock by then
+                return function(*given)
 
-    def rest(*changed: Any) -> None:
-        with clock.stage("commit"):  # as far as the training waits for it
-            to_rest(*changed)
+        return call
 
-    coordinator.announce.subscribe(note)
-    to_rest, scene.rest = scene.rest, rest
-    began = 0.0
+    scene, source = coordinator.scene, coordinator.source
+    scene.rest = timed("commit", scene.rest)  # as far as the training waits for it
+    source.draw = timed("layers", source.draw)
     while not coordinator.finished:
         if coordinator.progress < 0.5:
-            clock, began = StageClock(), layers
+            clock = StageClock()
         step(coordinator, capture.photo, clock)
-    clock.seconds["layers"] = layers - began
-    clock.seconds["plan and attach"] -= layers - began
     afterwards(coordinator)
     coordinator.close()
     return clock

@@ -138,6 +138,7 @@ class BlocksAlone:
         self._regions: dict[int, Region] = {}
         self._crops: dict[int, Crop] = {}
         self._part = 1.0
+        self._looked_at: int | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - by itself
         """The next block's one visit; the block is put to rest as it begins, with what lies around it."""
@@ -214,7 +215,9 @@ class BlocksAlone:
 
     def _look(self, block: int) -> None:
         """Find out what pixels are to the block, and let go of the last block's."""
-        run = self._run
+        if self._looked_at == block:
+            return
+        run, self._looked_at = self._run, block
         if self._surfaces is None:
             self._surfaces = Surfaces(self._scene, list(run.views.values()), run.rasterizer, run.device)
         box, self._regions, self._crops = self._box(block), {}, {}

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
+from abcd_ns.engine.train.health_record import FEW_VIEWS
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 
-FEW_VIEWS = 3
-"""A block that fewer views are worth training on is under-observed."""
 SECONDS_BETWEEN_POINTS = 2.0
 """Of the curve, where visits are shorter, longer or do not exist."""
 MOST_POINTS = 400
@@ -140,7 +139,7 @@ class RunHistory:
         """Of one block, on which so many views are worth training, if that is known."""
         if any(visit.block == block for visit in self.under_way.values()):
             return Status.ACTIVE
-        if views is not None and views < FEW_VIEWS:
+        if views is not None and views <= FEW_VIEWS:
             return Status.UNDER_OBSERVED
         return Status.DONE if self.visits.get(block) else Status.UNTRAINED
 

@@ -42,7 +42,7 @@ def test_only_powers_of_two_part_in_equal_halves():
 
 
 def test_a_tile_does_not_depend_on_how_large_the_land_is():
-    assert torch.equal(Land(2, 20).make_tile(1).means, Land(2, 20).make_tile(1).means)
+    assert torch.equal(Land(2, 20).make_tile(1).means, Land(8, 20).make_tile(1).means)
     assert not torch.equal(Land(2, 20).make_tile(0).means + 1, Land(2, 20).make_tile(1).means)
 
 

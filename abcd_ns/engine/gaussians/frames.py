@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import sh_basis_rows, sh_degree_of
@@ -77,19 +78,9 @@ def _basis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 15"]:
 
 
 def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """(w, x, y, z) of a rotation, w >= 0.
-
-    It is the eigenvector of the largest eigenvalue of a symmetric matrix, without the cases of the usual
-    formulae (Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation Matrix", 2000).
-    """
-    r = rotation.double()
-    skew = torch.stack((r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]))
-    trace = r.trace()
-    k = r.new_zeros(4, 4)
-    k[0, 0], k[0, 1:], k[1:, 0] = trace, skew, skew
-    k[1:, 1:] = r + r.T - trace * torch.eye(3, dtype=r.dtype)
-    found = torch.linalg.eigh(k / 3).eigenvectors[:, -1]
-    return found if found[0] >= 0 else -found
+    """(w, x, y, z) of a rotation, w >= 0; float64."""
+    found = Rotation.from_matrix(rotation.double().cpu().numpy()).as_quat(canonical=True)
+    return torch.from_numpy(found[[3, 0, 1, 2]]).to(rotation.device)
 
 
 def multiplied(first: Float[Tensor, "4"], quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:

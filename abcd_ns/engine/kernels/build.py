@@ -21,6 +21,7 @@ import torch
 
 from abcd_ns.engine.kernels.kernel import (
     COMPILER_OPTIONS,
+    SMALLEST,
     Kernel,
     can_build,
     forget_loaded,
@@ -82,7 +83,7 @@ def _dynamic_shapes(kernel: Kernel) -> tuple[dict[int, Any], ...]:
 
     def dim(size: str) -> Any:
         name, _, more = size.partition("+")
-        found = dims.setdefault(name, torch.export.Dim(name, min=kernel.smallest, max=2**30))
+        found = dims.setdefault(name, torch.export.Dim(name, min=SMALLEST, max=2**30))
         return found + int(more) if more else found
 
     return tuple(

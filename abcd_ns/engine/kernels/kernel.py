@@ -28,6 +28,9 @@ use one would still wait for others, and two processes on a machine would wait f
 
 Run = Callable[..., tuple[Tensor, ...]]
 
+SMALLEST = 2
+"""Dynamic sizes below this run eagerly: a compiler may treat a size of 1 as broadcast."""
+
 
 @dataclass(frozen=True)
 class Kernel:
@@ -45,8 +48,6 @@ class Kernel:
     """Of each argument, as "11 n" or "3 n+10": numbers are fixed sizes, names are dynamic ones."""
     depends: tuple[str, ...] = ()
     """Other source files, whose constants or functions the kernel uses."""
-    smallest: int = 2
-    """Dynamic sizes below this run eagerly. At least 2: a compiler may treat a size of 1 as broadcast."""
 
     def __call__(self, *tensors: Tensor, built: bool = True) -> tuple[Tensor, ...]:
         """Run, from machine code if that is wanted, there, and suits the tensors."""
@@ -57,7 +58,7 @@ class Kernel:
     def suits(self, *tensors: Tensor) -> bool:
         """Whether machine code is there and serves these tensors."""
         sizes = (tensors[argument].shape[axis] for argument, axis in self._dynamic)
-        return all(map(_is_plain, tensors)) and min(sizes) >= self.smallest and self.is_built
+        return all(map(_is_plain, tensors)) and min(sizes) >= SMALLEST and self.is_built
 
     @functools.cached_property
     def _dynamic(self) -> tuple[tuple[int, int], ...]:

@@ -18,7 +18,7 @@ from abcd_ns.engine.render import CutShot, Rasterizer, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.culling import Frusta, Optics, intersection
 from abcd_ns.engine.space.intervals import ray_interval
-from abcd_ns.engine.space.ordering import node_children_in_order, split_around
+from abcd_ns.engine.space.ordering import front_to_back, node_children_in_order
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.space.visibility import reaches
 from abcd_ns.engine.store.scene import BlockScene
@@ -298,8 +298,8 @@ class Painter:
                 yield from self._walk(child, center)
 
     def _is_in_front(self, unit: int, active: int, view: View) -> bool:
-        front, _ = split_around(self.tree, view.center.double().cpu(), active)
-        return self.tree.leaves(unit)[0] in front
+        order = front_to_back(self.tree, view.center.double().cpu())
+        return order.index(self.tree.leaves(unit)[0]) < order.index(active)
 
 
 def _over(front: FrozenLayers | None, behind: FrozenLayers | None) -> FrozenLayers | None:

@@ -43,16 +43,10 @@ class _Part:
     unit: int
     layer: Layer
     depth: Float[Tensor, "h w"]
-    raster: Raster | None
-    """With its graph, where there is but one unit: it need not be drawn again."""
 
 
 class WholePictures:
-    """Draws a scene for it, or for poses, to be judged by.
-
-    Args:
-        views: all that will be drawn.
-    """
+    """Draws a scene for it, or for poses, to be judged by."""
 
     def __init__(self, painter: Painter, settings: PaintSettings) -> None:
         self._painter, self._settings = painter, settings
@@ -100,31 +94,40 @@ class WholePictures:
         Args:
             gradient: gives dL/dC of a view's picture.
         """
+        if len(self._units) == 1:
+            loaded = self._load(self._units[0], views)
+            for view in views:
+                self._backward_through_one(loaded, view, gradient)
+            return
         parts = self._draw(views)
         pulls = []
         for view, own in zip(views, parts, strict=True):
             own[:] = self._in_order(view, own)
             pulls.append(gradient(view, self._picture(view, own)))
         for unit in self._units:
-            loaded = self._load(unit, views) if len(self._units) > 1 else None
+            loaded = self._load(unit, views)
             for view, own, pull in zip(views, parts, pulls, strict=True):
                 self._differentiate(unit, loaded, view, own, pull)
+
+    def _backward_through_one(self, loaded: Loaded, view: View, gradient: Callable) -> None:
+        """As `backward`, for a view, where one unit is all: it is drawn once. Its graph ends here."""
+        (unit,) = self._units
+        raster = self._raster(unit, loaded, view) if loaded.shows_in(view) else None
+        pull = gradient(view, self._picture(view, [] if raster is None else [_part(unit, raster)]))
+        if raster is not None:
+            raster.color.backward(pull)
 
     def _load(self, unit: int, views: Sequence[View]) -> Loaded:
         return self._painter.load(unit, seen_by=self._painter.frusta((still(v), v.full) for v in views))
 
     def _draw(self, views: Sequence[View]) -> list[list[_Part]]:
         parts: list[list[_Part]] = [[] for _ in views]
-        only = len(self._units) == 1
         for unit in self._units:
             loaded = self._load(unit, views)
             for view, own in zip(views, parts, strict=True):
-                if not loaded.shows_in(view):
-                    continue
-                with torch.set_grad_enabled(only):
-                    raster = self._raster(unit, loaded, view)
-                layer = Layer(raster.color.detach(), raster.transmittance.detach())
-                own.append(_Part(unit, layer, raster.depth.detach(), raster if only else None))
+                if loaded.shows_in(view):
+                    with torch.no_grad():
+                        own.append(_part(unit, self._raster(unit, loaded, view)))
         return parts
 
     def _raster(self, unit: int, loaded: Loaded, view: View) -> Raster:
@@ -150,18 +153,22 @@ class WholePictures:
         return WholePicture(whole.color, whole.transmittance, fold(depths, like=nothing).color[..., 0])
 
     def _differentiate(
-        self, unit: int, loaded: Loaded | None, view: View, parts: Sequence[_Part], pull: Tensor
+        self, unit: int, loaded: Loaded, view: View, parts: Sequence[_Part], pull: Tensor
     ) -> None:
         at = next((place for place, part in enumerate(parts) if part.unit == unit), None)
         if at is None:
             return
         layers, like = [part.layer for part in parts], parts[at].layer
-        raster = parts[at].raster or self._raster(unit, loaded, view)
+        raster = self._raster(unit, loaded, view)
         front, back = fold(layers[:at], like=like), fold(layers[at + 1 :], like=like)
         by_color = front.transmittance[..., None] * pull
         behind = composite(back, pull.new_zeros(3))
         outputs = (raster.color, raster.transmittance)
         torch.autograd.backward(outputs, (by_color, (by_color * behind).sum(dim=-1)))
+
+
+def _part(unit: int, raster: Raster) -> _Part:
+    return _Part(unit, Layer(raster.color.detach(), raster.transmittance.detach()), raster.depth.detach())
 
 
 def still(view: View) -> View:

@@ -6,10 +6,10 @@ import torch
 
 from abcd_ns.engine.render.base import CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.render.cpu.chunk_kernels import CompilePolicy
 from abcd_ns.engine.render.primitive import PrimitiveName
 from abcd_ns.engine.render.self_check import self_check
 from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.errors import UserError
 
 __all__ = [
     "CutShot",
@@ -32,7 +32,6 @@ def make_rasterizer(
     device: torch.device | str,
     *,
     primitive: PrimitiveName = "3dgs",
-    compile: CompilePolicy = "auto",
 ) -> Rasterizer:
     """The rasterizer called `name`; "auto" takes gsplat where there may be kernels for it, else torch.
 
@@ -40,15 +39,15 @@ def make_rasterizer(
 
     Args:
         primitive: what a Gaussian is.
-        compile: passed to TorchRasterizer.
 
     Raises:
         ValueError: gsplat was asked for on such a device.
+        UserError: gsplat has no kernels.
         RuntimeError: gsplat's kernels do not agree with the torch backend.
     """
     device = torch.device(device)
     if name == "torch" or (name == "auto" and device.type in WITHOUT_GSPLAT):
-        return TorchRasterizer(compile, primitive=primitive)
+        return TorchRasterizer(primitive=primitive)
     if device.type in WITHOUT_GSPLAT:
         raise ValueError(
             f'The gsplat rasterizer needs a CUDA device, not "{device}"; set the rasterizer to "torch".'
@@ -56,5 +55,11 @@ def make_rasterizer(
     from abcd_ns.engine.render.cuda.backend import GsplatRasterizer  # imports gsplat
 
     rasterizer = GsplatRasterizer(primitive)
-    self_check(rasterizer, device)
+    try:
+        self_check(rasterizer, device)
+    except AttributeError as error:  # of its module of kernels, which is None
+        raise UserError(
+            "gsplat has no CUDA kernels and found no nvcc to compile them: put nvcc on the PATH "
+            "(docs/troubleshooting.md), or train slowly with --pipeline.model.rasterizer torch."
+        ) from error
     return rasterizer

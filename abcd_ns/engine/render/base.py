@@ -28,8 +28,7 @@ class Raster:
     """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
     info: dict[str, Any]
     """gsplat 1.4.0's `info` for the Gaussians that take gradients, from v cameras: means2d [v, n, 2], radii
-    [v, n], depths, opacities, width, height, n_cameras, gaussian_ids. Of the full image, not the
-    crop."""
+    [v, n], width, height, n_cameras, gaussian_ids. Of the full image, not the crop."""
 
     @property
     def layer(self) -> Layer:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -32,10 +32,6 @@ class ZWindow:
         """All of z, everywhere."""
         infinity = torch.full((grid.tiles,), math.inf, device=device, dtype=dtype)
         return ZWindow(grid, -infinity, infinity)
-
-    def holds(self, tile: Int[Tensor, "q"], z: Float[Tensor, "q"]) -> Bool[Tensor, "q"]:
-        """Whether fragments at z count in a tile, for pairs of both."""
-        return (z >= self.near.index_select(0, tile)) & (z < self.far.index_select(0, tile))
 
     def before(self, other: "ZWindow") -> "ZWindow":
         """The part of this window in front of another one."""

@@ -39,13 +39,3 @@ def front_to_back(tree: BlockTree, center: Float[Tensor, "3"]) -> tuple[int, ...
             near, far = node_children_in_order(tree, node, center)
             stack += [far, near]
     return tuple(order)
-
-
-def split_around(
-    tree: BlockTree, center: Float[Tensor, "3"], block: int
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """(blocks in front of `block`, blocks behind it), each nearest first."""
-    tree.node_of(block)  # Raises for a block that does not exist.
-    order = front_to_back(tree, center)
-    place = order.index(block)
-    return order[:place], order[place + 1 :]

@@ -13,30 +13,25 @@ MAX_CELLS = 65_536
 """The most cells that a grid may have: far more than any scene needs, few enough to fit in memory."""
 
 
-def best_split(
-    points: Float[Tensor, "n 3"], box: Box, share: float = 0.5, weights: Float[Tensor, "n"] | None = None
-) -> tuple[int, float]:
-    """Where to cut `box` so that `share` of the weight of its points falls to the left.
+def best_split(points: Float[Tensor, "n 3"], box: Box, share: float = 0.5) -> tuple[int, float]:
+    """Where to cut `box` so that `share` of its points fall to the left.
 
     Takes the axis along which the points reach furthest, outliers aside, unless equal coordinates make
-    that cut miss its share by over a tenth of the weight and another axis does better. Points that all
+    that cut miss its share by over a tenth of the points and another axis does better. Points that all
     coincide (or are missing) cannot be shared out: then an empty cell is cut off.
 
     Args:
         points: inside `box`, finite.
         share: 0 to 1.
-        weights: >= 0; 1 each if left out.
 
     Returns:
         (axis, threshold), for BlockTree.split. The threshold lies strictly inside the box, and strictly
         between two points' coordinates where float64 has room there.
     """
-    points = in_float64(points).cpu()
-    weights = torch.ones(len(points), dtype=torch.float64) if weights is None else in_float64(weights).cpu()
-    total = float(weights.sum())
+    points, total = in_float64(points).cpu(), len(points)
     best: tuple[float, int, float] | None = None
     for axis in _axes_by_extent(points):
-        cut = _cut_along(points[:, axis], weights, share * total)
+        cut = _cut_along(points[:, axis], share * total)
         if cut is not None and (best is None or cut[0] < best[0]):
             best = (cut[0], axis, cut[1])
         if best is not None and best[0] <= 0.1 * total:
@@ -46,60 +41,44 @@ def best_split(
     return _cut_off(box, points[0].tolist() if len(points) else [0.0] * 3)
 
 
-def build_kd(
-    points: Float[Tensor, "n 3"], num_blocks: int, weights: Float[Tensor, "n"] | None = None
-) -> BlockTree:
-    """A tree of `num_blocks` cells with equal numbers of points (or sums of weights); deterministic.
+def build_kd(points: Float[Tensor, "n 3"], num_blocks: int) -> BlockTree:
+    """A tree of `num_blocks` cells with equal numbers of points; deterministic.
 
     Counts differ by at most one where all coordinates are distinct. Points that coincide stay together,
     so with few distinct points some blocks start empty, but there are always `num_blocks`.
 
     Raises:
-        ValueError: `num_blocks` < 1, a point that is not finite, or weights that are not finite and >= 0.
+        ValueError: `num_blocks` < 1, or a point that is not finite.
     """
     if num_blocks < 1:
         raise ValueError(f"cannot build {num_blocks} blocks: ask for 1 or more")
     _check_finite(points)
-    weights = points.new_ones(len(points)) if weights is None else weights
-    if not bool((weights.isfinite() & (weights >= 0)).all()):
-        raise ValueError("weights must be finite and 0 or more")
-    points, weights = in_float64(points).cpu(), in_float64(weights).cpu()
     everything = Box(torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double())
-    return _flatten(_kd_node(points, weights, everything, num_blocks))
+    return _flatten(_kd_node(in_float64(points).cpu(), everything, num_blocks))
 
 
-def build_grid(
-    points: Float[Tensor, "n 3"], counts: tuple[int, int, int] | None = None, cell_size: float | None = None
-) -> BlockTree:
+def build_grid(points: Float[Tensor, "n 3"], counts: tuple[int, int, int]) -> BlockTree:
     """A regular grid, as nested splits, over where the points are (outliers aside).
 
-    Give either `counts`, the cells on each axis, or `cell_size`, their edge in world units. The outermost
-    cells reach to infinity.
+    The outermost cells reach to infinity.
+
+    Args:
+        counts: the cells on each axis.
 
     Raises:
-        ValueError: both or neither given, not positive, over MAX_CELLS cells, or a point that is not finite.
+        ValueError: `counts` are not positive, over MAX_CELLS in all, or a point is not finite.
     """
-    if (counts is None) == (cell_size is None):
-        raise ValueError("a grid needs either counts or cell_size, and not both")
-    if (counts is not None and min(counts) < 1) or (cell_size is not None and not 0 < cell_size < math.inf):
-        raise ValueError(f"a grid needs positive counts or a positive cell_size, got {counts or cell_size}")
+    if min(counts) < 1 or math.prod(counts) > MAX_CELLS:
+        raise ValueError(f"a grid has at least one cell on each axis and {MAX_CELLS} in all, not {counts}")
     _check_finite(points)
     start, stop = _robust_range(in_float64(points).cpu())
-    extents = (stop - start).tolist()
-    if counts is not None:
-        # Without any extent every cell size is as good as another; 1 keeps the planes apart.
-        sizes = [(extent or 1.0) / n for extent, n in zip(extents, counts, strict=True)]
-    else:
-        sizes = [float(cell_size)] * 3
-        # Capped so that the product below stays small enough for an integer.
-        counts = tuple(math.ceil(min(max(extent / cell_size, 1.0), 2.0 * MAX_CELLS)) for extent in extents)
-    if math.prod(counts) > MAX_CELLS:
-        raise ValueError(f"the grid would have over {MAX_CELLS} cells: make them fewer or larger")
+    # Without any extent every cell size is as good as another; 1 keeps the planes apart.
+    sizes = [(extent or 1.0) / n for extent, n in zip((stop - start).tolist(), counts, strict=True)]
     grid = zip(start.tolist(), sizes, counts, strict=True)
     return _flatten(_grid_node([[lo + size * i for i in range(1, n)] for lo, size, n in grid]))
 
 
-def _kd_node(points: Tensor, weights: Tensor, box: Box, k: int) -> tuple | None:
+def _kd_node(points: Tensor, box: Box, k: int) -> tuple | None:
     """The subtree of `k` cells over these points, as nested (axis, threshold, left, right); None is a leaf.
 
     Rounding does not add up on the way down: of q k + r points with r < k, the left half of the cells gets
@@ -107,12 +86,12 @@ def _kd_node(points: Tensor, weights: Tensor, box: Box, k: int) -> tuple | None:
     """
     if k == 1:
         return None
-    axis, threshold = best_split(points, box, (k // 2) / k, weights)
+    axis, threshold = best_split(points, box, (k // 2) / k)
     below = points[:, axis] < threshold
     lower, upper = box.lower.clone(), box.upper.clone()
     upper[axis] = lower[axis] = threshold
-    left = _kd_node(points[below], weights[below], Box(box.lower, upper), k // 2)
-    right = _kd_node(points[~below], weights[~below], Box(lower, box.upper), k - k // 2)
+    left = _kd_node(points[below], Box(box.lower, upper), k // 2)
+    right = _kd_node(points[~below], Box(lower, box.upper), k - k // 2)
     return axis, threshold, left, right
 
 
@@ -142,15 +121,13 @@ def _axes_by_extent(points: Float64[Tensor, "n 3"]) -> list[int]:
     return sorted(range(3), key=lambda axis: (-robust[axis], -full[axis]))
 
 
-def _cut_along(
-    values: Float64[Tensor, "n"], weights: Float64[Tensor, "n"], target: float
-) -> tuple[float, float] | None:
-    """(miss, threshold) of the cut with about `target` weight below it; None if all values are equal."""
-    values, order = values.sort(stable=True)
+def _cut_along(values: Float64[Tensor, "n"], target: float) -> tuple[float, float] | None:
+    """(miss, threshold) of the cut with about `target` values below it; None if all values are equal."""
+    values = values.sort().values
     gaps = (values[:-1] < values[1:]).nonzero()[:, 0]
     if not len(gaps):
         return None
-    misses = (weights[order].cumsum(dim=0)[gaps] - target).abs()
+    misses = (gaps + 1 - target).abs()
     best = int(misses.argmin())
     low, high = values[gaps[best] : gaps[best] + 2].tolist()
     middle = low / 2 + high / 2  # Not (low + high) / 2, which may overflow.

@@ -103,6 +103,9 @@ class TrainingConfig:
             ("influence-share", self.influence_share > 0, "above 0"),
             ("normal-consistency", self.normal_consistency >= 0, "0 or more"),
             ("window-weight", 0 <= self.window_weight < 1, "from 0 to below 1"),
+            ("batch", self.batch >= 0, "0 or more"),
+            ("visit-views", self.visit_views > 0, "above 0"),
+            ("first-passes", self.first_passes > 0, "above 0"),
         ):
             if not fits:
                 value = getattr(self, name.replace("-", "_"))

@@ -62,8 +62,8 @@ class DeviceNeeds:
 
     @property
     def parameter_bytes(self) -> int:
-        """Of one Gaussian's parameters: 59 floats with spherical harmonics of degree 3."""
-        return FLOAT * (11 + 3 * (self.sh_degree + 1) ** 2)
+        """Of one Gaussian's parameters."""
+        return parameter_bytes(self.sh_degree)
 
     @property
     def gaussian_bytes(self) -> int:
@@ -155,9 +155,14 @@ class OutOfRoomError(UserError):
     """A block is too large for the memory that is free."""
 
 
+def parameter_bytes(sh_degree: int) -> int:
+    """Of one Gaussian: 59 floats with spherical harmonics of degree 3."""
+    return FLOAT * (11 + 3 * (sh_degree + 1) ** 2)
+
+
 def bytes_for(gaussians: int, sh_degree: int) -> int:
     """What a live block of so many Gaussians takes, pictures not counted."""
-    return gaussians * (11 + 3 * (sh_degree + 1) ** 2) * FLOAT * LIVE_COPIES
+    return gaussians * parameter_bytes(sh_degree) * LIVE_COPIES
 
 
 def projected_bytes(primitive: PrimitiveName) -> int:
@@ -168,7 +173,7 @@ def projected_bytes(primitive: PrimitiveName) -> int:
 def drawing_bytes(sh_degree: int, primitive: PrimitiveName) -> int:
     """What a Gaussian takes while it is drawn without gradients: its parameters, once more as the rasterizer
     wants them, and what one view sees of it."""
-    return FLOAT * 2 * (11 + 3 * (sh_degree + 1) ** 2) + projected_bytes(primitive)
+    return 2 * parameter_bytes(sh_degree) + projected_bytes(primitive)
 
 
 def free_bytes(device: torch.device) -> int:

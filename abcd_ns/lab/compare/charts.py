@@ -50,11 +50,12 @@ def draw_size_accuracy(results: Results, out: Path) -> list[Path]:
 def mean_curve(runs: Sequence[Run], along: Along = lambda point: point.seconds) -> list[tuple[float, float]]:
     """(x, PSNR) at each moment, means over the seeds.
 
-    Runs that passed a moment within one step lack its point; the curve then ends where the shortest does,
+    Runs that passed a moment within one step lack its point; the curve then begins where the shortest does,
     the last point of every run being its end.
     """
+    # Moments lie closest in the beginning, so that those which were passed are the first.
     length, count = min(len(run.curve) for run in runs), len(runs)
-    moments = zip(*([*run.curve[: length - 1], run.curve[-1]] for run in runs), strict=True)
+    moments = zip(*(run.curve[-length:] for run in runs), strict=True)
     return [(sum(map(along, points)) / count, sum(p.psnr for p in points) / count) for points in moments]
 
 
@@ -68,9 +69,9 @@ def _draw_curves(axes: Axes, results: Results, along: Along, title: str) -> dict
         curve = mean_curve(arm.runs, along)
         plot(axes, *zip(*curve, strict=True), arm.method, markersize=4.5)
         ends[arm.method] = curve[-1]
-    settings, seeds = results.settings, len(results.seeds)
+    settings = results.settings
     blocks = f"{settings.blocks} blocks" if settings.blocks > 1 else "1 block"
-    means = f", mean of {seeds} seeds" if seeds > 1 else ""
+    means = f", {results.means_of}" if results.means_of else ""
     axes.set_title(f"{settings.scene}, 1/{settings.downscale} size, {blocks}{means}", loc="left")
     axes.set_xlabel(title)
     axes.set_ylabel("held-out PSNR (dB)")

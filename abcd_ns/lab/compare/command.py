@@ -154,6 +154,8 @@ def impossible(job: Job, outcome: Run | Failure | None = None) -> LeftOut | None
 
 
 def _first_runs(results: Results, plan: Plan) -> list[tuple]:
-    """Each method's first run, with the folder of its pictures."""
-    first = [arm.runs[0] for arm in results.arms]
+    """A run of each method, of one seed where they share any, with the folder of its pictures."""
+    seeds = [{run.seed for run in arm.runs} for arm in results.arms]
+    shared = [seed for seed in results.seeds if all(seed in each for each in seeds)]
+    first = [next(r for r in arm.runs if not shared or r.seed == shared[0]) for arm in results.arms]
     return [(run, Job(run.method, run.seed, plan.settings).folder(plan.out) / PICTURES) for run in first]

@@ -1,5 +1,6 @@
 """Held-out views side by side: photo, every method's picture, and below each its error."""
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -80,14 +81,17 @@ def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
     if not runs:
         return []
     first, folder = runs[0]
-    out.mkdir(exist_ok=True)
+    if out.exists():
+        shutil.rmtree(out)  # of an earlier comparison, with other views
+    out.mkdir()
     paths = []
     for found in sorted(folder.glob("photo-*.png")):
         row = int(found.stem.removeprefix("photo-"))
         pictures = {run.method: read_picture(path / f"merged-{row:04d}.png") for run, path in runs}
         name = next(view.name for view in first.views if view.row == row)
         paths.append(out / f"view-{row:04d}.png")
-        title = f"{first.scene}, held-out view {name}, merged, seed {first.seed}"
+        seeds = ", ".join(map(str, sorted({run.seed for run, _ in runs})))
+        title = f"{first.scene}, held-out view {name}, merged, seed {seeds}"
         draw_comparison(read_picture(found), pictures, title, paths[-1])
     return paths
 

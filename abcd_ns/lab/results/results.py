@@ -116,6 +116,13 @@ class Results:
     notes: tuple[str, ...] = ()
     """What a reader of the table has to know."""
 
+    @property
+    def means_of(self) -> str:
+        """What an arm's numbers are means of, in words; empty where each has but one run."""
+        runs = sorted(len(arm.runs) for arm in self.arms) or [1]
+        few = "" if runs[0] == runs[-1] else f"{runs[0]} to "
+        return f"mean of {few}{runs[-1]} seeds" if runs[-1] > 1 else ""
+
     def of(self, method: str) -> tuple[Arm, ...]:
         """The method's arms, in their order."""
         return tuple(arm for arm in self.arms if arm.method == method)

@@ -46,7 +46,7 @@ STYLE = {
     "svg.fonttype": "none",  # text stays text: searchable, and set in the paper's font
     "svg.hashsalt": "abcd",  # the same chart gives the same bytes
 }
-FORMATS = ("png", "svg")
+FORMATS, DPI = ("png", "svg"), 300
 LABEL_GAP = 0.06
 """Least distance of two labels, as a share of the axis' height."""
 
@@ -74,7 +74,7 @@ def save(figure: Figure, out: Path, name: str) -> list[Path]:
     """Write the chart as name.png and name.svg; returns their paths."""
     paths = [out / f"{name}.{ending}" for ending in FORMATS]
     for path in paths:
-        figure.savefig(path, dpi=300, metadata={"Date": None} if path.suffix == ".svg" else None)
+        figure.savefig(path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
     return paths
 
 

@@ -133,10 +133,11 @@ def notes(results: Results) -> list[str]:
         found.append("Differences are those of merged PSNR, taken seed by seed.")
     reasons = {}
     for run in results.runs if results.kind == "comparison" else ():
-        reasons |= {"LPIPS": run.lpips_reason, "peak GPU memory": run.peak_device_note}
+        told = {"LPIPS": run.lpips_reason, "peak GPU memory": run.peak_device_note}
+        reasons |= {name: reason for name, reason in told.items() if reason}
         if run.ordering_gap_note:
             found.append(f"{run.method}: no ordering gap ({run.ordering_gap_note}).")
-    found += [f"{name} is missing: {reason}." for name, reason in reasons.items() if reason]
+    found += [f"{name} is missing: {reason}." for name, reason in reasons.items()]
     found += results.notes
     found += [f"{left.method} is left out: {left.reason}." for left in results.left_out]
     for failure in results.failures:

@@ -1,13 +1,12 @@
 """`abcd stability`: make methods fail, and see what ABCD does."""
 
 import shlex
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -53,6 +52,7 @@ def stability(
     only: Annotated[tuple[str, ...], words("A1 A3 ...")] = (),
     quick: Flag = False,
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    overwrite: Flag = False,
 ) -> int:
     """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
 
@@ -67,20 +67,23 @@ def stability(
         only: Scenarios to carry out, by id, without the charts.
         quick: A third of the training, no charts: to see that everything works. Its rules may fail.
         seed: Of every training.
+        overwrite: Replace what OUT holds of other scenarios, data or seed.
 
     Raises:
         UserError: an option cannot be used, or OUT holds something else.
     """
     check_ranges({"downscale": downscale})
     check_ranges({"seed": seed}, low=0)
-    claim(out, KIND, {})
+    scene = None if data is None else data.resolve().name
+    asked = {"only": sorted(only), "quick": quick, "seed": seed, "data": scene, "downscale": downscale}
+    claim(out, KIND, {"scenarios": asked}, overwrite)
     console, known = Console(), dict(SCENARIOS)
     if data is not None:
         stage = read_stage(data, downscale)
         known |= {scenario.id: scenario for scenario in real_scenarios(stage, data.resolve().name)}
     chosen = choose(only, known)
     wanted = () if only or quick else studies()
-    blank, paths = new_results(KIND, _command(data, out), describe_machine()), []
+    blank, paths = new_results(KIND, _command(asked, out), describe_machine()), []
 
     def keep(outcomes: Sequence[Outcome], curves: Sequence[Curve]) -> None:
         results = replace(blank, outcomes=tuple(outcomes), curves=tuple(curves))
@@ -96,10 +99,12 @@ def stability(
     return 0 if all(outcome.passed for outcome in outcomes) else 1
 
 
-def _command(data: Path | None, out: Path) -> str:
-    """The command line that was typed, with the names of folders instead of where they are."""
-    names = {str(path): path.resolve().name for path in (data, out) if path is not None}
-    return shlex.join(["abcd", *(names.get(word, word) for word in sys.argv[1:])])
+def _command(asked: Mapping[str, Any], out: Path) -> str:
+    """The command line that makes the same, with the names of folders instead of where they are."""
+    line = ["abcd", "stability", *(["--only", *asked["only"]] if asked["only"] else [])]
+    line += ["--data", asked["data"], "--downscale", asked["downscale"]] if asked["data"] else []
+    line += [*(["--quick"] if asked["quick"] else []), "--seed", asked["seed"], "--out", out.resolve().name]
+    return shlex.join(map(str, line))
 
 
 def choose(only: Sequence[str], known: dict[str, Scenario]) -> list[Scenario]:

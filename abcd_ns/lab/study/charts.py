@@ -217,6 +217,6 @@ def _title(results: Results, method: str | None = None) -> str:
     if results.kind != "study of blocks" and set(results.methods) != {"abcd-monolithic"}:
         parts.append(f"{s.blocks} blocks")
     parts.append(f"{s.steps:,} steps" if s.seconds is None else f"{s.seconds:g} s")
-    if len(results.seeds) > 1:
-        parts.append(f"mean of {len(results.seeds)} seeds")
+    if results.means_of:
+        parts.append(results.means_of)
     return ", ".join(parts)

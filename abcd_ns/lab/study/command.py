@@ -15,7 +15,7 @@ from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, check_numbers, make_settings, words
 from abcd_ns.lab.study.charts import draw_study
 
-AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic", "abcd-partition", "abcd-exact", "abcd-paper"]
+AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic", "abcd-partition", "abcd-exact"]
 BLOCKS, LIMIT = "blocks", "training.density.max_gaussians"
 PRICE, STRATEGY = "training.density.price", "training.density.strategy"
 """The options that the first two studies vary."""
@@ -160,7 +160,8 @@ class OptionsStudy(Conditions):
         pipeline, notes = registered(self.method).pipeline, []
         variants = [parse_variant(text, pipeline) for text in self.vary]
         folders = [variant.folder for variant in variants]
-        shared = {BLOCKS: self.blocks, LIMIT: self.max_gaussians}
+        shared = {LIMIT: self.max_gaussians}
+        shared |= {} if self.method == "abcd-monolithic" else {BLOCKS: self.blocks}
         for variant in variants:
             if folders.count(variant.folder) > 1:
                 raise UserError(f"--vary {variant.name!r} is given twice.")

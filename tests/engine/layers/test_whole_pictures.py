@@ -1,5 +1,6 @@
 """Whole pictures, drawn unit by unit, and their gradient by the pose."""
 
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -52,6 +53,22 @@ def test_the_gradient_of_a_pose_is_that_of_the_merged_picture(pass_gaussians):
         expected = torch.tensor([(loss(view, step) - loss(view, -step)) / 2e-6 for step in steps])
         assert torch.allclose(by_step(matrix, view.viewmat).float(), expected, rtol=2e-3, atol=2e-2)
         assert float(expected.abs().min()) > 0.1
+
+
+def test_a_graph_goes_before_the_next_view_is_drawn():
+    """However many views are asked for at once, no more than one has its graph."""
+    pictures, alive = whole_pictures_of(1000), []
+    inner = pictures._raster
+
+    def raster(*arguments):
+        assert not any(reference() is not None for reference in alive)
+        drawn = inner(*arguments)
+        alive.append(weakref.ref(drawn.color))
+        return drawn
+
+    pictures._raster = raster
+    pictures.differentiate(VIEWS, lambda view, _: weights_for(view))
+    assert len(alive) == len(VIEWS)
 
 
 @pytest.mark.parametrize("pass_gaussians", [0, 1000])

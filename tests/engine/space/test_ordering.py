@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.space.ordering import front_to_back, node_children_in_order, split_around
+from abcd_ns.engine.space.ordering import front_to_back, node_children_in_order
 from abcd_ns.engine.space.partition import build_grid
 from abcd_ns.engine.space.tree import BlockTree
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
@@ -92,14 +92,6 @@ def test_order_is_right_in_exact_arithmetic(seed, num_blocks):
         assert places == sorted(places)
 
 
-@given(SEEDS, st.integers(1, 12))
-def test_split_around_cuts_the_order_at_the_block(seed, num_blocks):
-    tree, center = random_tree(seed, num_blocks), lattice_points(seed, 1)[0]
-    for block in range(num_blocks):
-        front, behind = split_around(tree, center, block)
-        assert (*front, block, *behind) == front_to_back(tree, center)
-
-
 def test_a_grid_is_ordered_by_manhattan_distance_of_cells():
     points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 4
     tree = build_grid(points, counts=(4, 4, 4))
@@ -126,9 +118,7 @@ def test_a_camera_on_the_plane_belongs_to_the_right():
     assert front_to_back(tree, torch.nextafter(center, center - 1)) == (0, 1)
 
 
-def test_bad_nodes_and_blocks_are_refused():
+def test_a_leaf_has_no_children():
     tree, center = random_tree(0, 3), torch.zeros(3)
-    with pytest.raises(ValueError, match="block 3 does not exist"):
-        split_around(tree, center, 3)
     with pytest.raises(ValueError, match="is the leaf of block 1"):
         node_children_in_order(tree, tree.node_of(1), center)

@@ -3,7 +3,6 @@
 import json
 import math
 import random
-from itertools import pairwise
 
 import pytest
 import torch
@@ -140,15 +139,6 @@ def test_kd_ignores_outliers_when_it_picks_an_axis():
     assert int(build_kd(points, 2).axis[0]) == 1
 
 
-def test_kd_balances_weights():
-    generator = torch.Generator().manual_seed(1)
-    points, weights = torch.rand(500, 3, generator=generator), torch.rand(500, generator=generator) * 9
-    sums = torch.zeros(7).index_add(0, build_kd(points, 7, weights).assign(points), weights)
-    assert float(sums.max() - sums.min()) <= 2 * 9
-    all_on_one = build_kd(points, 4, torch.zeros(500))
-    assert_proper(all_on_one, 4)
-
-
 def test_kd_thresholds_lie_strictly_between_coordinates():
     points = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     points[1, 0] = torch.nextafter(points[1, 0], torch.tensor(2.0))
@@ -166,17 +156,15 @@ def test_best_split_cuts_the_share_it_is_asked_for():
 
 
 @pytest.mark.parametrize(
-    ("points", "num_blocks", "weights", "message"),
+    ("points", "num_blocks", "message"),
     [
-        (torch.zeros(3, 3), 0, None, "cannot build 0 blocks"),
-        (torch.tensor([[0.0, math.nan, 0.0]]), 2, None, "1 of 1 points are NaN"),
-        (torch.zeros(3, 3), 2, torch.tensor([1.0, -1.0, 1.0]), "weights must be finite"),
-        (torch.zeros(1, 3), 2, torch.tensor([math.inf]), "weights must be finite"),
+        (torch.zeros(3, 3), 0, "cannot build 0 blocks"),
+        (torch.tensor([[0.0, math.nan, 0.0]]), 2, "1 of 1 points are NaN"),
     ],
 )
-def test_kd_refuses_bad_input(points, num_blocks, weights, message):
+def test_kd_refuses_bad_input(points, num_blocks, message):
     with pytest.raises(ValueError, match=message):
-        build_kd(points, num_blocks, weights)
+        build_kd(points, num_blocks)
 
 
 def test_grid_by_counts_is_regular_and_unbounded():
@@ -194,35 +182,20 @@ def test_grid_by_counts_is_regular_and_unbounded():
     assert len(set(zip(tree.assign(points[3:]).tolist(), columns.tolist(), rows.tolist(), strict=True))) == 8
 
 
-def test_grid_by_cell_size_has_that_spacing():
-    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([20.0, 6.0, 1.0])
-    tree = build_grid(points, cell_size=5.0)
-    planes = [sorted(set(tree.threshold[tree.axis == axis].tolist())) for axis in range(3)]
-    assert [len(p) for p in planes] == [3, 1, 0]
-    assert [b - a for a, b in pairwise(planes[0])] == pytest.approx([5.0, 5.0])
-
-
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.full((4, 3), -7.0)])
 def test_grid_survives_points_without_extent(points):
     tree = build_grid(points, counts=(2, 3, 1))
     assert_proper(tree, 6)
     assert sum(counts_of(tree, points)) == len(points)
-    assert build_grid(points, cell_size=2.0).num_blocks == 1
 
 
 def test_grid_refuses_bad_input():
     points = torch.rand(100, 3)
-    with pytest.raises(ValueError, match="either counts or cell_size"):
-        build_grid(points)
-    with pytest.raises(ValueError, match="either counts or cell_size"):
-        build_grid(points, counts=(1, 1, 1), cell_size=1.0)
-    with pytest.raises(ValueError, match="positive"):
-        build_grid(points, counts=(1, 0, 1))
-    with pytest.raises(ValueError, match="positive"):
-        build_grid(points, cell_size=-1.0)
-    for tiny in (1e-3, 5e-324):
-        with pytest.raises(ValueError, match=f"over {MAX_CELLS} cells"):
-            build_grid(points, cell_size=tiny)
+    for counts in ((1, 0, 1), (MAX_CELLS, 2, 1)):
+        with pytest.raises(ValueError, match="at least one cell on each axis"):
+            build_grid(points, counts)
+    with pytest.raises(ValueError, match="1 of 1 points are NaN"):
+        build_grid(torch.full((1, 3), math.nan), (2, 1, 1))
 
 
 @given(SEEDS, st.integers(1, 12), st.integers(0, 2))

@@ -1,6 +1,6 @@
 """Runs in processes of their own: what is reused, what is refused, what a failure leaves.
 
-The worker here is a script that makes runs up; tests/cli/test_compare_real.py trains.
+The worker here is a script that makes runs up; test_real.py trains.
 """
 
 import dataclasses

@@ -53,8 +53,7 @@ class TorchRasterizer(Rasterizer):
 
     Args:
         compile: whether float32 on the CPU runs on kernels built ahead of time (see kernels): "auto" if they
-            are found, "always" building them now if need be, "never" not at all. Built and eager kernels
-            agree to rounding only: use "never" where last bits must not depend on the machine.
+            are found, "never" not at all. Built and eager kernels agree to rounding only.
         tile_side: pixels along a tile's side; a divisor of 16. Speed only.
         chunk: Gaussians per kernel call and tile. Speed and memory only.
         window_side: pixels along the sides of the tiles of its z windows; 0 takes `tile_side`.
@@ -142,6 +141,7 @@ class TorchRasterizer(Rasterizer):
         images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, candidates.rows), job))
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
+    @torch.no_grad()
     def cuts(
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
@@ -149,7 +149,6 @@ class TorchRasterizer(Rasterizer):
         for few in _a_few(shots, [shot.crop for shot in shots], gaussians):
             yield from self._cut_together(gaussians, few, sh_degree, antialiased)
 
-    @torch.no_grad()
     def _cut_together(
         self, gaussians: Gaussians, shots: Sequence[CutShot], sh_degree: int, antialiased: bool
     ) -> list[Cut]:
@@ -165,6 +164,7 @@ class TorchRasterizer(Rasterizer):
         inside = [own[which] for own, which in zip(seen, members, strict=True)]
         return [Cut(*parts) for parts in zip(front, back, inside, members, strict=True)]
 
+    @torch.no_grad()
     def depth_windows(
         self,
         gaussians: Gaussians,
@@ -177,7 +177,6 @@ class TorchRasterizer(Rasterizer):
         for few in _a_few(seen, [crop for _, crop in seen], gaussians):
             yield from self._windows_together(gaussians, few, visible, antialiased)
 
-    @torch.no_grad()
     def _windows_together(
         self, gaussians: Gaussians, seen: Sequence[tuple[View, Crop]], visible: float, antialiased: bool
     ) -> list[ZWindow]:
@@ -242,8 +241,12 @@ class TorchRasterizer(Rasterizer):
     def _pack(self, gaussians: Gaussians) -> Float[Tensor, "p n"]:
         """`pack`, kept for the next view of the same Gaussians."""
         if self._packed is None or self._packed[0]() is not gaussians:
-            self._packed = (weakref.ref(gaussians), pack(gaussians))
+            self._packed = (weakref.ref(gaussians, self._forget_packed), pack(gaussians))
         return self._packed[1]
+
+    def _forget_packed(self, of: weakref.ref[Gaussians]) -> None:
+        if self._packed is not None and self._packed[0] is of:
+            self._packed = None
 
     def _job(
         self, candidates: Candidates, planes: Float[Tensor, "r n"], absgrad_target: Tensor | None = None
@@ -289,10 +292,7 @@ def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot], center: int) -> di
     return {
         "means2d": own[:, center : center + 2].transpose(1, 2),
         "radii": own[:, -1].detach().int(),
-        "depths": own[:, DEPTH],
-        "opacities": own[:, -8],
         **image_size([shot.view for shot in shots], own.device),
         "n_cameras": len(shots),
-        "camera_ids": None,
         "gaussian_ids": None,
     }

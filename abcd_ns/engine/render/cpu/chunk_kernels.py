@@ -10,6 +10,7 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels import Kernel
 from abcd_ns.engine.kernels.build import build_kernels
+from abcd_ns.engine.kernels.photometric import PHOTOMETRIC_KERNELS
 from abcd_ns.engine.render import splat_kernels, surfel_kernels
 from abcd_ns.engine.render.cpu import splat_fragments, surfel_fragments
 from abcd_ns.engine.render.cpu.splat_fragments import SplatFragments
@@ -23,7 +24,7 @@ from abcd_ns.engine.render.cpu.torch_kernels import (
 )
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
 
-CompilePolicy = Literal["auto", "always", "never"]
+CompilePolicy = Literal["auto", "never"]
 
 
 FRAGMENTS: dict[str, Fragments] = {"3dgs": SplatFragments(), "2dgs": SurfelFragments()}
@@ -59,7 +60,7 @@ class ChunkKernels:
 
     Args:
         policy: "auto" takes built kernels where they are found and builds them when `warm_up` is called;
-            "always" builds them now; "never" is eager.
+            "never" is eager.
     """
 
     def __init__(self, policy: CompilePolicy, side: int, chunk: int, primitive: Primitive = SPLATS) -> None:
@@ -68,13 +69,12 @@ class ChunkKernels:
         self.fragments = FRAGMENTS[primitive.name]
         self.built = policy != "never" and all(kernel.is_built for kernel in self._all)
         """Whether float32 on the CPU runs fast."""
-        if policy == "always":
-            self.warm_up()
 
     def warm_up(self) -> None:
         """Build the kernels, a few minutes once per machine, unless the policy is "never"."""
-        if self._policy != "never" and not self.built:
-            build_kernels(self._all, *self._size, self._primitive.name)
+        needed = (*self._all, *PHOTOMETRIC_KERNELS)  # of the loss, which every training has
+        if self._policy != "never" and not all(kernel.is_built for kernel in needed):
+            build_kernels(needed, *self._size, self._primitive.name)
             self.built = all(kernel.is_built for kernel in self._all)
 
     @property

@@ -92,21 +92,19 @@ class GsplatRasterizer(Rasterizer):
             raster.info["n_cameras"] = len(shots)
         return tuple(rasters[k] for k in range(len(shots)))
 
+    @torch.no_grad()
     def cuts(
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each is projected and sorted once."""
         for shot in shots:
-            yield self._cut(gaussians, shot, sh_degree, antialiased)
+            splats = self.project(gaussians, shot.view, sh_degree=sh_degree, antialiased=antialiased)
+            drawing = self._drawing_of(splats, shot.crop, windowed=True)
+            members = drawing.members(drawing.inside([shot.inside]))
+            layers = (drawing.only(drawing.inside([window])).layer() for window in (shot.front, shot.back))
+            yield Cut(*layers, splats[members], members)
 
     @torch.no_grad()
-    def _cut(self, gaussians: Gaussians, shot: CutShot, sh_degree: int, antialiased: bool) -> Cut:
-        splats = self.project(gaussians, shot.view, sh_degree=sh_degree, antialiased=antialiased)
-        drawing = self._drawing_of(splats, shot.crop, windowed=True)
-        members = drawing.members(drawing.inside([shot.inside]))
-        layers = (drawing.only(drawing.inside([window])).layer() for window in (shot.front, shot.back))
-        return Cut(*layers, splats[members], members)
-
     def depth_windows(
         self,
         gaussians: Gaussians,
@@ -117,14 +115,8 @@ class GsplatRasterizer(Rasterizer):
     ) -> Iterator[ZWindow]:
         """See Rasterizer.depth_windows."""
         for view, crop in seen:
-            yield self._depth_window(gaussians, view, crop, visible, antialiased)
-
-    @torch.no_grad()
-    def _depth_window(
-        self, gaussians: Gaussians, view: View, crop: Crop, visible: float, antialiased: bool
-    ) -> ZWindow:
-        drawing = self._drawing_of(self.project(gaussians, view, antialiased=antialiased), crop)
-        return showing(drawing.sheet.grids[0], drawing.tile, drawing.z, drawing.weights(), visible)
+            drawing = self._drawing_of(self.project(gaussians, view, antialiased=antialiased), crop)
+            yield showing(drawing.sheet.grids[0], drawing.tile, drawing.z, drawing.weights(), visible)
 
     def _drawing_of(self, splats: Splats, crop: Crop, windowed: bool = False) -> Drawing:
         packed = Packed.of_splats([(0, splats)])
@@ -200,12 +192,8 @@ def _info(own: Projected, view: View) -> dict[str, Any]:
     return {
         "means2d": own.centers,
         "radii": own.radii,
-        "depths": own.depths,
-        "opacities": own.opacities,
         "width": view.width,
         "height": view.height,
-        "n_cameras": len(own.radii),
-        "camera_ids": None,
         "gaussian_ids": None,
     }
 

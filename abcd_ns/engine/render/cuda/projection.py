@@ -136,7 +136,8 @@ def project(
     if compensations is not None:
         opacities = opacities * compensations
     used = (sh_degree + 1) ** 2
-    coefficients = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)[:, :used]
+    rest = gaussians.features_rest[:, : used - 1]
+    coefficients = torch.cat((gaussians.features_dc[:, None], rest), dim=1)
     # Camera by camera: for all at once gsplat would copy the coefficients, most of a Gaussian, for each.
     directions = (gaussians.means - eyes[:, None]).unbind()
     seen = zip(directions, (radii > 0).unbind(), strict=True)

@@ -30,7 +30,6 @@ BEFORE_RESET, AFTER_RESET = 7, 4
 
 GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
-COUNTED = (*GRADIENTS, *WEIGHED)
 REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
 """Shares of a visit after which a block among others is neither refined nor reset."""

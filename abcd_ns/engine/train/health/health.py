@@ -282,12 +282,9 @@ class Health:
         return self._ledger.setdefault(block, BlockHealth())
 
     def _count(self, what: str, count: int) -> None:
-        self._tell(self._active, what, count)
-
-    def _tell(self, active: ActiveVisit | None, what: str, count: int) -> None:
         if count:
-            block = WHOLE if active is None else active.geometry.block
-            record = self._ledger.setdefault(block, BlockHealth())
+            record, active = self._record, self._active
             setattr(record, what, getattr(record, what) + count)
+            alone = active is None or active.is_whole
             number = 0 if active is None else active.number
-            self._announce(Mended(number, None if block == WHOLE else block, what, count))
+            self._announce(Mended(number, None if alone else active.geometry.block, what, count))

@@ -16,8 +16,8 @@ from abcd_ns.engine.types import Gaussians
 class Snapshot(BlockScene):
     """All blocks as they were at one moment."""
 
-    def __init__(self, scene: BlockScene, generation: int) -> None:
-        self.tree, self._generation = scene.tree, generation
+    def __init__(self, scene: BlockScene) -> None:
+        self.tree = scene.tree
         self._blocks = [
             Gaussians(**{name: value.clone() for name, value in scene.gaussians(block).items()})
             for block in range(scene.tree.num_blocks)
@@ -25,9 +25,6 @@ class Snapshot(BlockScene):
 
     def gaussians(self, block: int) -> Gaussians:
         return self._blocks[block]
-
-    def version(self, block: int) -> int:  # noqa: ARG002 - all are of the same moment
-        return self._generation
 
     def count(self, block: int) -> int:
         return len(self._blocks[block])
@@ -51,7 +48,7 @@ class OldNeighbours:
     def __call__(self) -> BlockScene:
         visit = self._run.state.visit
         if self._seen is None or visit - self._taken_at >= self._every:
-            self._seen, self._taken_at = Snapshot(self._run.scene, visit), visit
+            self._seen, self._taken_at = Snapshot(self._run.scene), visit
         return self._seen
 
 
