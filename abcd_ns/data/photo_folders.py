@@ -54,8 +54,9 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoFile], list[str]
         )
     of = max((n for n in copies if factor % n == 0), default=min(copies))
     if factor % of:
+        found = of * max(factor // of, 1)
         notes.append(
-            f"{full} does not exist: {copies[of]} is used, which is more than --downscale-factor {factor}."
+            f"{full} does not exist: {copies[of]} is used, and photos are at 1/{found}, not 1/{factor}."
         )
     return _check_folder(copies[of], of, scene.frames, max(factor, of)), notes
 

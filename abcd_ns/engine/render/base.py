@@ -79,7 +79,7 @@ class Rasterizer(Protocol):
     """
 
     name: str
-    """Identifies primitive, backend and version; part of every layer's key."""
+    """Of primitive, backend and version, in messages."""
     primitive: Primitive
     """What a Gaussian is."""
     window_side: int

@@ -41,7 +41,7 @@ class GsplatRasterizer(Rasterizer):
         self._cameras = Cameras()
 
     def warm_up(self) -> None:
-        """Nothing: gsplat compiles when it is imported, at the latest for the self-check."""
+        """Nothing: gsplat compiles at its first call, which is the self-check's."""
 
     @torch.no_grad()
     def project(

@@ -1,9 +1,9 @@
 """Notices what goes wrong in the live block, counts it, tells it, and mends what can be mended.
 
-In any run: gradients, moments and values that are no numbers. Where blocks are trained within layers: giants,
-and, where there are others that have to live with the result, visits that left their pictures worse than they
-found them. A run in which nothing goes wrong is the same with or without all this,
-on a CPU bit for bit: healthy tensors are read, never written.
+In any run: gradients, moments and values that are no numbers (in exact joint training gradients alone). Where
+blocks are trained within layers: giants, and, where there are others that have to live with the result,
+visits that left their pictures worse than they found them. A run in which nothing goes wrong is the same with
+or without all this, on a CPU bit for bit: healthy tensors are read, never written.
 """
 
 import math
