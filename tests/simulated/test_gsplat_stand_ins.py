@@ -6,8 +6,10 @@ import pytest
 import torch
 from gsplat.cuda import _torch_impl, _wrapper
 
+from abcd_ns.engine import render
 from abcd_ns.engine.render import TorchRasterizer, make_rasterizer, self_check
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
+from abcd_ns.errors import UserError
 from tests.reference import gsplat_stand_ins as stand_ins
 from tests.reference.rasterizer_scenes import as_leaves, random_gaussians, small_view
 from tests.reference.simulated_device import DEVICE, simulated_device
@@ -152,3 +154,12 @@ def test_auto_is_gsplat_on_the_simulated_device_and_agrees_with_torch(primitive,
         assert rasterizer.name.startswith(name)
         assert 0 < self_check(rasterizer, DEVICE) < (1e-4 if primitive == "3dgs" else 5e-4)
         assert make_rasterizer("torch", DEVICE).name.startswith("torch")
+
+
+def test_where_gsplat_has_no_kernels_one_line_says_so(monkeypatch):
+    monkeypatch.setattr(render, "self_check", lambda *_: None.CameraModelType)
+    with pytest.raises(UserError, match=r"put nvcc on the PATH.*rasterizer torch"):
+        make_rasterizer("auto", DEVICE)
+    monkeypatch.setattr(render, "self_check", lambda *_: TorchRasterizer.missing)
+    with pytest.raises(AttributeError, match="missing"):
+        make_rasterizer("auto", DEVICE)

@@ -57,7 +57,9 @@ def make_rasterizer(
     rasterizer = GsplatRasterizer(primitive)
     try:
         self_check(rasterizer, device)
-    except AttributeError as error:  # of its module of kernels, which is None
+    except AttributeError as error:
+        if "'NoneType'" not in str(error):  # its module of kernels
+            raise
         raise UserError(
             "gsplat has no CUDA kernels and found no nvcc to compile them: put nvcc on the PATH "
             "(docs/troubleshooting.md), or train slowly with --pipeline.model.rasterizer torch."
