@@ -33,7 +33,6 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.control import DensityConfig, for_blocks
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Sample
@@ -142,8 +141,7 @@ def begin(
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     keep = None if blocks == 1 else len(capture.gaussians) // blocks
     store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=seed))
-    density = for_blocks(DensityConfig(), blocks)
-    config = TrainingConfig(seed=seed, antialiased=antialiased, density=density)
+    config = TrainingConfig(seed=seed, antialiased=antialiased)
     run = TrainingRun(
         config,
         Budget(steps=steps, seconds=seconds),

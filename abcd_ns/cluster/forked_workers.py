@@ -6,14 +6,12 @@ step of a small block is some hundred short operations, which a second thread ha
 """
 
 import ctypes
-import math
 import os
 import signal
 import sys
 import time
 import traceback
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
@@ -23,8 +21,9 @@ from typing import Any, NoReturn
 import torch
 
 from abcd_ns.cluster.lease import Finished, Lease, Lost, Parcel, Report, StepsSeen, WorkersError
+from abcd_ns.cluster.members import Member, Members, RecentMean
 from abcd_ns.cluster.visit_worker import VisitWorker
-from abcd_ns.engine.events import StepTaken, WorkerSeen
+from abcd_ns.engine.events import StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, is_out_of_memory
@@ -68,23 +67,15 @@ class Failed:
 
 
 @dataclass
-class Member:
-    """A place for a visit; its process, while there is one."""
+class Place(Member):
+    """For a visit; its process, while there is one."""
 
-    number: int
-    lease: Lease | None = None
-    pid: int = 0
     pipe: Connection | None = None
     heard: float = 0.0
-    """When it last said something, or was started; of `time.monotonic`, as the other moments."""
-    done: int = 0
-    visits: int = 0
-    deaths: int = 0
-    free_since: float = 0.0
-    waited: float = 0.0
+    """When it last said something, or was started."""
 
 
-class ForkedWorkers:
+class ForkedWorkers(Members[Place]):
     """So many processes at most at a time.
 
     Args:
@@ -92,18 +83,8 @@ class ForkedWorkers:
     """
 
     def __init__(self, count: int, worker: VisitWorker) -> None:
-        self._worker, self._owner, self._began = worker, os.getpid(), time.monotonic()
-        self._members = [Member(number, free_since=self._began) for number in range(count)]
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return len(self._members)
-
-    @property
-    def idle(self) -> int:
-        """How many could take a visit now."""
-        return sum(member.lease is None for member in self._members)
+        self._worker, self._owner, now = worker, os.getpid(), time.monotonic()
+        super().__init__([Place(number, since=now, free_since=now) for number in range(count)])
 
     @property
     def pids(self) -> list[int]:
@@ -116,11 +97,9 @@ class ForkedWorkers:
 
     def submit(self, lease: Lease) -> None:
         """Fork a process for a visit."""
-        idle = (member for member in self._members if member.lease is None)
-        member = min(idle, key=lambda member: member.free_since)
-        now = time.monotonic()
-        member.waited += now - member.free_since
-        member.lease, member.heard, member.done = lease, now, 0
+        member = self._longest_idle()
+        member.take(lease)
+        member.heard = time.monotonic()
         member.pipe, theirs = Pipe()
         member.pid = os.fork()
         if member.pid == 0:
@@ -141,17 +120,13 @@ class ForkedWorkers:
                 reports.append(self._lose(member, f"silent for {SILENCE:.0f} s"))
         return reports
 
-    def seen(self) -> Sequence[WorkerSeen]:
-        """What each is doing."""
-        return [self._seen(member) for member in self._members]
-
     def close(self) -> None:
         """End them."""
         for member in self._members:
             if member.lease is not None:
                 self._end(member)
 
-    def _hear(self, member: Member) -> list[Report]:
+    def _hear(self, member: Place) -> list[Report]:
         member.heard = time.monotonic()
         try:
             said = member.pipe.recv()
@@ -169,13 +144,13 @@ class ForkedWorkers:
         self._end(member)
         raise WorkersError(said.why)
 
-    def _lose(self, member: Member, why: str) -> Lost:
+    def _lose(self, member: Place, why: str) -> Lost:
         member.deaths += 1
         return Lost(self._end(member).number, why)
 
-    def _end(self, member: Member) -> Lease:
+    def _end(self, member: Place) -> Lease:
         """Its process is no more, and it is idle."""
-        lease, member.lease, member.free_since = member.lease, None, time.monotonic()
+        lease = member.put_down()
         member.pipe.close()
         if os.getpid() == self._owner:  # a process that was forked meanwhile knows it, too
             with suppress(ProcessLookupError):
@@ -184,28 +159,19 @@ class ForkedWorkers:
                 os.waitpid(member.pid, 0)
         return lease
 
-    def _seen(self, member: Member) -> WorkerSeen:
-        lease, now = member.lease, time.monotonic()
-        waited = member.waited + (now - member.free_since if lease is None else 0.0)
-        block, steps = (lease.task.active.geometry.block, lease.task.active.steps) if lease else (None, 0)
-        share = min(waited / max(now - self._began, 1e-9), 1.0)
-        return WorkerSeen(member.number, block, member.done, steps, member.visits, member.deaths, share)
-
 
 class _Telling:
     """Tells the driver how far a visit is, now and then."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._told = pipe, time.monotonic()
-        self._psnrs: deque[float] = deque(maxlen=16)
+        self._psnr = RecentMean()
 
     def __call__(self, step: StepTaken) -> None:
-        if math.isfinite(step.psnr):
-            self._psnrs.append(step.psnr)
+        self._psnr.add(step.psnr)
         if time.monotonic() - self._told >= TELL_EVERY:
             self._told = time.monotonic()
-            mean = sum(self._psnrs) / len(self._psnrs) if self._psnrs else math.nan
-            self._pipe.send((step.visit_step, mean))
+            self._pipe.send((step.visit_step, self._psnr.value))
 
 
 def _live(pipe: Connection, visit: Callable[[Callable[[StepTaken], None]], Any]) -> NoReturn:

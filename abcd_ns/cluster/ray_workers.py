@@ -7,7 +7,7 @@ one, and what it was at is given to another. The driver owns every object, so th
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,8 +32,9 @@ from abcd_ns.cluster.lease import (
     VisitTask,
     WorkersError,
 )
+from abcd_ns.cluster.members import Member, Members, RecentMean
 from abcd_ns.cluster.visit_worker import VisitWorker
-from abcd_ns.engine.events import StepTaken, WorkerSeen
+from abcd_ns.engine.events import StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.types import Gaussians
@@ -82,7 +83,7 @@ class Actor:
 
     def __init__(self) -> None:
         self._worker: VisitWorker | None = None
-        self._done, self._psnrs = 0, list[float]()
+        self._done, self._psnr = 0, RecentMean()
 
     def prepare(self, make: Callable[[], VisitWorker]) -> int:
         """Read what the run needs; gives the process' identifier."""
@@ -92,48 +93,31 @@ class Actor:
 
     def visit(self, task: VisitTask, state: Shared, drawn: dict[int, Shared]) -> Parcel:
         """Train a block; gives what became of it."""
-        self._done, self._psnrs = 0, []
+        self._done, self._psnr = 0, RecentMean()
         return Parcel.of(self._worker.visit(task, state(), drawn, self._hear))
 
     def _hear(self, step: StepTaken) -> None:
         self._done = step.visit_step
-        self._psnrs = [*self._psnrs[-15:], step.psnr]
+        self._psnr.add(step.psnr)
 
     def progress(self) -> tuple[int, float]:
         """Steps of the visit so far, and the mean PSNR of the last ones, dB."""
-        psnrs = [psnr for psnr in self._psnrs if psnr == psnr]
-        return self._done, sum(psnrs) / len(psnrs) if psnrs else float("nan")
+        return self._done, self._psnr.value
 
 
 @dataclass
-class Member:
-    """A worker, as the driver knows it."""
+class Remote(Member):
+    """A worker on some machine."""
 
-    number: int
-    actor: Any
-    asked: ray.ObjectRef
+    actor: Any = None
+    asked: ray.ObjectRef | None = None
     """What it is at: getting ready, or a visit."""
-    lease: Lease | None = None
     question: ray.ObjectRef | None = None
     asked_at: float = 0.0
-    """When its last question was put, or it was started; of `time.monotonic`, as the other moments."""
-    ready: bool = False
-    pid: int = 0
-    steps: int = 0
-    visits: int = 0
-    deaths: int = 0
-    since: float | None = None
-    """When it was first ready."""
-    free_since: float = 0.0
-    waited: float = 0.0
-
-    @property
-    def is_idle(self) -> bool:
-        """Whether it could take a visit."""
-        return self.ready and self.lease is None
+    """When its last question was put, or it was started."""
 
 
-class RayWorkers:
+class RayWorkers(Members[Remote]):
     """So many actors of the Ray cluster that this process is connected to; see `connect`.
 
     Args:
@@ -147,17 +131,7 @@ class RayWorkers:
         self._class = ray.remote(**options, max_restarts=0, max_task_retries=0)(Actor)
         self._make = ray.put(make)
         self._failed_starts = 0
-        self._members = [self._start(Member(number, None, None)) for number in range(count)]
-
-    @property
-    def count(self) -> int:
-        """How many there are, those that are starting included."""
-        return len(self._members)
-
-    @property
-    def idle(self) -> int:
-        """How many could take a visit now."""
-        return sum(member.is_idle for member in self._members)
+        super().__init__([self._start(Remote(number)) for number in range(count)])
 
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         """Put it where all workers can read it."""
@@ -165,11 +139,9 @@ class RayWorkers:
 
     def submit(self, lease: Lease) -> None:
         """Give a visit to the one who has waited longest."""
-        idle = (member for member in self._members if member.is_idle)
-        member = min(idle, key=lambda member: member.free_since)
-        now = time.monotonic()
-        member.waited += now - member.free_since
-        member.lease, member.asked_at, member.steps = lease, now, 0
+        member = self._longest_idle()
+        member.take(lease)
+        member.asked_at = time.monotonic()
         member.asked = member.actor.visit.remote(lease.task, lease.state, dict(lease.drawn))
 
     def wait(self, seconds: float) -> list[Report]:
@@ -191,7 +163,7 @@ class RayWorkers:
             reports += self._give_up(member)
         return reports
 
-    def _give_up(self, member: Member) -> list[Report]:
+    def _give_up(self, member: Remote) -> list[Report]:
         """Replace one that has not answered for too long."""
         patience = SILENCE if member.ready else SLOW_START
         waits = member.question is not None or not member.ready
@@ -199,10 +171,6 @@ class RayWorkers:
             return []
         ray.kill(member.actor)
         return self._replace(member, f"silent for {patience:.0f} s")
-
-    def seen(self) -> Sequence[WorkerSeen]:
-        """What each is doing."""
-        return [self._seen(member) for member in self._members]
 
     def close(self) -> None:
         """End them."""
@@ -215,7 +183,7 @@ class RayWorkers:
         """Processes of those that are ready."""
         return [member.pid for member in self._members if member.ready]
 
-    def _start(self, member: Member) -> Member:
+    def _start(self, member: Remote) -> Member:
         member.actor = self._class.remote()
         member.asked = member.actor.prepare.remote(self._make)
         member.question, member.lease, member.ready = None, None, False
@@ -228,7 +196,7 @@ class RayWorkers:
             if member.lease is not None and member.question is None and now - member.asked_at > LOOK_EVERY:
                 member.question, member.asked_at = member.actor.progress.remote(), now
 
-    def _answer_of(self, member: Member) -> list[Report]:
+    def _answer_of(self, member: Remote) -> list[Report]:
         question, member.question = member.question, None
         try:
             steps, psnr = ray.get(question, timeout=0)
@@ -236,10 +204,10 @@ class RayWorkers:
             return []  # what it was asked to do fails likewise, and says why
         if member.lease is None:
             return []
-        member.steps = steps
+        member.done = steps
         return [StepsSeen(member.lease.number, steps, psnr)]
 
-    def _end_of(self, member: Member, ref: ray.ObjectRef) -> list[Report]:
+    def _end_of(self, member: Remote, ref: ray.ObjectRef) -> list[Report]:
         try:
             answer = ray.get(ref)
         except RayTaskError as error:
@@ -249,17 +217,15 @@ class RayWorkers:
             raise _as_user_error(error, member.number) from error
         except RayError as error:
             return self._replace(member, _first_line(error))
-        now = time.monotonic()
-        member.asked, member.free_since = None, now
+        member.asked, lease = None, member.put_down()
         if not member.ready:
             member.ready, member.pid, self._failed_starts = True, answer, 0
-            member.since = member.since or now
+            member.since = member.since or member.free_since
             return []
-        lease, member.lease = member.lease, None
         member.visits += 1
         return [Finished(lease.number, answer.opened())]
 
-    def _replace(self, member: Member, why: str) -> list[Report]:
+    def _replace(self, member: Remote, why: str) -> list[Report]:
         """Start another in place of one that is gone."""
         lost = [] if member.lease is None else [Lost(member.lease.number, why)]
         member.deaths += 1
@@ -271,20 +237,6 @@ class RayWorkers:
             )
         self._start(member)
         return lost
-
-    def _seen(self, member: Member) -> WorkerSeen:
-        lease, now = member.lease, time.monotonic()
-        waited = member.waited + (now - member.free_since if member.is_idle else 0.0)
-        share = waited / max(now - member.since, 1e-9) if member.since else 0.0
-        return WorkerSeen(
-            member.number,
-            lease and lease.task.active.geometry.block,
-            member.steps,
-            lease.task.active.steps if lease else 0,
-            member.visits,
-            member.deaths,
-            min(share, 1.0),
-        )
 
 
 def _first_line(error: Exception) -> str:

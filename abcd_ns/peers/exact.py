@@ -81,7 +81,6 @@ class ExactTrainer(Trainer):
 
     def __init__(self, run: TrainingRun) -> None:
         super().__init__(run)
-        run.fit_density(1)  # every block sees every step
         self._optics = Optics(list(self.views.values()), run.rasterizer.slack)
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
         self._batch: Batch | None = None

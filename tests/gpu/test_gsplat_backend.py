@@ -190,7 +190,7 @@ def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(ras
     shot = CutShot(view(), crop, every.before(window), window, every.behind(window))
     cuts = []
     for backend in (rasterizer, TorchRasterizer("never", tile_side=16)):
-        cut = backend.cut(frozen, shot, sh_degree=3)
+        (cut,) = backend.cuts(frozen, [shot], sh_degree=3)
         (middle,) = backend.draw(active, [Shot(view(), crop, cut.inside, window)], sh_degree=3)
         found = sandwich(cut.front, middle.layer, cut.back, torch.zeros(3, device=device))
         whole = backend(everyone, view(), sh_degree=3, crop=crop)

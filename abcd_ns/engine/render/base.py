@@ -170,11 +170,6 @@ class Rasterizer(Protocol):
         gradients. Drawn as they are asked for, a few at a time."""
         ...
 
-    def cut(self, gaussians: Gaussians, shot: CutShot, *, sh_degree: int, antialiased: bool = False) -> Cut:
-        """`cuts` for a single shot."""
-        (cut,) = self.cuts(gaussians, [shot], sh_degree=sh_degree, antialiased=antialiased)
-        return cut
-
     def depth_windows(
         self,
         gaussians: Gaussians,

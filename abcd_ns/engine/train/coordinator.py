@@ -201,10 +201,7 @@ def rest_after_visit(
     """
     limits = run.config.limits.block_limit, run.config.limits.sole_limit
     tree, parts = cut_full(run.scene, updates, run.state, *limits, run.announce)
-    split = tree is not run.scene.tree
     run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
-    if split:
-        run.fit_density(tree.num_blocks)
     block = None if active.is_whole else active.geometry.block
     staying = len(state) if block is None else len(updates[block])
     run.announce(

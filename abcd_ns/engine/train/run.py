@@ -14,7 +14,7 @@ from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.train.capture.light import Light
 from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.control import DensityControl, for_blocks
+from abcd_ns.engine.train.density.control import DensityControl, for_primitive
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
@@ -56,7 +56,7 @@ class TrainingRun:
         self.poses = Poses(views)
         may_act = config.heal and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
-        self.fit_density(scene.tree.num_blocks)
+        self.density = DensityControl(for_primitive(config.density, rasterizer.primitive))
 
     def views_at(self, reduction: int) -> dict[int, View]:
         """The training views by index, their pictures reduced."""
@@ -77,10 +77,6 @@ class TrainingRun:
         if active is not None and not active.is_all:
             return active.reduction
         return reduction_at(self.progress, self.config.coarse, self._shortest)
-
-    def fit_density(self, blocks: int) -> None:
-        """Density control for a scene of so many blocks."""
-        self.density = DensityControl(for_blocks(self.config.density, blocks, self.rasterizer.primitive))
 
     @property
     def blocks(self) -> int:

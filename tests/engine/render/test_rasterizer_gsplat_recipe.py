@@ -228,7 +228,7 @@ def test_cut_is_that_of_the_torch_backend(backend, crop):
     span = ZWindow.everything(inside.grid, "cpu", torch.float64)
     shot = CutShot(VIEW, crop, span.before(inside), inside, span.behind(inside))
     found, expected = (
-        draw.cut(gaussians, shot, sh_degree=1) for draw in (backend, torch_twin(backend, TILE))
+        next(draw.cuts(gaussians, [shot], sh_degree=1)) for draw in (backend, torch_twin(backend, TILE))
     )
     for side in ("front", "back"):
         one, other = getattr(found, side), getattr(expected, side)

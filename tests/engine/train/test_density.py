@@ -1,7 +1,6 @@
 """Growing and pruning: gsplat's strategies on a block's own clock."""
 
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -10,14 +9,15 @@ from gsplat.strategy import DefaultStrategy
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, make_adam
-from abcd_ns.engine.render.primitive import SURFELS
+from abcd_ns.engine.render.primitive import SPLATS, SURFELS
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
+from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_primitive
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
+from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
-from tests.reference.scenes import random_gaussians, ring_of_views
+from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 
 def live(gaussians: Gaussians):
@@ -232,18 +232,35 @@ def test_covariances_against_the_definition():
     assert torch.allclose(found, found.transpose(1, 2))
 
 
-@pytest.mark.parametrize(("blocks", "given", "expected"), [(1, 0, 100), (8, 0, 30), (1, 7, 7), (8, 7, 7)])
-def test_blocks_refine_after_fewer_steps_than_a_scene_unless_told(blocks, given, expected):
-    config = DensityConfig(refine_every=given, refine_stop=0.3)
-    assert for_blocks(config, blocks) == replace(config, refine_every=expected)
+def test_blocks_refine_after_fewer_steps_than_what_is_trained_at_once(tmp_path, views, photos, start):
+    """The warm-up is as one block: by the steps of blocks it would have three times the Gaussians."""
+    usual = {}
+    for blocks in (1, 4):
+        (tmp_path / str(blocks)).mkdir()
+        options = {"blocks": blocks, "steps": 60, "scaffold": None if blocks == 1 else 20}
+        coordinator = make_coordinator(tmp_path / str(blocks), start, views, **options)
+        while not coordinator.finished:
+            train_step(coordinator, photos)
+            if (active := coordinator.state.active) is not None:
+                found = coordinator.visit.live.density_clock(1, 1, None).usual
+                usual.setdefault((blocks, active.is_whole), set()).add(found)
+    assert usual == {(1, False): {100}, (4, True): {100}, (4, False): {30}}
+
+
+@pytest.mark.parametrize(("given", "usual", "due"), [(0, 100, 100), (0, 30, 30), (7, 100, 7)])
+def test_steps_between_refinements_are_those_given_or_the_usual(given, usual, due):
+    control = DensityControl(DensityConfig(refine_every=given))
+    assert control.is_due(clock(steps=due, usual=usual))
+    assert not control.is_due(clock(steps=due - 1, usual=usual))
 
 
 def test_surfels_grow_by_plain_gradients_and_2dgs_threshold():
-    found = for_blocks(DensityConfig(), 1, SURFELS)
+    found = for_primitive(DensityConfig(), SURFELS)
     assert not found.use_absgrad
     assert math.isclose(found.densify_grad_thresh, 2e-4)
     plain = DensityConfig(use_absgrad=False, densify_grad_thresh=3e-4)
-    assert for_blocks(plain, 1, SURFELS).densify_grad_thresh == 3e-4
+    assert for_primitive(plain, SURFELS).densify_grad_thresh == 3e-4
+    assert for_primitive(DensityConfig(), SPLATS) == DensityConfig()
 
 
 @pytest.mark.parametrize("option", [{"antialiased": True}, {"poses": "SO3xR3"}])

@@ -18,7 +18,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
-from abcd_ns.engine.render.primitive import SPLATS, Primitive
+from abcd_ns.engine.render.primitive import Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.density.shedding import WEIGHED, faded, may_grow, price_at, weigh, worthless
@@ -63,7 +63,7 @@ class DensityConfig:
     """Share of the run after which the number of Gaussians no longer changes."""
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
-    where a block sees every step, as splatfacto has it, and 30 elsewhere."""
+    where all is trained at once, as splatfacto has it, also in the warm-up, and 30 elsewhere."""
     reset_every: int = 3000
     """A block's own steps between opacity resets (`default` strategy); 0 means never."""
     cull_alpha_thresh: float = 0.005
@@ -89,13 +89,12 @@ class DensityConfig:
         return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
 
 
-def for_blocks(config: DensityConfig, blocks: int, primitive: Primitive = SPLATS) -> DensityConfig:
-    """The options of a scene of so many blocks of a primitive: nothing is left to choose."""
-    if config.use_absgrad and not primitive.has_absgrad:
-        plain = config.densify_grad_thresh * PLAIN_GRADIENT
-        config = replace(config, use_absgrad=False, densify_grad_thresh=plain)
-    every = REFINE_EVERY_SCENE if blocks == 1 else REFINE_EVERY_BLOCK
-    return replace(config, refine_every=config.refine_every or every)
+def for_primitive(config: DensityConfig, primitive: Primitive) -> DensityConfig:
+    """The options where Gaussians are of a primitive."""
+    if not config.use_absgrad or primitive.has_absgrad:
+        return config
+    plain = config.densify_grad_thresh * PLAIN_GRADIENT
+    return replace(config, use_absgrad=False, densify_grad_thresh=plain)
 
 
 @dataclass(frozen=True)
@@ -114,6 +113,8 @@ class DensityClock:
     """Gaussians that may still be added to the scene; None for no limit."""
     seed: int
     """Of the random numbers drawn in this step."""
+    usual: int = REFINE_EVERY_SCENE
+    """`refine_every` where it is not given."""
     refined: int | None = None
     """`steps` when the block was last refined; None refines at the very step that it is due."""
     resets: int | None = None
@@ -162,7 +163,7 @@ class DensityControl:
         """Whether this step refines."""
         if not self.config.refine_start <= clock.progress < self.config.refine_stop:
             return False
-        every = max(self.config.refine_every, clock.views, 1)
+        every = max(self.config.refine_every or clock.usual, clock.views, 1)
         if clock.refined is None:
             return clock.reached(every)
         return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= every

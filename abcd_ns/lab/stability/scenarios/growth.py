@@ -7,7 +7,12 @@ import torch
 
 from abcd_ns.engine.events import VisitUndone
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_blocks
+from abcd_ns.engine.train.density.control import (
+    REFINE_EVERY_BLOCK,
+    DensityClock,
+    DensityConfig,
+    DensityControl,
+)
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_visit
 from abcd_ns.lab.stability.lab import Lab, make_stage
@@ -83,13 +88,14 @@ def refinements(
     cameras: int, sweep: int, config: DensityConfig, *, batch: int = 4, limit: int = VIEWS
 ) -> int:
     """How often a block that `cameras` see is refined in one visit, once it is warm."""
-    control = DensityControl(for_blocks(config, 8))
+    control = DensityControl(config)
     used = views_per_visit(cameras, cameras, limit)
     steps = -(-passes_of_sweep(sweep, PASSES, PASSES, used) * used // batch)
     views, done = min(cameras, steps * batch), 10 * max(cameras, 1)
     clocks = [
-        DensityClock(0.2, done + batch * (k + 1), batch, views, None, 0) for k in range(steps)
-    ]  # by the coordinator's rule, see Coordinator._density_clock
+        DensityClock(0.2, done + batch * (k + 1), batch, views, None, 0, REFINE_EVERY_BLOCK)
+        for k in range(steps)
+    ]  # see LiveBlock.density_clock
     return sum(control.is_due(clock) for clock in clocks)
 
 
