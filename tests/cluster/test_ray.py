@@ -94,8 +94,9 @@ def workers(steady, photos, traps):
         pytest.skip("this machine is too busy to start Ray, which gives itself 30 s")
     found = RayWorkers(2, partial(make_worker, steady[1], photos, traps=traps))
     yield found
-    found.close()
-    ray.shutdown()
+    if ray.is_initialized():  # else a test has ended this session, and with it the workers
+        found.close()
+        ray.shutdown()
 
 
 @pytest.fixture
