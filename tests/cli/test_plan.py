@@ -12,7 +12,8 @@ from abcd_ns.cli.plan.forecast import Share, device_shares, disk_shares, views_o
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import GB, Fit
+from abcd_ns.nerfstudio.fit import FITTED, GB, Fit
+from abcd_ns.nerfstudio.workers import blocks_to_begin_with
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 FITS = (Share("something", 1),)
@@ -50,6 +51,24 @@ def test_a_forecast_adds_up():
     needs = DeviceNeeds(48 * 36, 4, levels=3)  # where the CPU is the device, nothing else is kept there
     assert sum(share.nbytes for share in found.device) == needs.bytes_for(250)
     assert not found.warnings
+
+
+def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
+    """As in training, which fits nothing to the device then."""
+    found = forecast(
+        capture(), Wanted(blocks=2, max_gaussians=3_000_000, device_budget_gb=0.5), Console(quiet=True)
+    )
+    assert found.fit.limits == dict.fromkeys(FITTED, 0) | {"batch_limit": 4}
+    assert "1,500,000 Gaussians" in found.device[0].what
+    assert any("on the device" in line for line in found.warnings)
+
+
+def test_workers_for_whom_there_is_no_room_are_refused():
+    alone = Fit(blocks=1, limit=0, sole=5000, budget=GB, gaussians=1000, batch=4)
+    assert blocks_to_begin_with(alone, 0) == 1
+    with pytest.raises(UserError, match=r"1\.0 GB of the device have no room for a block among others"):
+        blocks_to_begin_with(alone, 2)
+    assert blocks_to_begin_with(dataclasses.replace(alone, limit=5000), 3) == 6
 
 
 def test_a_device_budget_decides_how_many_blocks():

@@ -137,7 +137,7 @@ def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
 
     def draw(results: Results, out: Path) -> list[Path]:
         charts = [*draw_speed_accuracy(results, out), *draw_size_accuracy(results, out)]
-        return [*charts, *draw_pictures(_first_runs(results, plan), out / PICTURES)]
+        return [*charts, *draw_pictures(first_runs(results, plan), out / PICTURES)]
 
     return experiment.carry_out(plan, console, draw, overwrite, impossible)
 
@@ -153,7 +153,7 @@ def impossible(job: Job, outcome: Run | Failure | None = None) -> LeftOut | None
     return None
 
 
-def _first_runs(results: Results, plan: Plan) -> list[tuple]:
+def first_runs(results: Results, plan: Plan) -> list[tuple]:
     """A run of each method, of one seed where they share any, with the folder of its pictures."""
     seeds = [{run.seed for run in arm.runs} for arm in results.arms]
     shared = [seed for seed in results.seeds if all(seed in each for each in seeds)]

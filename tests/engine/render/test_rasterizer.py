@@ -373,3 +373,11 @@ def test_each_view_of_a_batch_counts_by_its_own_size():
     for name, value in together.items():
         torch.testing.assert_close(value, sum(each[name] for each in one_by_one), rtol=1e-4, atol=1e-4)
     assert float(together["grad2d"].abs().max()) > 0
+
+
+def test_nothing_is_kept_of_gaussians_that_are_gone():
+    draw, gaussians = TorchRasterizer("never"), random_gaussians(5)
+    draw.project(gaussians, VIEW)
+    assert draw._packed is not None
+    del gaussians
+    assert draw._packed is None

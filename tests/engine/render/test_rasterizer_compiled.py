@@ -9,8 +9,9 @@ import torch
 from abcd_ns.engine.build_kernels import all_kernels
 from abcd_ns.engine.kernels import Kernel, build, can_build
 from abcd_ns.engine.kernels.kernel import FOLDER_VARIABLE, forget_loaded
-from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
+from abcd_ns.engine.kernels.photometric import PHOTOMETRIC_KERNELS, SSIM_WINDOW
 from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.cpu import chunk_kernels as chunk_kernels_module
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels, chunk_kernels
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.types import Crop
@@ -158,3 +159,14 @@ def test_using_kernels_does_not_import_the_compiler():
         "sys.exit(any(name.startswith('torch._inductor.codegen') for name in set(sys.modules) - before))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_kernels_of_the_loss_that_are_missing_are_built_too(monkeypatch):
+    """Those that draw may be there: of an earlier version, whose loss was another."""
+    asked = []
+    monkeypatch.setattr(Kernel, "is_built", property(lambda kernel: kernel not in PHOTOMETRIC_KERNELS))
+    monkeypatch.setattr(chunk_kernels_module, "build_kernels", lambda kernels, *_: asked.extend(kernels))
+    kernels = ChunkKernels("auto", 4, 8)
+    assert kernels.built
+    kernels.warm_up()
+    assert set(PHOTOMETRIC_KERNELS) <= set(asked)

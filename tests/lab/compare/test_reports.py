@@ -4,6 +4,8 @@ import dataclasses
 import re
 import xml.etree.ElementTree as ET
 from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from PIL import Image
 from rich.console import Console
 
 from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy, mean_curve
+from abcd_ns.lab.compare.command import first_runs
 from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
 from abcd_ns.lab.job import METHODS, evenly
 from abcd_ns.lab.results.run import ViewScore
@@ -210,3 +213,16 @@ def test_every_view_that_all_runs_drew_gets_a_figure(tmp_path):
     assert [path.name for path in paths] == ["view-0000.png", "view-0005.png"]
     assert all(re.match(rb"\x89PNG", path.read_bytes()) for path in paths)
     assert draw_pictures([], tmp_path / "nothing") == []
+
+
+def test_where_a_seed_failed_pictures_are_of_one_that_all_methods_have_and_titles_count_what_is_there():
+    results = made_up_results(
+        *(made_up_run(seed=seed) for seed in (0, 1)), made_up_run("abcd-monolithic", seed=1), seeds=(0, 1)
+    )
+    plan = SimpleNamespace(settings=results.settings, out=Path("out"))
+    assert [(run.method, run.seed) for run, _ in first_runs(results, plan)] == [
+        ("abcd", 1),
+        ("abcd-monolithic", 1),
+    ]
+    assert results.means_of == "mean of 1 to 2 seeds"
+    assert made_up_results(made_up_run()).means_of == ""

@@ -116,6 +116,11 @@ def test_the_command_writes_a_report(tmp_path, capsys):
     report = read_results(tmp_path / "out" / "results.json")
     assert [outcome.id for outcome in report.outcomes] == ["A7", "A21"]
     assert "2 of 2 scenarios pass." in printed
+    assert report.command == "abcd stability --only A21 A7 --seed 0 --out out"
+    before = (tmp_path / "out" / "results.json").read_bytes()
+    assert cli.main(["stability", "--out", str(tmp_path / "out"), "--only", "A7"]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (tmp_path / "out" / "results.json").read_bytes() == before
 
 
 def test_a_seed_below_0_is_refused(tmp_path, capsys):
