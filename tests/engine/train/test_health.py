@@ -353,3 +353,13 @@ def test_a_block_that_is_emptied_in_its_visit_ends_it(tmp_path, views, photos, s
     train(resumed, photos, steps=left)
     assert resumed.state.active is None
     assert resumed.count() == coordinator.count()
+
+
+def test_a_visit_that_time_ran_out_on_says_nothing_of_whether_the_block_is_hidden(tmp_path, views, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=3, warmup=0.0)
+    coordinator.next_batch()
+    block = coordinator.state.active.geometry.block
+    coordinator.end_visit()
+    assert coordinator.state.step == 0
+    assert coordinator.state.health[block].visits == 1
+    assert not coordinator.state.health[block].hidden

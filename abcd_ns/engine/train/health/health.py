@@ -151,7 +151,8 @@ class Health:
         self.look_over()
         state, record = detach(), self._record
         record.visits += 1
-        record.hidden = not active.shown
+        if active.done:  # else time ran out before anybody could see
+            record.hidden = not active.shown
         self._active = self._attached = None
         if not self.undoes or active.is_whole:
             return state
