@@ -57,6 +57,16 @@ def test_refinement_keeps_to_its_share_of_the_run(progress, expected):
     assert DensityControl(DensityConfig()).is_due(clock(progress=progress)) is expected
 
 
+def test_a_block_grows_in_its_first_visit_however_late_that_is():
+    late = {"progress": 0.9, "refined": 0, "spent": 0.1}
+    control = DensityControl(DensityConfig())
+    assert control.is_due(clock(first=True, **late))
+    assert not control.is_due(clock(**late))
+    assert not control.is_due(clock(first=True, **{**late, "spent": 0.6}))
+    never = DensityControl(DensityConfig(refine_start=1.0, refine_stop=0.0))
+    assert not never.is_due(clock(first=True, **late))
+
+
 def test_the_default_strategy_clones_where_gradients_are_high():
     params, optimizers = live(random_gaussians(8, size=0.001))
     control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
@@ -245,6 +255,23 @@ def test_blocks_refine_after_fewer_steps_than_what_is_trained_at_once(tmp_path, 
                 found = coordinator.visit.live.density_clock(1, 1, None).usual
                 usual.setdefault((blocks, active.is_whole), set()).add(found)
     assert usual == {(1, False): {100}, (4, True): {100}, (4, False): {30}}
+
+
+def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(tmp_path, views, photos, start):
+    density = DensityConfig(
+        refine_start=0.0, refine_stop=0.01, refine_every=1, densify_grad_thresh=1e-9, price=0
+    )
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=2, steps=60, scaffold=40, visit_steps=8, density=density
+    )
+    counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        active, live = coordinator.state.active, coordinator.visit.live
+        if active is not None and not active.is_whole:
+            counts[live.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(live))
+    assert [len(found) for found in counts[True].values()] == [2, 2]  # before it grew, and after
+    assert [len(found) for found in counts[False].values()] == [1, 1]
 
 
 @pytest.mark.parametrize(("given", "usual", "due"), [(0, 100, 100), (0, 30, 30), (7, 100, 7)])

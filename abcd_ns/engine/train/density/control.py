@@ -5,6 +5,7 @@ the run and in the block's own steps, so it is kept in this file and the strateg
 step number they are given, either to gather statistics or to refine now.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -60,7 +61,8 @@ class DensityConfig:
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
-    """Share of the run after which the number of Gaussians no longer changes."""
+    """Share of the run after which the number of Gaussians no longer changes; a block grows in its first
+    visit all the same, whenever that is."""
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
     where all is trained at once, as splatfacto has it, also in the warm-up, and 30 elsewhere."""
@@ -119,6 +121,8 @@ class DensityClock:
     """`steps` when the block was last refined; None refines at the very step that it is due."""
     resets: int | None = None
     """Resets of the opacities that the block has had; None resets at the very step that one is due."""
+    first: bool = False
+    """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
     spent: float = 0.0
     """Share of the visit that is done, for what is left must make good what growing and resets upset before
     others see the block; 0 where there are no others."""
@@ -161,7 +165,10 @@ class DensityControl:
 
     def is_due(self, clock: DensityClock) -> bool:
         """Whether this step refines."""
-        if not self.config.refine_start <= clock.progress < self.config.refine_stop:
+        begins, ends = self.config.refine_start, self.config.refine_stop
+        if clock.first and begins < ends:
+            ends = math.inf
+        if not begins <= clock.progress < ends:
             return False
         every = max(self.config.refine_every or clock.usual, clock.views, 1)
         if clock.refined is None:

@@ -151,6 +151,7 @@ class LiveBlock:
             seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
             refined=self.clocks.refined if among_others else None,
             resets=self.clocks.resets if among_others else None,
+            first=among_others and not active.is_whole and self.clocks.visits == 0,
             spent=active.done / active.steps if among_others else 0.0,
         )
 
