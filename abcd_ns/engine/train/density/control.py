@@ -5,7 +5,6 @@ the run and in the block's own steps, so it is kept in this file and the strateg
 step number they are given, either to gather statistics or to refine now.
 """
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render.primitive import Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
-from abcd_ns.engine.train.density.shedding import WEIGHED, faded, may_grow, price_at, weigh, worthless
+from abcd_ns.engine.train.density.shedding import LAST, WEIGHED, faded, may_grow, price_at, weigh, worthless
 
 # Step numbers as gsplat sees them. It refines on multiples of REFINE, resets opacities on multiples of
 # `reset_every` (never, with these numbers) and prunes by size where step > reset_every.
@@ -62,7 +61,7 @@ class DensityConfig:
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
     """Share of the run after which the number of Gaussians no longer changes; a block grows in its first
-    visit all the same, whenever that is."""
+    visit all the same, unless that is in the last third."""
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
     where all is trained at once, as splatfacto has it, also in the warm-up, and 30 elsewhere."""
@@ -167,7 +166,7 @@ class DensityControl:
         """Whether this step refines."""
         begins, ends = self.config.refine_start, self.config.refine_stop
         if clock.first and begins < ends:
-            ends = math.inf
+            ends = max(ends, LAST)
         if not begins <= clock.progress < ends:
             return False
         every = max(self.config.refine_every or clock.usual, clock.views, 1)
