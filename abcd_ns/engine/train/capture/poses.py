@@ -5,6 +5,7 @@ optimizer has it). All poses together may not be turned, moved or scaled: the sc
 looks at it from elsewhere, held-out views first of all, would look past it.
 """
 
+import base64
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -13,7 +14,6 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from abcd_ns.engine.layers.whole_pictures import WholePicture
-from abcd_ns.engine.train.capture import per_view
 from abcd_ns.engine.types import View
 
 Kind = Literal["off", "SO3xR3"]
@@ -58,12 +58,18 @@ class Poses:
 
     def to_json(self) -> dict[str, str]:
         """Those that are refined, bit for bit."""
-        return per_view.to_json({str(view): pose for view, pose in self._refined.items()})
+        return {
+            str(view): base64.b64encode(pose.cpu().contiguous().numpy().tobytes()).decode()
+            for view, pose in self._refined.items()
+        }
 
     def restore(self, data: Mapping[str, str]) -> None:
         """Stand where `to_json` was called."""
-        self._refined = {int(view): torch.empty_like(self._given[int(view)]) for view in data}
-        per_view.restore({str(view): pose for view, pose in self._refined.items()}, data)
+        self._refined = {}
+        for view, text in data.items():
+            like = self._given[int(view)]
+            pose = torch.frombuffer(bytearray(base64.b64decode(text)), dtype=like.dtype)
+            self._refined[int(view)] = pose.view_as(like)
 
 
 def turned(viewmat: Float64[Tensor, "4 4"], step: Float64[Tensor, "6"]) -> Float64[Tensor, "4 4"]:
