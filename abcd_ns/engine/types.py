@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Integer
@@ -87,8 +88,7 @@ class Gaussians:
 assert tuple(f.name for f in fields(Gaussians)) == PARAM_NAMES
 
 
-@dataclass(frozen=True)
-class Crop:
+class Crop(NamedTuple):
     """A rectangle of pixels: columns x .. x + width - 1 and rows y .. y + height - 1 of a full image."""
 
     x: int

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
@@ -37,16 +36,6 @@ class VisitGeometry:
     def views(self) -> tuple[int, ...]:
         """Indices of the views that see the block."""
         return tuple(sorted(self.crops))
-
-    def to_json(self) -> dict[str, Any]:
-        """As JSON; numbers survive exactly."""
-        crops = {str(i): [c.x, c.y, c.width, c.height] for i, c in self.crops.items()}
-        return {"block": self.block, "crops": crops}
-
-    @staticmethod
-    def from_json(data: dict[str, Any]) -> "VisitGeometry":
-        """The inverse of `to_json`."""
-        return VisitGeometry(data["block"], {int(i): Crop(*crop) for i, crop in data["crops"].items()})
 
 
 def survey(

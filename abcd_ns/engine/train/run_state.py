@@ -2,13 +2,15 @@
 
 import copy
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
+
+import msgspec
 
 from abcd_ns.engine.layers.visit_layers import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
 from abcd_ns.engine.store.special_blocks import WHOLE, from_text
-from abcd_ns.engine.train.health_record import BlockHealth, Ledger
+from abcd_ns.engine.train.health_record import Ledger
 from abcd_ns.engine.train.schedule import VisitPlan
 
 UNLIMITED = 2**31
@@ -94,10 +96,6 @@ class ActiveVisit:
         return min(max((progress - self.since) / (self.until - self.since), 0.0), 1.0)
 
 
-GONE = ("warm",)
-"""What states held before, and nobody asks for any more."""
-
-
 @dataclass
 class RunState:
     """All that the coordinator knows besides the blocks themselves."""
@@ -152,39 +150,16 @@ class RunState:
 
     def to_json(self) -> dict[str, Any]:
         """As JSON, which shares nothing with this state; `from_json` gives an equal one."""
-        active = self.active and {
-            **vars(self.active),
-            "geometry": self.active.geometry.to_json(),
-            "views": list(self.active.views),
-            "looked_at": list(self.active.looked_at),
-            "objective": {str(view): list(losses) for view, losses in self.active.objective.items()},
-        }
-        lent = [[visit.geometry.block, visit.steps] for visit in self.in_flight]
-        queue = lent + [[plan.block, plan.steps] for plan in self.queue]
-        views = {str(block): count for block, count in self.views.items()}
-        known = {str(b): {str(v): value for v, value in row.items()} for b, row in self.influence.items()}
-        health = {str(block): dict(vars(record)) for block, record in self.health.items()}
-        changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
-        return {**{k: v for k, v in vars(self).items() if k != "in_flight"}, **changed}
+        lent = [VisitPlan(visit.geometry.block, visit.steps) for visit in self.in_flight]
+        return msgspec.to_builtins(replace(self, queue=lent + self.queue, in_flight=[]), str_keys=True)
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> "RunState":
-        """The inverse of `to_json`; of nothing, as in a store that is new, a run that has not begun."""
-        if not data:
-            return RunState()
-        active = data["active"]
-        if active is not None:
-            geometry = VisitGeometry.from_json(active["geometry"])
-            views = {name: tuple(active[name]) for name in ("views", "looked_at")}
-            losses = {int(view): list(found) for view, found in active.get("objective", {}).items()}
-            active = ActiveVisit(**{**active, **views, "geometry": geometry, "objective": losses})
-        queue = [VisitPlan(*plan) for plan in data["queue"]]
-        views = {int(block): count for block, count in data["views"].items()}
-        known = {int(b): {int(v): value for v, value in row.items()} for b, row in data["influence"].items()}
-        health = {from_text(block): BlockHealth(**record) for block, record in data.get("health", {}).items()}
-        changed = {"queue": queue, "active": active, "views": views, "influence": known, "health": health}
-        same = {name: value for name, value in data.items() if name not in GONE}
-        return RunState(**{**same, **changed})
+        """The inverse of `to_json`; of nothing, as in a store that is new, a run that has not begun. What
+        older versions wrote besides is passed over."""
+        state = msgspec.convert(data, RunState, str_keys=True)
+        state.health = {from_text(block): record for block, record in state.health.items()}
+        return state
 
 
 class Stopwatch:

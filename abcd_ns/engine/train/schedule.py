@@ -8,9 +8,11 @@ grow longer, so that drawing the frozen layers is paid for by more steps.
 
 import math
 import random
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import NamedTuple, TypeVar
+
+T = TypeVar("T")
 
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks."""
@@ -37,8 +39,7 @@ FROZEN_COST, WINDOW_COST = 0.3, 0.4
 """Of drawing a Gaussian into a layer, and of finding its block's window; a training step draws one for 1."""
 
 
-@dataclass(frozen=True)
-class VisitPlan:
+class VisitPlan(NamedTuple):
     """One visit to come."""
 
     block: int
@@ -136,6 +137,12 @@ def views_per_step(batch: int, blocks: int, limit: int = 0) -> int:
         limit: `Limits.batch_limit`.
     """
     return batch or (1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH))
+
+
+def evenly(values: Sequence[T], wanted: int) -> list[T]:
+    """So many of the values, as far apart from each other as from both ends; all if there are no more."""
+    wanted = min(wanted, len(values))
+    return [values[int((k + 0.5) * len(values) / wanted)] for k in range(wanted)]
 
 
 def views_per_visit(seen: int, most_seen: int, limit: int) -> int:
