@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.pictures import PictureArray, draw_comparison, psnr_of, read_picture
-from abcd_ns.lab.job import evenly
 from abcd_ns.lab.results.style import STYLE
 from abcd_ns.lab.runs.runner import take_folder
 
@@ -212,7 +212,7 @@ def _draw(out: Path, pairs: Sequence[Pair]) -> list[Path]:
     folder = out / "pictures"
     folder.mkdir(exist_ok=True)
     paths = []
-    for row in evenly(len(pairs), SHOWN):
+    for row in evenly(range(len(pairs)), SHOWN):
         photo, picture = pairs[row]
         paths.append(folder / f"view-{row:04d}.png")
         draw_comparison(photo, {"abcd": picture}, f"held-out view {row}", paths[-1])

@@ -148,9 +148,3 @@ class Plan:
     def seeds(self) -> tuple[int, ...]:
         """In their order."""
         return tuple(dict.fromkeys(job.seed for job in self.jobs))
-
-
-def evenly(count: int, wanted: int) -> tuple[int, ...]:
-    """`wanted` of the rows 0 .. count - 1, as far apart from each other as from both ends."""
-    wanted = min(count, wanted)
-    return tuple(int((k + 0.5) * count / wanted) for k in range(wanted))

@@ -15,7 +15,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from abcd_ns.lab.job import Job, evenly
+from abcd_ns.engine.train.schedule import evenly
+from abcd_ns.lab.job import Job
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.evaluate import (
@@ -81,7 +82,7 @@ def seed_everything(seed: int) -> None:
 
 def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[ViewScore], list[float]]:
     """Scores and squared ordering gaps of all held-out views; photo and picture of some of them as PNG."""
-    shown = set(evenly(len(training.pipeline.datamanager.eval_dataset), job.settings.pictures))
+    shown = set(evenly(range(len(training.pipeline.datamanager.eval_dataset)), job.settings.pictures))
     scores, gaps = [], []
     for drawn in draw_held_out(training.pipeline):
         scores.append(score(drawn))

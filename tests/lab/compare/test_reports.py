@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy, mean_curve
 from abcd_ns.lab.compare.command import first_runs
 from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
-from abcd_ns.lab.job import METHODS, evenly
+from abcd_ns.lab.job import METHODS
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS, spread
 from abcd_ns.lab.results.tables import MEASURES, cell, notes, print_table, rows, write_table
@@ -176,7 +177,7 @@ def test_errors_are_absolute_differences():
 
 @given(st.integers(1, 200), st.integers(1, 10))
 def test_shown_views_are_evenly_chosen(count, wanted):
-    chosen = evenly(count, wanted)
+    chosen = evenly(range(count), wanted)
     assert len(chosen) == len(set(chosen)) == min(count, wanted)
     assert 0 <= chosen[0] <= chosen[-1] < count
     gaps = np.diff([-chosen[0] - 1, *chosen, 2 * count - chosen[-1] - 1])  # mirrored at both ends
@@ -184,7 +185,7 @@ def test_shown_views_are_evenly_chosen(count, wanted):
 
 
 def test_no_view_is_shown_where_none_is_wanted():
-    assert evenly(5, 0) == ()
+    assert evenly(range(5), 0) == []
 
 
 @pytest.mark.parametrize("methods", [1, 3])

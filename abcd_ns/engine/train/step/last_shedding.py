@@ -24,6 +24,7 @@ from abcd_ns.engine.layers.whole_pictures import WholePicture
 from abcd_ns.engine.store.scene import BlockScene, ChangedScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail
 from abcd_ns.engine.train.run import TrainingRun
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.step.whole_views import WholeViews
 from abcd_ns.engine.transfer import upload
@@ -167,12 +168,6 @@ class LastShedding:
             stays[~state.waits] = worth > price
             run.rest(scene.tree, {block: state[stays], **inbox_without(scene, {block})}, within=0.0)
         return gone
-
-
-def evenly(views: list[View], wanted: int) -> list[View]:
-    """So many of the views, as far apart from each other as from both ends; all if there are no more."""
-    wanted = min(wanted, len(views))
-    return [views[int((k + 0.5) * len(views) / wanted)] for k in range(wanted)]
 
 
 def random_signs(seed: int) -> Callable[[Sequence[int]], Tensor]:
