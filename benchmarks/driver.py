@@ -7,9 +7,6 @@ on disk, all of it one after the other. Ray's own work is left out. Nothing is d
 """
 
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +20,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.settle import settle, state_for_visit
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.machine import describe_machine
+from benchmarks.runs import StageClock
 
 BLOCKS = 2
 NEIGHBOURS = 8
@@ -41,14 +39,6 @@ class Args:
     """That a worker takes for a visit, supposed."""
 
 
-@contextmanager
-def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Add what it takes."""
-    began = time.perf_counter()
-    yield
-    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - began
-
-
 def measure(args: Args, folder: Path) -> tuple[dict[str, float], int, int]:
     """Seconds a visit by stage; bytes of the block with its moments, and as it is drawn."""
     generator = torch.Generator().manual_seed(0)
@@ -62,19 +52,19 @@ def measure(args: Args, folder: Path) -> tuple[dict[str, float], int, int]:
     tree = build_kd(start.means, BLOCKS)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     store.commit(blocks_at_rest(tree, start))
-    scene, seconds = StoredScene(tree, store), dict[str, float]()
+    scene, clock = StoredScene(tree, store), StageClock()
     for _ in range(args.visits):
-        with timed(seconds, "reading, and a copy to lend"):
+        with clock.stage("reading, and a copy to lend"):
             state = state_for_visit(scene, 0)
             lent = {name: tensor.clone() for name, tensor in state.packed()[0].items()}
-        with timed(seconds, "settling the answer by cells"):
+        with clock.stage("settling the answer by cells"):
             updates = settle(scene, 0, state)
-        with timed(seconds, "putting it to rest on disk"):
+        with clock.stage("putting it to rest on disk"):
             scene.rest(tree, updates, {}, 0.0)
             scene.flush()
     scene.close()
     moved = sum(tensor.nbytes for tensor in lent.values())
-    return {name: value / args.visits for name, value in seconds.items()}, moved, state.gaussians.nbytes
+    return {name: value / args.visits for name, value in clock.seconds.items()}, moved, state.gaussians.nbytes
 
 
 def main(args: Args) -> None:

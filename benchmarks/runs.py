@@ -5,6 +5,8 @@ import json
 import multiprocessing
 import os
 import tempfile
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -126,6 +128,34 @@ def trainer_alone(data: Path, **options: Any) -> Iterator[Trainer]:
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         yield trainer
+
+
+class StageClock:
+    """Seconds by stage, each until the device has done its work; those of a stage within another one are its
+    own alone."""
+
+    def __init__(self) -> None:
+        self.seconds: Counter[str] = Counter()
+        self._within = 0.0
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        outer, self._within, start = self._within, 0.0, time.perf_counter()
+        yield
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        took = time.perf_counter() - start
+        self.seconds[name] += took - self._within
+        self._within = outer + took
+
+    def timed(self, name: str, function: Callable) -> Callable:
+        """The function as a stage."""
+
+        def call(*args: Any, **options: Any) -> Any:
+            with self.stage(name):
+                return function(*args, **options)
+
+        return call
 
 
 def print_machine(*more: str) -> None:

@@ -8,10 +8,7 @@ device has done its work, which makes steps slower than they are: their sum is n
 """
 
 import tempfile
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +39,7 @@ from abcd_ns.lab.results.tables import markdown
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views
-from benchmarks.runs import print_machine
+from benchmarks.runs import StageClock, print_machine
 
 STAGES = (
     "plan and attach",
@@ -82,29 +79,6 @@ class Capture:
     held_out: list[View]
     held_out_photo: PhotoReader
     gaussians: Gaussians
-
-
-class StageClock:
-    """Seconds by stage; those of a stage within another one are its own alone."""
-
-    def __init__(self) -> None:
-        self.seconds: Counter[str] = Counter()
-        self.views = 0
-        self._within = 0.0
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        outer, self._within, start = self._within, 0.0, time.perf_counter()
-        yield
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        took = time.perf_counter() - start
-        self.seconds[name] += took - self._within
-        self._within = outer + took
-
-    def ms_per_view(self) -> dict[str, float]:
-        """By stage."""
-        return {stage: 1e3 * self.seconds[stage] / self.views for stage in STAGES}
 
 
 def read(data: Path, downscale: int) -> Capture:
@@ -160,40 +134,34 @@ def run(
     args: Args,
     folder: Path,
     afterwards: Callable[[Coordinator], None] = lambda _: None,
-) -> StageClock:
-    """Train; the stages of the second half.
+) -> tuple[int, dict[str, float]]:
+    """Train; the views that the second half has drawn, and its milliseconds a view by stage.
 
     Args:
         afterwards: given the coordinator when the clock has stopped.
     """
     coordinator = begin(capture, blocks, folder, seconds=args.seconds, seed=args.seed)
-    clock = StageClock()
-
-    def timed(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*given: Any) -> Any:
-            with clock.stage(stage):  # of the clock by then
-                return function(*given)
-
-        return call
-
+    clock, views = StageClock(), 0
     scene, source = coordinator.scene, coordinator.source
-    scene.rest = timed("commit", scene.rest)  # as far as the training waits for it
-    source.draw = timed("layers", source.draw)
+    scene.rest = clock.timed("commit", scene.rest)  # as far as the training waits for it
+    source.draw = clock.timed("layers", source.draw)
     while not coordinator.finished:
         if coordinator.progress < 0.5:
-            clock = StageClock()
-        step(coordinator, capture.photo, clock)
+            clock.seconds.clear()
+            views = 0
+        views += step(coordinator, capture.photo, clock)
+    spent = {stage: 1e3 * clock.seconds[stage] / views for stage in STAGES}
     afterwards(coordinator)
     coordinator.close()
-    return clock
+    return views, spent
 
 
 def _shown(sample: Sample, photo: PhotoReader) -> Float[Tensor, "h w 3"]:
     return sample.reduced(photo(sample.view.index, sample.source))
 
 
-def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> None:
-    """training_loop.train_step with a clock."""
+def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> int:
+    """training_loop.train_step with a clock; the number of views."""
     with clock.stage("plan and attach"):
         batch = coordinator.next_batch()
     with clock.stage("photos"):
@@ -212,7 +180,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> Non
             optimizer.step()
     with clock.stage("density and settling"):
         coordinator.after_step(rendered, psnrs(rendered.pictures, photos))
-    clock.views += len(batch.samples)
+    return len(batch.samples)
 
 
 def profile(coordinator: Coordinator, photo: PhotoReader, steps: int, top: int = 30) -> list[dict[str, Any]]:
@@ -247,11 +215,11 @@ def main(args: Args) -> None:
         one = run(capture, 1, args, Path(folder) / "one")
         several = run(capture, args.blocks, args, Path(folder) / "several")
     print_machine(f"{args.data.name}, {len(capture.views)} views, {args.seconds:g} s a run; ms a view\n")
-    clocks, table = (one, several), [["stage", "1 block", f"{args.blocks} blocks"]]
+    table = [["stage", "1 block", f"{args.blocks} blocks"]]
     for stage in STAGES:
-        table.append([stage, *(f"{clock.ms_per_view()[stage]:.2f}" for clock in clocks)])
-    table.append(["all", *(f"{1e3 * sum(clock.seconds.values()) / clock.views:.2f}" for clock in clocks)])
-    print(markdown([*table, ["views", *(str(clock.views) for clock in clocks)]]))
+        table.append([stage, *(f"{ms[stage]:.2f}" for _, ms in (one, several))])
+    table.append(["all", *(f"{sum(ms.values()):.2f}" for _, ms in (one, several))])
+    print(markdown([*table, ["views", *(str(views) for views, _ in (one, several))]]))
 
 
 if __name__ == "__main__":

@@ -11,12 +11,10 @@ for that, by `passes_for_layers`.
 """
 
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
@@ -29,7 +27,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.schedule import passes_for_layers
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop
-from benchmarks.runs import print_machine
+from benchmarks.runs import StageClock, print_machine
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
 STAGES = ("survey", "attach", "layers", "steps", "end")
@@ -83,47 +81,30 @@ def begin(args: Args, folder: Path) -> tuple[Coordinator, Callable[[int, Crop], 
     return coordinator, lambda _, crop: noise[crop.slices]
 
 
-def timed(seconds: Counter, stage: str, method: Callable[..., Any]) -> Callable[..., Any]:
-    """The method, with its time added to a stage."""
-
-    def run(*args: Any, **options: Any) -> Any:
-        began = time.perf_counter()
-        try:
-            return method(*args, **options)
-        finally:
-            if torch.cuda.is_available():
-                torch.cuda.synchronize()
-            seconds[stage] += time.perf_counter() - began
-
-    return run
-
-
 def measure(args: Args, folder: Path) -> tuple[Counter, dict[str, float]]:
     """(seconds by stage, what else is known) of the second visit."""
     coordinator, photo = begin(args, folder)
-    seconds, events = Counter(), []
+    clock, events = StageClock(), []
     coordinator.announce.subscribe(
         lambda event: events.append(event) if isinstance(event, VisitBegan) else None
     )
-    coordinator.visits.begin = timed(seconds, "survey", coordinator.visits.begin)
-    coordinator.source.draw = timed(seconds, "layers", coordinator.source.draw)
-    coordinator.begin_visit = timed(seconds, "attach", coordinator.begin_visit)
-    coordinator.end_visit = timed(seconds, "end", coordinator.end_visit)
-    whole = timed(seconds, "steps", train_step)
+    coordinator.visits.begin = clock.timed("survey", coordinator.visits.begin)
+    coordinator.source.draw = clock.timed("layers", coordinator.source.draw)
+    coordinator.begin_visit = clock.timed("attach", coordinator.begin_visit)
+    coordinator.end_visit = clock.timed("end", coordinator.end_visit)
+    take_step = clock.timed("steps", train_step)
     layers = 0
     while coordinator.state.visit < 2 or coordinator.state.active is not None:
         if coordinator.state.visit == 1 and coordinator.state.active is None:
-            seconds.clear()
-        whole(coordinator, photo)
+            clock.seconds.clear()
+        take_step(coordinator, photo)
         if coordinator.visit.steps.layers is not None:
             layers = coordinator.layer_bytes
-    seconds["steps"] -= seconds["attach"] + seconds["end"]
-    seconds["attach"] -= seconds["survey"] + seconds["layers"]
     state, drawn = coordinator.state, coordinator.batch * args.steps
     known = {"views": events[-1].views, "drawn": drawn, "layer_bytes": layers}
     known |= {"passes": passes_for_layers(state.trained, state.frozen)}
     coordinator.close()
-    return seconds, known
+    return clock.seconds, known
 
 
 def main(args: Args) -> None:

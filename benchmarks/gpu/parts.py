@@ -175,8 +175,8 @@ def visits(task: Task) -> Iterator[Found]:
             rows += visit.profile(coordinator, capture.photo, size.profiled_steps)
 
         with tempfile.TemporaryDirectory(dir=task.work) as folder:
-            clock = visit.run(capture, blocks, args, Path(folder), look)
-        stages = {"views": clock.views, "ms_per_view": clock.ms_per_view(), "profile": rows}
+            views, spent = visit.run(capture, blocks, args, Path(folder), look)
+        stages = {"views": views, "ms_per_view": spent, "profile": rows}
         found["by_blocks"].append({"blocks": blocks, **stages})
         yield found
 
