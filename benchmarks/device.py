@@ -21,11 +21,13 @@ size; bytes do.
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import tyro
 
@@ -101,15 +103,10 @@ class Watch:
         self.steps, self.plain, self.visits, self.layers = Tally(), Tally(), Tally(), Tally()
         self._refined = False
 
-    @contextmanager
-    def layers_in(self) -> Iterator[None]:
+    def layers_in(self) -> AbstractContextManager:
         """Count the copies that LayerStore makes, whoever calls it."""
-        originals = LayerStore.put, LayerStore.get
-        LayerStore.put, LayerStore.get = map(self._counted, originals)
-        try:
-            yield
-        finally:
-            LayerStore.put, LayerStore.get = originals
+        counted = {name: self._counted(getattr(LayerStore, name)) for name in ("put", "get")}
+        return mock.patch.multiple(LayerStore, **counted)
 
     def _counted(self, method: Callable[..., Any]) -> Callable[..., Any]:
         def counted(*args: Any) -> Any:
@@ -123,20 +120,17 @@ class Watch:
     def take_step(self, coordinator: Coordinator, photos: Photos) -> None:
         """A step of training; whatever a visit's beginning or end adds to it is that visit's."""
         edges: list[Counts] = []
-        originals = coordinator.begin_visit, coordinator.end_visit
+        begin, end = coordinator.begin_visit, coordinator.end_visit
 
         def apart(method: Callable[[], None]) -> None:
             before = self._counts.copy()
             method()
             edges.append(self._counts.since(before))
 
-        coordinator.begin_visit, coordinator.end_visit = (
-            lambda: apart(originals[0]),
-            lambda: apart(originals[1]),
-        )
         before, self._refined = self._counts.copy(), False
-        train_step(coordinator, photos)
-        coordinator.begin_visit, coordinator.end_visit = originals
+        parted = {"begin_visit": partial(apart, begin), "end_visit": partial(apart, end)}
+        with mock.patch.multiple(coordinator, **parted):
+            train_step(coordinator, photos)
         taken = self._counts.since(before)
         for edge in edges:
             taken = taken.since(edge)
@@ -145,8 +139,7 @@ class Watch:
         if not self._refined:
             self.plain.add(taken)
 
-    @contextmanager
-    def refinements_in(self) -> Iterator[None]:
+    def refinements_in(self) -> AbstractContextManager:
         """Notice which steps refine, or reset opacities."""
         original = DensityControl._step_default
 
@@ -154,11 +147,7 @@ class Watch:
             self._refined = True
             return original(*args)
 
-        DensityControl._step_default = noticed
-        try:
-            yield
-        finally:
-            DensityControl._step_default = original
+        return mock.patch.object(DensityControl, "_step_default", noticed)
 
 
 def scene(args: Args) -> tuple[Gaussians, list[View], Photos]:
