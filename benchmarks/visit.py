@@ -19,7 +19,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.profiler import ProfilerActivity
 
-from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render import Rasterizer, make_rasterizer
@@ -34,11 +33,9 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import PhotoReader
-from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.lab.results.tables import markdown
-from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
-from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.views import training_views
+from abcd_ns.lab.stability.lab import Stage
+from abcd_ns.lab.stability.scenarios.real import read_stage
 from benchmarks.runs import StageClock, print_machine
 
 STAGES = (
@@ -70,36 +67,13 @@ class Args:
     """Of the runs."""
 
 
-@dataclass(frozen=True)
-class Capture:
-    """What runs train on and are judged by."""
-
-    views: list[View]
-    photo: PhotoReader
-    held_out: list[View]
-    held_out_photo: PhotoReader
-    gaussians: Gaussians
-
-
-def read(data: Path, downscale: int) -> Capture:
-    """The capture in RAM."""
-    parser = AbcdDataParserConfig(downscale_factor=downscale)
-    manager = AbcdDataManagerConfig(data=data, dataparser=parser).setup(device="cpu", test_mode="val")
-    points = manager.train_dataset.metadata["points3D_xyz"].float()
-    train = training_views(manager.train_dataset.cameras, points)
-    held_out = training_views(manager.eval_dataset.cameras, points, train[0].near)
-    start = gaussians_from_points(points, manager.train_dataset.metadata["points3D_rgb"])
-    photos = (_photos(dataset) for dataset in (manager.train_dataset, manager.eval_dataset))
-    return Capture(train, next(photos), held_out, next(photos), start)
-
-
-def _photos(dataset: AbcdDataset) -> PhotoReader:
-    photos = [dataset.photos.image(row).float() / 255 for row in range(len(dataset))]
-    return lambda view, crop: photos[view][crop.slices]
+def read(data: Path, downscale: int) -> Stage:
+    """The capture in RAM, with all its points."""
+    return read_stage(data, downscale, most_points=None)
 
 
 def begin(
-    capture: Capture,
+    capture: Stage,
     blocks: int,
     folder: Path,
     *,
@@ -111,10 +85,11 @@ def begin(
 ) -> Coordinator:
     """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    tree = build_kd(capture.gaussians.means, blocks)
+    start = gaussians_from_points(capture.points.float(), capture.colors)
+    tree = build_kd(start.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
-    keep = None if blocks == 1 else len(capture.gaussians) // blocks
-    store.commit(blocks_at_rest(tree, capture.gaussians, keep=keep, seed=seed))
+    keep = None if blocks == 1 else len(start) // blocks
+    store.commit(blocks_at_rest(tree, start, keep=keep, seed=seed))
     config = TrainingConfig(seed=seed, antialiased=antialiased)
     run = TrainingRun(
         config,
@@ -129,7 +104,7 @@ def begin(
 
 
 def run(
-    capture: Capture,
+    capture: Stage,
     blocks: int,
     args: Args,
     folder: Path,
@@ -149,7 +124,7 @@ def run(
         if coordinator.progress < 0.5:
             clock.seconds.clear()
             views = 0
-        views += step(coordinator, capture.photo, clock)
+        views += step(coordinator, capture, clock)
     spent = {stage: 1e3 * clock.seconds[stage] / views for stage in STAGES}
     afterwards(coordinator)
     coordinator.close()

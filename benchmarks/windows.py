@@ -31,9 +31,9 @@ from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.results.tables import markdown
-from abcd_ns.lab.stability.lab import merged
+from abcd_ns.lab.stability.lab import Stage, merged
 from benchmarks.runs import Asked, write_runs
-from benchmarks.visit import Capture, begin, read
+from benchmarks.visit import begin, read
 
 COUNTED = 10
 """Fragments are counted in one of so many steps."""
@@ -87,7 +87,7 @@ def count(rasterizer: TorchRasterizer, own: Gaussians, samples: tuple[Sample, ..
             ).fragments
 
 
-def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
+def run(capture: Stage, side: int, seed: int, args: Args) -> Row:
     """Train and look at held-out views."""
     rasterizer, counts = TorchRasterizer(window_side=side), Counts()
     with tempfile.TemporaryDirectory() as folder:
@@ -100,11 +100,11 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
         MemoryScene(tree, gaussians), capture.held_out, rasterizer, ownership="fragments", pass_gaussians=0
     )
     errors, gaps = [], []
-    for view in capture.held_out:
+    for view, photo in zip(capture.held_out, capture.truth, strict=True):
         with torch.no_grad():
             picture = rasterizer(gaussians, view, sh_degree=3).color.clamp(0, 1)
         composited = painter.picture(view, PaintSettings(3)).color.clamp(0, 1)
-        errors.append(psnr(picture, capture.held_out_photo(view.index, view.full)))
+        errors.append(psnr(picture, photo))
         gaps.append(psnr(picture, composited))
     drawn = max(counts.own + counts.frozen, 1)
     return Row(
@@ -119,7 +119,7 @@ def run(capture: Capture, side: int, seed: int, args: Args) -> Row:
     )
 
 
-def train(coordinator: Coordinator, capture: Capture, rasterizer: TorchRasterizer, counts: Counts) -> None:
+def train(coordinator: Coordinator, capture: Stage, rasterizer: TorchRasterizer, counts: Counts) -> None:
     """All steps; those in the midst of a visit are timed, and some of them counted."""
     while not coordinator.finished:
         active = coordinator.state.active
@@ -128,7 +128,7 @@ def train(coordinator: Coordinator, capture: Capture, rasterizer: TorchRasterize
             samples = coordinator.next_batch().samples
             count(rasterizer, live_gaussians(coordinator.params).detach(), samples, counts)
         began = time.perf_counter()
-        train_step(coordinator, capture.photo)
+        train_step(coordinator, capture)
         if amid:
             counts.seconds += time.perf_counter() - began
             counts.views += coordinator.batch

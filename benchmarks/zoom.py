@@ -19,9 +19,9 @@ from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.results.tables import markdown
-from abcd_ns.lab.stability.lab import merged
+from abcd_ns.lab.stability.lab import Stage, merged
 from benchmarks.runs import Asked, write_runs
-from benchmarks.visit import Capture, begin, read
+from benchmarks.visit import begin, read
 
 
 @dataclass(kw_only=True)
@@ -44,14 +44,14 @@ class Row:
     gaussians: int
 
 
-def run(captures: dict[int, Capture], antialiased: bool, seed: int, args: Args) -> Row:
+def run(captures: dict[int, Stage], antialiased: bool, seed: int, args: Args) -> Row:
     """Train on one size, score all."""
     capture, rasterizer = captures[args.downscale], TorchRasterizer()
     with tempfile.TemporaryDirectory() as folder:
         options = {"steps": args.steps, "seed": seed, "antialiased": antialiased}
         coordinator = begin(capture, args.blocks, Path(folder), rasterizer=rasterizer, **options)
         while not coordinator.finished:
-            train_step(coordinator, capture.photo)
+            train_step(coordinator, capture)
         gaussians = merged(coordinator)
         coordinator.close()
     scores = {size: score(gaussians, captures[size], rasterizer, antialiased) for size in args.drawn}
@@ -59,12 +59,12 @@ def run(captures: dict[int, Capture], antialiased: bool, seed: int, args: Args) 
 
 
 @torch.no_grad()
-def score(gaussians: Gaussians, capture: Capture, rasterizer: TorchRasterizer, antialiased: bool) -> float:
+def score(gaussians: Gaussians, capture: Stage, rasterizer: TorchRasterizer, antialiased: bool) -> float:
     """Mean PSNR of the held-out views, dB."""
     errors = []
-    for view in capture.held_out:
+    for view, photo in zip(capture.held_out, capture.truth, strict=True):
         drawn = rasterizer(gaussians, view, sh_degree=3, antialiased=antialiased).color.clamp(0, 1)
-        errors.append(float(psnr(drawn, capture.held_out_photo(view.index, view.full))))
+        errors.append(float(psnr(drawn, photo)))
     return fmean(errors)
 
 

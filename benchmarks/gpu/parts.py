@@ -172,7 +172,7 @@ def visits(task: Task) -> Iterator[Found]:
         rows: list[Found] = []
 
         def look(coordinator, rows=rows) -> None:
-            rows += visit.profile(coordinator, capture.photo, size.profiled_steps)
+            rows += visit.profile(coordinator, capture, size.profiled_steps)
 
         with tempfile.TemporaryDirectory(dir=task.work) as folder:
             views, spent = visit.run(capture, blocks, args, Path(folder), look)

@@ -3,19 +3,16 @@
 import json
 from pathlib import Path
 
+from abcd_ns.lab.stability.lab import Stage, make_stage
+from abcd_ns.lab.world.world import ring
 from benchmarks import zoom
-from benchmarks.visit import Capture
 from benchmarks.zoom import Args, main
-from tests.reference.scenes import Photos, random_gaussians, ring_of_views
 
 
 def test_runs_of_either_kind_are_scored_at_every_size(tmp_path, capsys, monkeypatch):
-    truth, start = (random_gaussians(60, seed=seed, sh_degree=3) for seed in (1, 2))
-
-    def read(_: Path, downscale: int) -> Capture:
-        views = ring_of_views(6, width=96 // downscale, height=72 // downscale)
-        photos = Photos(truth, views)
-        return Capture(views[:4], photos, views[4:], photos, start)
+    def read(_: Path, downscale: int) -> Stage:
+        size = 96 // downscale, 72 // downscale
+        return make_stage(views=ring(4, size=size), held_out=ring(2, turn=0.3, size=size), points=60)
 
     monkeypatch.setattr(zoom, "read", read)
     out = tmp_path / "out.json"

@@ -29,9 +29,12 @@ MOST_POINTS = 4000
 """More points than this are thinned out, for time."""
 
 
-def read_stage(data: Path, downscale: int) -> Stage:
+def read_stage(data: Path, downscale: int, most_points: int | None = MOST_POINTS) -> Stage:
     """A capture as `ns-train abcd --data` reads it; every 8th view held out. All photos are kept in RAM;
     masks and alpha channels are left aside.
+
+    Args:
+        most_points: of more, so many are taken by chance; None takes all in their order.
 
     Raises:
         UserError: it cannot be used; the message says why.
@@ -52,7 +55,9 @@ def read_stage(data: Path, downscale: int) -> Stage:
         raise UserError(f"{data} has no points to begin with; the scenarios need some.")
     points = metadata["points3D_xyz"]
     views = training_views(splits[0].cameras, points)
-    chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:MOST_POINTS]
+    chosen = slice(None)
+    if most_points is not None:
+        chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:most_points]
     return Stage(
         views,
         dict(enumerate(pictures[0])),
