@@ -1,6 +1,6 @@
 """The parts' records as charts, in the style of all others, and as short tables."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from abcd_ns.lab.results.records import decode
-from abcd_ns.lab.results.results import Results
+from abcd_ns.lab.results.results import Arm, Results
+from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
-from abcd_ns.lab.results.tables import GIB, NOTHING, notes, print_rows, rows
+from abcd_ns.lab.results.tables import GIB, MEASURES, cell, notes, print_rows, rows
 from abcd_ns.lab.scale.charts import draw_scale
 
 Record = dict[str, Any]
@@ -20,15 +21,18 @@ SHADES = ("#0072B2", "#56A0D3", "#003A5D")
 STAGES = ("#0072B2", "#56A0D3", "#D55E00", "#007A5A", "#8A6A00", "#8A5A83", "#B3306B", "#888888", "#444444")
 
 
+COMPARED = ("PSNR, merged (dB)", "SSIM, merged", "Gaussians", "steps", "training (s)")
+COMPARED += ("peak GPU memory (GiB)", "peak GPU memory, reserved (GiB)")
+"""What a comparison's table shows of each arm."""
+
+
 def draw(records: Sequence[Record], out: Path) -> list[Path]:
     """Draw what there is to draw; the paths of the charts, png and svg."""
     drawn: list[Path] = []
     for record in records:
         part, found = record["part"], record["found"]
-        if part.startswith("compare") and found.get("runs"):
-            drawn += _draw_comparison(part, found, out)
-        elif part == "extent" and found:
-            drawn += draw_scale(decode(Results, found["scale"], "extent.json"), out)
+        if (results := _results(found)) is not None:
+            drawn += draw_scale(results, out) if part == "extent" else _draw_comparison(part, results, out)
         elif part == "visit" and found.get("by_blocks"):
             drawn += _draw_visit(found, out)
     return drawn
@@ -47,11 +51,9 @@ def _rows(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
     """A part's table, titles first, and notes."""
     if not found:
         return [[part]], []
-    if part.startswith("compare"):
-        return _rows_of_comparison(part, found)
-    if part == "extent":
-        results = decode(Results, found["scale"], "extent.json")
-        return rows(results), [*results.findings, *notes(results)]
+    if (results := _results(found)) is not None:
+        table = rows(results) if part == "extent" else _rows_of_comparison(part, results)
+        return table, [*results.findings, *notes(results)]
     if part == "visit":
         columns = found["by_blocks"]
         titles = ["visit, ms a view", *(f"{column['blocks']} blocks" for column in columns)]
@@ -66,58 +68,53 @@ def _rows(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
     return [["build", ""], *([name, str(value)] for name, value in flat.items())], []
 
 
-def _rows_of_comparison(part: str, found: Record) -> tuple[list[list[str]], list[str]]:
-    titles = [part, "PSNR (dB)", "SSIM", "Gaussians", "steps", "seconds", "GPU (GiB)", "reserved (GiB)"]
-    body = []
-    for run in found["runs"]:
-        memory = [run["peak_device_bytes"], run["peak_reserved_bytes"]]
-        body.append(
-            [
-                run["arm"],
-                f"{run['psnr_merged']:.2f}",
-                NOTHING if run["ssim_merged"] is None else f"{run['ssim_merged']:.3f}",
-                f"{run['gaussians']:,}",
-                f"{run['steps']:,}",
-                f"{run['train_seconds']:.0f}",
-                *(NOTHING if size is None else f"{size / GIB:.2f}" for size in memory),
-            ]
-        )
-    left_out = [f"{left['method']} is left out: {left['reason']}" for left in found["left_out"]]
-    return [titles, *body], left_out + [
-        f"{fail['arm']} failed: {fail['reason']}" for fail in found["failures"]
-    ]
+def _results(found: Record) -> Results | None:
+    """Of a part that is an experiment."""
+    return decode(Results, found["results"], "results") if found.get("results") else None
+
+
+def _name(arm: Arm) -> str:
+    return f"{arm.method} {arm.variant}".removesuffix(" default")
+
+
+def _rows_of_comparison(part: str, results: Results) -> list[list[str]]:
+    shown = [measure for measure in MEASURES if measure.title in COMPARED]
+    body = [[_name(arm), *(cell(arm.runs, measure) for measure in shown)] for arm in results.arms]
+    return [[part, *(measure.title for measure in shown)], *body]
 
 
 @in_style
-def _draw_comparison(part: str, found: Record, out: Path) -> list[Path]:
-    """Held-out PSNR over training time, and what each arm took of the GPU."""
-    shades, runs = iter(SHADES), found["runs"]
+def _draw_comparison(part: str, results: Results, out: Path) -> list[Path]:
+    """Held-out PSNR over training time, and what each arm took of the GPU; nothing without a run."""
+    if not results.arms:
+        return []
+    shades, settings = iter(SHADES), results.settings
+    runs = {_name(arm): arm.runs[0] for arm in results.arms}
     colors = {
-        r["arm"]: next(shades) if r["arm"].startswith("abcd blocks") else COLORS[r["method"]] for r in runs
+        name: next(shades) if name.startswith("abcd blocks") else COLORS[run.method]
+        for name, run in runs.items()
     }
     figure = Figure(figsize=(9.0, 3.5), layout="constrained")
     curves, memory = figure.subplots(1, 2, width_ratios=(1.6, 1))
     ends = {}
-    for run in runs:
-        line = [(point["seconds"], point["psnr"]) for point in run["curve"]]
-        marker = MARKERS[run["method"]]
-        curves.plot(*zip(*line, strict=True), color=colors[run["arm"]], marker=marker, markersize=4)
-        ends[run["arm"]] = line[-1]
-    settings = found["settings"]
-    budget = f"{settings['steps']:,} steps" if settings["seconds"] is None else f"{settings['seconds']:g} s"
-    curves.set_title(f"{settings['data']}, {budget} a run", loc="left")
+    for name, run in runs.items():
+        line = [(point.seconds, point.psnr) for point in run.curve]
+        curves.plot(*zip(*line, strict=True), color=colors[name], marker=MARKERS[run.method], markersize=4)
+        ends[name] = line[-1]
+    budget = f"{settings.steps:,} steps" if settings.seconds is None else f"{settings.seconds:g} s"
+    curves.set_title(f"{settings.scene}, {budget} a run", loc="left")
     curves.set(xlabel="training time (s)", ylabel="held-out PSNR (dB)", xlim=(0, None))
     lay_grid(curves)
     label_ends(curves, ends, 1.04 * max(seconds for seconds, _ in ends.values()), colors)
-    _bars(memory, [run["arm"] for run in runs], runs, colors)
+    _bars(memory, runs, colors)
     return save(figure, out, part)
 
 
-def _bars(axes: Axes, names: list[str], runs: Sequence[Record], colors: dict[str, str]) -> None:
+def _bars(axes: Axes, runs: Mapping[str, Run], colors: dict[str, str]) -> None:
     """Peak GPU memory: dark what tensors held, pale what torch had taken for them."""
     for alpha, key in ((0.35, "peak_reserved_bytes"), (1.0, "peak_device_bytes")):
-        sizes = [(run[key] or 0) / GIB for run in runs]
-        axes.barh(names, sizes, color=[colors[name] for name in names], alpha=alpha)
+        sizes = [(getattr(run, key) or 0) / GIB for run in runs.values()]
+        axes.barh(list(runs), sizes, color=[colors[name] for name in runs], alpha=alpha)
     axes.invert_yaxis()
     axes.set(xlabel="peak GPU memory (GiB)\npale: reserved", xlim=(0, None))
     lay_grid(axes)

@@ -4,7 +4,6 @@ A part is a generator: each record it yields holds all that it has found so far 
 that a part that is killed leaves what it had.
 """
 
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,16 +19,16 @@ import torch
 from rich.console import Console
 
 from abcd_ns.cli.doctor.hardware import look_at_hardware
+from abcd_ns.cli.report.run_folder import CHECKPOINTS
 from abcd_ns.engine.render import make_rasterizer, self_check
 from abcd_ns.lab.compare.command import Options, impossible, make_plan
-from abcd_ns.lab.job import Change, Job, Variant
+from abcd_ns.lab.job import AS_IT_IS, Change, Job, Variant
 from abcd_ns.lab.results.records import decode, encode, read_json, write_json
-from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.runs.runner import claim, finish_job
 from abcd_ns.lab.scale import command as scale
 from abcd_ns.lab.scale.worker import LandSettings
 from abcd_ns.machine import describe_machine, describe_versions
+from abcd_ns.nerfstudio.run import STATE
 from benchmarks import visit
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -79,6 +78,13 @@ class Task:
         return TINY if self.tiny else Size()
 
 
+@dataclass(frozen=True)
+class ScoredJob(Job):
+    """A run of which nothing is wanted but its scores."""
+
+    scratch = (STATE, CHECKPOINTS)  # blocks at rest, layers, checkpoints: gigabytes
+
+
 def build(_: Task) -> Iterator[Found]:
     """gsplat's extension, compiled if need be; whether the rasterizers compute what they should."""
     found: Found = {"hardware": asdict(look_at_hardware())}
@@ -114,8 +120,7 @@ def count_tests(report: Path) -> Found:
 
 def compare(task: Task, by_steps: bool) -> Iterator[Found]:
     """Every method on the scene, under the protocol of `abcd compare`, at equal time or at equal steps."""
-    size, console = task.size, Console()
-    budget = {"steps": size.steps} if by_steps else {"seconds": size.seconds}
+    size = task.size
     given = Options(
         data=task.data,
         methods=size.methods,
@@ -123,33 +128,15 @@ def compare(task: Task, by_steps: bool) -> Iterator[Found]:
         evals=6,
         pictures=0,
         out=task.work,
-        **budget,
+        **({"steps": size.steps} if by_steps else {"seconds": size.seconds}),
     )
     plan = make_plan(given)
-    several = [Variant((Change("blocks", str(count)),)) for count in size.blocks]
-    jobs = (*plan.jobs, *(Job("abcd", task.seed, plan.settings, variant) for variant in several))
-    shared = {"settings": asdict(plan.settings), "machine": asdict(describe_machine())}
-    claim(plan.out, "GPU comparison", shared)
-    found: Found = {
-        "settings": asdict(plan.settings) | {"data": plan.settings.scene},
-        "runs": [],
-        "failures": [],
-        "left_out": [],
-    }
-    for job in jobs:
-        left = impossible(job)
-        if left is not None:
-            found["left_out"].append(asdict(left))
-            continue
-        outcome = finish_job(job, plan.out, console, job.name)
-        what = "runs" if isinstance(outcome, Run) else "failures"
-        found[what].append(
-            {"arm": f"{job.method} {job.variant.name}".removesuffix(" default"), **encode(outcome)}
-        )
-        for place in job.folder(plan.out).iterdir():
-            if place.is_dir():  # blocks at rest, layers, checkpoints: gigabytes, and scored by now
-                shutil.rmtree(place)
-        yield found
+    arms = [(method, AS_IT_IS) for method in plan.methods]
+    arms += [("abcd", Variant((Change("blocks", str(count)),))) for count in size.blocks]
+    jobs = tuple(ScoredJob(method, task.seed, plan.settings, variant) for method, variant in arms)
+    plan = replace(plan, kind="GPU comparison", jobs=jobs)
+    for results in experiment.run_jobs(plan, Console(), leave_out=impossible):
+        yield {"results": encode(results)}
 
 
 def extent(task: Task) -> Iterator[Found]:
@@ -159,7 +146,7 @@ def extent(task: Task) -> Iterator[Found]:
     plan = scale.make_plan(Path(task.work), settings, size.tiles, size.tiles, task.seed)
     plan = replace(plan, jobs=tuple(sorted(plan.jobs, key=lambda job: job.tiles)))
     for results in experiment.run_jobs(plan, Console(), leave_out=scale.too_large):
-        yield {"scale": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
+        yield {"results": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
 
 
 def visits(task: Task) -> Iterator[Found]:

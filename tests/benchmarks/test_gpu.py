@@ -10,11 +10,12 @@ import torch
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import encode, read_json, write_json
+from abcd_ns.lab.results.results import Arm
 from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part
 from benchmarks.gpu.charts import draw
 from benchmarks.gpu.parts import count_tests
 from benchmarks.visit import STAGES
-from tests.lab.compare.records import made_up_run
+from tests.lab.compare.records import made_up, made_up_run
 from tests.reference.colmap_scene import write_scene
 
 GIB = 2**30
@@ -126,11 +127,13 @@ def test_tests_are_counted_by_their_end(tmp_path):
 
 def test_every_record_is_drawn(tmp_path):
     memory = {"peak_device_bytes": 2 * GIB, "peak_reserved_bytes": 3 * GIB, "peak_device_note": None}
-    runs = [
-        {"arm": arm, **encode(made_up_run(arm.split()[0], psnr=20.0 + k, **memory))}
-        for k, arm in enumerate(("splatfacto", "abcd-monolithic", "abcd blocks=1", "abcd blocks=8"))
+    variants = {"splatfacto": "default", "abcd-monolithic": "default"}
+    arms = [*variants.items(), ("abcd", "blocks=1"), ("abcd", "blocks=8")]
+    arms = [
+        Arm(method, variant, None, (made_up_run(method, psnr=20.0 + k, **memory),))
+        for k, (method, variant) in enumerate(arms)
     ]
-    found = {"settings": {"data": "made-up", "seconds": 60.0, "steps": None}, "runs": runs}
+    found = {"results": encode(made_up("GPU comparison", *arms))}
     stages = {"views": 9, "ms_per_view": dict.fromkeys(STAGES, 1.5), "profile": []}
     records = [
         WHOLE,
@@ -157,10 +160,10 @@ def test_all_parts_of_a_dry_run_go_through(tmp_path, capsys):
     assert main(Args(data=write_scene(tmp_path / "scene"), out=out, dry_run=True)) == 0
     assert ours or read_json(out / "tests.json")["found"]["skipped"] > 0
     for part in ("compare", "compare-steps"):
-        found = read_json(out / f"{part}.json")["found"]
-        assert [run["arm"] for run in found["runs"]] == ["abcd blocks=2"]
+        found = read_json(out / f"{part}.json")["found"]["results"]
+        assert [(arm["method"], arm["variant"]) for arm in found["arms"]] == [("abcd", "blocks=2")]
         assert found["left_out"][0]["method"] == "splatfacto"
         assert not list((out / "work" / part).rglob("nerfstudio_models"))
     assert read_json(out / "visit.json")["found"]["by_blocks"][0]["profile"]
-    assert len(read_json(out / "extent.json")["found"]["scale"]["arms"]) == 2
+    assert len(read_json(out / "extent.json")["found"]["results"]["arms"]) == 2
     assert "a dry run: these numbers mean nothing" in capsys.readouterr().out
