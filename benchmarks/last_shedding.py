@@ -14,10 +14,12 @@ import torch
 import tyro
 
 from abcd_ns.engine.events import Event, ShedAtEnd, Shedding
-from abcd_ns.lab.job import Job, Settings
+from abcd_ns.lab.compare.command import Options, make_plan
 from abcd_ns.lab.runs.evaluate import draw_held_out, mean, score
 from abcd_ns.lab.runs.worker import set_up
 from abcd_ns.machine import describe_versions
+
+SCORES = ("psnr_merged", "ssim_merged")
 
 
 @dataclass(frozen=True)
@@ -34,50 +36,33 @@ class Args:
 
 def main(args: Args) -> None:
     """Train, look before and after, write what was found."""
-    settings = Settings(
-        data=str(args.data.resolve()),
-        downscale=args.downscale,
-        blocks=args.blocks,
-        seconds=None,
-        steps=args.steps,
-        evals=1,
-        max_gaussians=0,
-        densify=True,
-        pictures=0,
-    )
+    method, given = "abcd-monolithic" if args.blocks == 1 else "abcd", vars(args)
+    asked = {name: given[name] for name in ("steps", "blocks", "downscale")}
+    where = {"data": str(args.data), "out": str(args.out)}
+    plan = make_plan(Options(methods=(method,), seeds=(args.seed,), evals=1, pictures=0, **where, **asked))
+    found = {"args": {name: str(value) for name, value in {**asked, "seed": args.seed}.items()}}
     with TemporaryDirectory() as folder:
-        found = _train(
-            Job("abcd-monolithic" if args.blocks == 1 else "abcd", args.seed, settings), Path(folder)
-        )
-    found = {"args": {k: str(v) for k, v in asdict(args).items() if k not in ("out", "data")}, **found}
+        training = set_up(plan.jobs[0], Path(folder))
+
+        def look() -> dict[str, float | None]:
+            scores = [score(drawn) for drawn in draw_held_out(training.pipeline)]
+            return {name: mean([getattr(each, name) for each in scores]) for name in SCORES}
+
+        def listen(event: Event) -> None:
+            match event:
+                case Shedding(done=0):
+                    found["training_seconds"] = training.stopwatch.seconds
+                    found["held_out_before"], found["began"] = look(), time.perf_counter()
+                case ShedAtEnd():
+                    found["shedding_seconds"] = time.perf_counter() - found.pop("began")
+                    found["shed"], found["held_out_after"] = asdict(event), look()
+
+        training.coordinator.announce.subscribe(listen)
+        training.trainer.train()
+    found |= {"threads": torch.get_num_threads(), "versions": asdict(describe_versions())}
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps({"scene": settings.scene, **found}, indent=1) + "\n")
+    args.out.write_text(json.dumps({"scene": plan.settings.scene, **found}, indent=1) + "\n")
     print(json.dumps(found, indent=1))
-
-
-def _train(job: Job, folder: Path) -> dict:
-    training = set_up(job, folder)
-    found: dict = {}
-
-    def look() -> dict[str, float | None]:
-        scores = [score(drawn) for drawn in draw_held_out(training.pipeline)]
-        return {
-            name: mean([getattr(each, name) for each in scores]) for name in ("psnr_merged", "ssim_merged")
-        }
-
-    def listen(event: Event) -> None:
-        match event:
-            case Shedding(done=0):
-                found["training_seconds"] = training.stopwatch.seconds
-                found["held_out_before"], found["began"] = look(), time.perf_counter()
-            case ShedAtEnd():
-                found["shedding_seconds"] = time.perf_counter() - found.pop("began")
-                found["shed"], found["held_out_after"] = asdict(event), look()
-
-    training.coordinator.announce.subscribe(listen)
-    training.trainer.train()
-    versions = asdict(describe_versions())
-    return {**found, "threads": torch.get_num_threads(), "versions": versions}
 
 
 if __name__ == "__main__":
