@@ -9,14 +9,14 @@ from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.findings import find_growth
 from abcd_ns.lab.results.records import decode, encode, read_json
-from abcd_ns.lab.results.results import Arm, Results, read_results
+from abcd_ns.lab.results.results import Arm, Results
 from abcd_ns.lab.results.run import Failure, Footing, Run
 from abcd_ns.lab.results.tables import notes, rows, write_table
 from abcd_ns.lab.scale.charts import draw_scale
 from abcd_ns.lab.scale.command import make_plan, scale
 from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings, run
 from abcd_ns.lab.world.land import Land, color_of
-from tests.lab.compare.records import made_up, made_up_run
+from tests.lab.compare.records import made_up, made_up_run, read_results
 from tests.lab.in_process import jobs_in_this_process
 
 MIB = 2**20

@@ -1,11 +1,9 @@
 """results.json: everything that an experiment found, with what is needed to do it again."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 
 from abcd_ns.lab.job import Settings
-from abcd_ns.lab.results.records import encode, read_record, write_json
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.machine import Machine, Versions
 
@@ -136,21 +134,3 @@ class Results:
     def runs(self) -> tuple[Run, ...]:
         """Of all arms."""
         return tuple(run for arm in self.arms for run in arm.runs)
-
-
-def write_results(path: Path, results: Results) -> None:
-    """Write results.json.
-
-    Raises:
-        ValueError: a number is NaN or infinite.
-    """
-    write_json(path, encode(results))
-
-
-def read_results(path: Path) -> Results:
-    """Read results.json back.
-
-    Raises:
-        RecordError: it is absent, of another schema, or does not fit the schema.
-    """
-    return read_record(path, Results, SCHEMA)

@@ -9,7 +9,8 @@ from rich.console import Console
 
 from abcd_ns.lab.job import Job, Plan, Settings
 from abcd_ns.lab.results.findings import findings_of
-from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Results, write_results
+from abcd_ns.lab.results.records import encode, write_json
+from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Results
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.results.tables import TABLE_FILE, print_table, write_table
 from abcd_ns.lab.runs.runner import claim, finish_job
@@ -35,7 +36,7 @@ def carry_out(
         overwrite: drop the runs that the plan's folder holds.
     """
     for results in run_jobs(plan, console, overwrite, leave_out):
-        write_results(plan.out / RESULTS_FILE, results)  # each time: a long one may be interrupted
+        write_json(plan.out / RESULTS_FILE, encode(results))  # each time: a long one may be interrupted
     report(results, plan.out, console, draw)
     return 1 if results.failures else 0
 
@@ -90,7 +91,7 @@ def new_results(kind: str, command: str, machine: Machine, **fields) -> Results:
 
 def write_report(results: Results, out: Path, draw: Draw) -> list[Path]:
     """Write results.json, table and charts; returns their paths."""
-    write_results(out / RESULTS_FILE, results)
+    write_json(out / RESULTS_FILE, encode(results))
     write_table(results, out / TABLE_FILE)
     return [out / RESULTS_FILE, out / TABLE_FILE, *draw(results, out)]
 

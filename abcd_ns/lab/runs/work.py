@@ -14,13 +14,13 @@ RUN_FILE = "run.json"
 """Written when all is done, beside the job."""
 
 
-def work(kind: type[Job], do: Callable[..., Run], args: list[str] | None = None) -> int:
+def work(kind: type[Job], do: Callable[..., Run]) -> int:
     """Do the job in the file named by the only argument; exit code 0, or 2 for an error of the user's.
 
     Args:
         do: given the job and its folder.
     """
-    (path,) = map(Path, sys.argv[1:] if args is None else args)
+    (path,) = map(Path, sys.argv[1:])
     job = decode(kind, read_json(path), str(path))
     try:
         found = do(job, path.resolve().parent)

@@ -138,10 +138,5 @@ def _record(
     )
 
 
-def main(args: list[str] | None = None) -> int:
-    """Do the job in the file named by the only argument; exit code 0, or 2 for an error of the user's."""
-    return work(Job, run, args)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(work(Job, run))

@@ -1,15 +1,21 @@
 """Made-up runs for tests of what experiments write. No number here was ever measured."""
 
 import dataclasses
+from pathlib import Path
 
 from abcd_ns.lab.job import Settings
 from abcd_ns.lab.results.findings import findings_of
+from abcd_ns.lab.results.records import read_record
 from abcd_ns.lab.results.results import SCHEMA, Arm, LeftOut, Results
 from abcd_ns.lab.results.run import CurvePoint, Failure, Run, ViewScore
 from abcd_ns.machine import Machine, Versions
 
 MACHINE = Machine(cpu="Made-up CPU", cores=2, torch_threads=2, ram_bytes=8 << 30, gpu=None, os="Linux x86_64")
 VERSIONS = Versions(python="3.11", torch="2.11", nerfstudio="1.1.5", gsplat="1.4.0", abcd_ns="0", commit=None)
+
+
+def read_results(path: Path) -> Results:
+    return read_record(path, Results, SCHEMA)
 
 
 def made_up_run(method: str = "abcd", seed: int = 0, psnr: float = 24.0, speed: float = 1.0, **fields) -> Run:

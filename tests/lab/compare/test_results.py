@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.lab.compare.command import Options
-from abcd_ns.lab.results.records import RecordError, decode, encode
-from abcd_ns.lab.results.results import SCHEMA, read_results, write_results
+from abcd_ns.lab.results.records import RecordError, decode, encode, write_json
+from abcd_ns.lab.results.results import SCHEMA
 from abcd_ns.lab.results.run import CurvePoint, Run
 from abcd_ns.lab.runs.evaluate import mean, ordering_gap
 from abcd_ns.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
-from tests.lab.compare.records import made_up_results, made_up_run
+from tests.lab.compare.records import made_up_results, made_up_run, read_results
 
 RUN = ("arms", 0, "runs", 0)
 finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
@@ -33,7 +33,7 @@ def test_results_come_back_as_they_were_written(tmp_path_factory, psnr, gap, gau
     fields = {"ordering_gap_db": gap, "gaussians": gaussians, "curve": points, "lpips_reason": reason}
     results = made_up_results(made_up_run(**fields), made_up_run("abcd-monolithic", psnr=psnr))
 
-    write_results(path, results)
+    write_json(path, encode(results))
 
     assert read_results(path) == results
 
@@ -42,14 +42,14 @@ def test_results_come_back_as_they_were_written(tmp_path_factory, psnr, gap, gau
 def test_no_number_that_json_lacks_is_written(tmp_path, number):
     bad = made_up_run(curve=(CurvePoint(1.0, 1, 20.0), CurvePoint(2.0, 2, number)))
     with pytest.raises(ValueError, match=r"arms\[0\]\.runs\[1\]\.curve\[1\]\.psnr is (nan|-?inf)"):
-        write_results(tmp_path / "results.json", made_up_results(made_up_run(), bad))
+        write_json(tmp_path / "results.json", encode(made_up_results(made_up_run(), bad)))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("constant", ["NaN", "Infinity", "-Infinity"])
 def test_no_number_that_json_lacks_is_read(tmp_path, constant):
     path = tmp_path / "results.json"
-    write_results(path, made_up_results(made_up_run(ssim=0.875)))
+    write_json(path, encode(made_up_results(made_up_run(ssim=0.875))))
     path.write_text(path.read_text().replace("0.875", constant))
     with pytest.raises(RecordError, match="is not JSON"):
         read_results(path)

@@ -14,13 +14,12 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, carry_out, impossible, make_plan
 from abcd_ns.lab.job import Job, Plan
 from abcd_ns.lab.results.records import encode
-from abcd_ns.lab.results.results import read_results
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.runs import runner
 from abcd_ns.lab.runs.experiment import run_jobs
 from abcd_ns.lab.runs.runner import last_line
 from tests.lab.compare.fake_worker import FakeWorker
-from tests.lab.compare.records import MACHINE
+from tests.lab.compare.records import MACHINE, read_results
 
 
 @pytest.fixture

@@ -10,14 +10,14 @@ from rich.progress import Progress
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.findings import headline
-from abcd_ns.lab.results.results import Curve, Line, Outcome, Results, read_results
+from abcd_ns.lab.results.results import Curve, Line, Outcome, Results
 from abcd_ns.lab.runs.experiment import write_report
 from abcd_ns.lab.stability.charts import draw_curves
 from abcd_ns.lab.stability.command import KIND, SCENARIOS, Meter, carry_out, choose
 from abcd_ns.lab.stability.curves import studies
 from abcd_ns.lab.stability.lab import Lab
 from abcd_ns.lab.stability.outcome import Finding, Scenario, against_one_block
-from tests.lab.compare.records import made_up
+from tests.lab.compare.records import made_up, read_results
 
 GOOD = Outcome(
     "A1", "NaN | in splats", "NaN put in", "mended", True, False, {"abcd": "fine"}, {"lost": 0.1}, 2.0

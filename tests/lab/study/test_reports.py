@@ -11,12 +11,14 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Plan
 from abcd_ns.lab.results.findings import find_difference, find_gap
 from abcd_ns.lab.results.frontier import LIMIT, MCMC, PRICE, curves, fewest_near_best, psnr_at
-from abcd_ns.lab.results.results import Arm, read_results, write_results
+from abcd_ns.lab.results.records import encode, write_json
+from abcd_ns.lab.results.results import Arm
 from abcd_ns.lab.results.tables import notes, rows, write_table
 from abcd_ns.lab.runs import runner
 from abcd_ns.lab.study.charts import draw_study
 from abcd_ns.lab.study.command import BlocksStudy, OptionsStudy, carry_out
 from tests.lab.compare.fake_worker import FakeWorker
+from tests.lab.compare.records import read_results
 from tests.lab.in_process import jobs_in_this_process
 from tests.lab.study.records import (
     blocks_study,
@@ -290,7 +292,7 @@ def test_another_kind_of_study_is_refused(conditions):
 @pytest.mark.parametrize("make", STUDIES)
 def test_results_come_back_as_they_were_written(make, tmp_path):
     study = make((0, 1))
-    write_results(tmp_path / "results.json", study)
+    write_json(tmp_path / "results.json", encode(study))
     assert read_results(tmp_path / "results.json") == study
 
 
