@@ -1,26 +1,15 @@
 """Decides which folder each photo is read from, and checks all of them before training."""
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
 from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.photos import PhotoSource
 from abcd_ns.data.picture_files import SUFFIXES, check_complete, is_turned, read_header
 from abcd_ns.data.scene import Frame, Scene
 
 
-@dataclass(frozen=True)
-class PhotoFile:
-    """One photo on disk, and the size it is reduced to after decoding."""
-
-    path: Path
-    stored: tuple[int, int]
-    """(width, height) in the file, EXIF orientation not applied."""
-    reduced: tuple[int, int]
-    """(width, height) after area averaging."""
-
-
-def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoFile], list[str]]:
+def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[str]]:
     """Find and check the photos of all frames.
 
     images_N (N = `factor`) is used where every photo is there in W/N x H/N, rounded either way. Otherwise
@@ -28,7 +17,7 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoFile], list[str]
     reduced copies that can serve are taken.
 
     Returns:
-        (one file per frame, notes for the user).
+        (one source per frame, without undistortion and mask; notes for the user).
 
     Raises:
         InputError: lists every photo that is missing, damaged or of the wrong size.
@@ -61,10 +50,10 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoFile], list[str]
     return _check_folder(copies[of], of, scene.frames, max(factor, of)), notes
 
 
-def assume_photos(scene: Scene, factor: int) -> list[PhotoFile]:
+def assume_photos(scene: Scene, factor: int) -> list[PhotoSource]:
     """The photos as the model describes them, without looking: for viewing and exporting."""
     return [
-        PhotoFile(scene.photo_folder / f.name, f.lens.size, _reduce(f.name, f.lens.size, factor))
+        PhotoSource(scene.photo_folder / f.name, f.lens.size, _reduce(f.name, f.lens.size, factor))
         for f in scene.frames
     ]
 
@@ -82,7 +71,7 @@ def _reduced_folders(scene: Scene) -> dict[int, Path]:
     return found
 
 
-def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> list[PhotoFile]:
+def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> list[PhotoSource]:
     """The files of `frames` in a folder of photos reduced by `of`, to be reduced by `factor` in all."""
     problems, files = Problems(), []
     for frame in frames:
@@ -91,7 +80,7 @@ def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> li
             header = read_header(path)
             _check_size(path, header.size, frame, of)
             check_complete(path, header)
-            files.append(PhotoFile(path, header.size, _reduce(str(path), header.size, factor // of)))
+            files.append(PhotoSource(path, header.size, _reduce(str(path), header.size, factor // of)))
     problems.raise_if_any()
     return files
 

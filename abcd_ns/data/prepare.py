@@ -1,7 +1,7 @@
 """Reads and checks everything that a scene consists of, once for all of its splits."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from torch import Tensor
 from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_model, read_colmap
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
-from abcd_ns.data.photo_folders import PhotoFile, assume_photos, locate_photos
+from abcd_ns.data.photo_folders import assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
 from abcd_ns.data.picture_files import read_header
 from abcd_ns.data.scene import Frame, Lens, Scene, check_layout
@@ -172,7 +172,7 @@ def check_masks(sources: list[PhotoSource]) -> None:
     problems.raise_if_any()
 
 
-def _check_layout_and_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoFile], list[str]]:
+def _check_layout_and_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSource], list[str]]:
     """The photos' files, and notes; both kinds of fault are looked for before either is reported."""
     problems = Problems()
     with problems.collect():
@@ -183,7 +183,7 @@ def _check_layout_and_photos(scene: Scene, factor: int, needed: bool) -> tuple[l
     return found
 
 
-def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoFile], list[str]]:
+def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSource], list[str]]:
     problems = Problems()
     for frame in scene.frames:
         if frame.mask_path is not None:
@@ -200,7 +200,7 @@ def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoFil
     return files, notes
 
 
-def _sources(scene: Scene, files: list[PhotoFile]) -> tuple[list[PhotoSource], list[Lens]]:
+def _sources(scene: Scene, files: list[PhotoSource]) -> tuple[list[PhotoSource], list[Lens]]:
     """Photo sources and final cameras. A lens without distortion is left alone, pixel for pixel."""
     flats, problems = {}, Problems()
     lenses = [frame.lens.resized(*file.reduced) for frame, file in zip(scene.frames, files, strict=True)]
@@ -211,7 +211,7 @@ def _sources(scene: Scene, files: list[PhotoFile]) -> tuple[list[PhotoSource], l
                 flats[lens] = _undistortion(frame, lens) if lens.distorted else None
     problems.raise_if_any()
     sources = [
-        PhotoSource(file.path, file.stored, file.reduced, flats[lens], frame.mask_path)
+        replace(file, undistortion=flats[lens], mask_path=frame.mask_path)
         for frame, file, lens in zip(scene.frames, files, lenses, strict=True)
     ]
     return sources, [flats[lens].pinhole if flats[lens] else lens for lens in lenses]
