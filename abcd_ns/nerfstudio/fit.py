@@ -1,7 +1,6 @@
 """What fits this machine: how many blocks, how much of a photo a step draws, and what is kept in RAM."""
 
 from bisect import bisect_left
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import psutil
@@ -172,22 +171,14 @@ def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
     """As many views in a step, and as much of them, as leave room for Gaussians."""
     training, left = demand.training, _needs(demand, 1, 0, levels_of(2)).left(budget)
     room = PICTURE_SHARE * left
-    views = list(_fewer(views_per_step(training.batch, 2, training.limits.batch_limit)))
-    if training.batch:
-        views = views[:1]
+    most = views_per_step(training.batch, 2, training.limits.batch_limit)
+    views = [most] if training.batch else [most >> halved for halved in range(most.bit_length())]
     for batch in views:
         if _needs(demand, batch, training.limits.crop_pixels, levels=0).step_bytes <= room:
             return batch, training.limits.crop_pixels
     batch = views[-1]
     of_a_pixel = DeviceNeeds(1, batch, drawings=drawings_of(training)).step_bytes
     return batch, training.limits.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
-
-
-def _fewer(views: int) -> Iterator[int]:
-    """Half as many each time, down to one."""
-    while views:
-        yield views
-        views //= 2
 
 
 def _needs(demand: Demand, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:

@@ -174,17 +174,10 @@ def examine(lab: Lab, scenario: Scenario) -> Outcome:
     torch.manual_seed(0)
     began = time.perf_counter()
     found = scenario.run(lab)
-    return Outcome(
-        scenario.id,
-        scenario.fails,
-        scenario.done,
-        scenario.rule,
-        found.passed,
-        found.worse,
-        found.said,
-        {name: float(value) for name, value in found.numbers.items()},
-        round(time.perf_counter() - began, 1),
-    )
+    seconds = round(time.perf_counter() - began, 1)
+    asked = (scenario.id, scenario.fails, scenario.done, scenario.rule)
+    numbers = {name: float(value) for name, value in found.numbers.items()}
+    return Outcome(*asked, found.passed, found.worse, found.said, numbers, seconds)
 
 
 def print_outcome(outcome: Outcome, console: Console) -> None:

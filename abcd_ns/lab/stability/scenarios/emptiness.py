@@ -1,5 +1,7 @@
 """A4, A9: blocks with nothing in them, and blocks that few cameras see or none."""
 
+from dataclasses import replace
+
 import torch
 
 from abcd_ns.engine.space.partition import build_kd
@@ -84,14 +86,7 @@ def few_cameras() -> tuple[Stage, BlockTree]:
     for ball in balls:
         shell = torch.nn.functional.normalize(torch.randn((40, 3), **draw), dim=1) * ball.radius
         points = torch.cat([stage.points, shell.double() + torch.tensor(ball.center)])
-        stage = Stage(
-            stage.views,
-            stage.photos,
-            points,
-            torch.cat([stage.colors, torch.full((40, 3), 128.0)]),
-            stage.held_out,
-            stage.truth,
-        )
+        stage = replace(stage, points=points, colors=torch.cat([stage.colors, torch.full((40, 3), 128.0)]))
     tree = build_kd(torch.zeros(0, 3), 1)
     for depth in (-10.0, -25.0, -35.0):  # the part below a cut keeps its number: name the parts from below
         tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, depth]]))), 2, depth)
