@@ -1,6 +1,7 @@
 """All that belongs to one block: its Gaussians, their Adam moments, growth statistics and clocks."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -77,14 +78,13 @@ class BlockState:
 
     def __getitem__(self, rows: Tensor | slice) -> "BlockState":
         """The Gaussians at `rows` with all that belongs to them; the clocks stay the block's."""
-        return BlockState(
-            self.gaussians[rows],
-            self.exp_avg[rows],
-            self.exp_avg_sq[rows],
-            {name: value[rows] for name, value in self.growth.items()},
-            self.clocks,
-            self.waits[rows],
-        )
+        return self._each(lambda part: part[rows])
+
+    def _each(self, change: Callable[[Any], Any]) -> "BlockState":
+        """With each of its parts changed, but for the clocks."""
+        gaussians, moments = change(self.gaussians), (change(getattr(self, name)) for name in MOMENTS)
+        growth = {name: change(value) for name, value in self.growth.items()}
+        return BlockState(gaussians, *moments, growth, self.clocks, change(self.waits))
 
     def joined_by(self, arrivals: "BlockState") -> "BlockState":
         """This block with the Gaussians of `arrivals` added at the end, moments and statistics included.
@@ -108,14 +108,7 @@ class BlockState:
 
     def to(self, device: torch.device | str) -> "BlockState":
         """On another device."""
-        return BlockState(
-            self.gaussians.to(device),
-            self.exp_avg.to(device),
-            self.exp_avg_sq.to(device),
-            {name: value.to(device) for name, value in self.growth.items()},
-            self.clocks,
-            self.waits.to(device),
-        )
+        return self._each(lambda part: part.to(device))
 
     def packed(self) -> Packed:
         """As it is kept, for the store; clocks as JSON."""

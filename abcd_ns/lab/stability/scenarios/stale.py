@@ -1,5 +1,7 @@
 """Training against old pictures of the other blocks, which the engine refuses: to see what that does."""
 
+from dataclasses import replace
+
 import torch
 
 from abcd_ns.engine.gaussians.block_state import BlockState
@@ -65,9 +67,7 @@ class DampedBlock(LiveBlock):
             return state
         before = self._run.scene.gaussians_at_rest(active.geometry.block)
         mixed = {n: torch.lerp(getattr(before, n), v, self._share) for n, v in state.gaussians.items()}
-        return BlockState(
-            Gaussians(**mixed), state.exp_avg, state.exp_avg_sq, state.growth, state.clocks
-        )  # moments are of the path, not of where it ends
+        return replace(state, gaussians=Gaussians(**mixed))  # moments are of the path, not of where it ends
 
 
 def stale_coordinator(run: TrainingRun, every: int, damping: float = 1.0) -> Coordinator:
