@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from abcd_ns.engine.render.projection import Splats, pack, project_packed
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 
 
@@ -34,6 +35,11 @@ def small_view(width: int = 37, height: int = 21, dtype: torch.dtype = torch.flo
     viewmat[:3, 3] = torch.tensor([-0.3, 0.1, 0.2])
     K = torch.tensor([[0.8 * width, 0, width / 2 + 1], [0, 1.3 * height, height / 2 - 1], [0, 0, 1]])
     return View(viewmat, K, width, height).to(dtype)
+
+
+def project(gaussians: Gaussians, view: View, **options) -> Splats:
+    """As the torch rasterizer does, with gradients."""
+    return project_packed(pack(gaussians), view, **options)
 
 
 def as_leaves(gaussians: Gaussians) -> Gaussians:

@@ -123,36 +123,19 @@ def project_packed(
     built: bool = True,
     primitive: Primitive = SPLATS,
 ) -> Splats:
-    """See `project`; of packed Gaussians."""
-    camera = camera_numbers(view, parameters, sh_degree, antialiased)
-    if camera.requires_grad and torch.is_grad_enabled():
-        return Splats(primitive.project.function(parameters, camera)[0])
-    return Splats(_Splat.apply(parameters, camera, primitive, built))
-
-
-def project(
-    gaussians: Gaussians,
-    view: View,
-    *,
-    sh_degree: int = 0,
-    antialiased: bool = False,
-    built: bool = True,
-    primitive: Primitive = SPLATS,
-) -> Splats:
     """Project Gaussians into a view; differentiable in the Gaussians, and in the pose if it takes gradients.
 
     Args:
+        parameters: see `pack`.
         sh_degree: the degree of spherical harmonics in use.
         antialiased: multiply opacities by sqrt(det(cov) / det(cov + blur)), as in Mip-Splatting.
         built: use machine code where it is there.
         primitive: what a Gaussian is.
-
-    Raises:
-        ValueError: `sh_degree` is above 3, or above what the Gaussians hold.
     """
-    check_degree(gaussians, sh_degree)
-    options = {"sh_degree": sh_degree, "antialiased": antialiased, "built": built, "primitive": primitive}
-    return project_packed(pack(gaussians), view, **options)
+    camera = camera_numbers(view, parameters, sh_degree, antialiased)
+    if camera.requires_grad and torch.is_grad_enabled():
+        return Splats(primitive.project.function(parameters, camera)[0])
+    return Splats(_Splat.apply(parameters, camera, primitive, built))
 
 
 def check_degree(gaussians: Gaussians, sh_degree: int) -> None:

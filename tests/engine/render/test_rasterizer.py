@@ -13,7 +13,6 @@ from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
 from abcd_ns.engine.render.cpu import binning
 from abcd_ns.engine.render.cpu.binning import bin_splats
-from abcd_ns.engine.render.projection import project
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
@@ -22,6 +21,7 @@ from tests.reference.rasterizer_scenes import (
     as_leaves,
     gradients,
     probe,
+    project,
     random_gaussians,
     relative_error,
     small_view,

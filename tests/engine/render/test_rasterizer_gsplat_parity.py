@@ -6,10 +6,9 @@ from gsplat import DefaultStrategy
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 
 from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.render.projection import project
 from abcd_ns.engine.render.splat_kernels import COV_XX, COV_YY
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from tests.reference.rasterizer_scenes import as_leaves, random_gaussians, relative_error, small_view
+from tests.reference.rasterizer_scenes import as_leaves, project, random_gaussians, relative_error, small_view
 
 VIEW = small_view()
 

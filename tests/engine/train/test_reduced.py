@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.render.projection import project
 from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.schedule import reduction_at
 from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Crop, View
+from tests.reference.rasterizer_scenes import project
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
 
 
