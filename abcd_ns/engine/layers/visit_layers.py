@@ -22,6 +22,8 @@ BYTES_PER_PIXEL = 32
 """Of a front and a back layer in float32."""
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
+CROP_ALIGN = 16
+"""Crops begin and end on multiples of so many pixels, or at the image's edge."""
 
 
 @dataclass(frozen=True)
@@ -38,18 +40,12 @@ class VisitGeometry:
         return tuple(sorted(self.crops))
 
 
-def survey(
-    gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: Rasterizer, *, align: int = 16
-) -> VisitGeometry:
-    """Which views see the block's Gaussians, and where in the image.
-
-    Args:
-        align: crops begin and end on multiples of this, pixels (or at the image's edge).
-    """
+def survey(gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: Rasterizer) -> VisitGeometry:
+    """Which views see the block's Gaussians, and where in the image."""
     views = tuple(views)
     extents = rasterizer.extents(gaussians, views).tolist() if views else []
     crops = {
-        view.index: footprint(extent, view, margin=CROP_MARGIN, align=align)
+        view.index: footprint(extent, view, margin=CROP_MARGIN, align=CROP_ALIGN)
         for view, extent in zip(views, extents, strict=True)
     }
     return VisitGeometry(block, {view: crop for view, crop in crops.items() if crop is not None})

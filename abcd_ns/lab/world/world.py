@@ -182,10 +182,8 @@ def camera(
     return View(pose.float(), K, width, height, index)
 
 
-def ring(
-    count: int, *, turn: float = 0.0, radius: float = 1.0, size: tuple[int, int] = (48, 36)
-) -> list[View]:
-    """Cameras on a circle, at three heights in turn, all looking at the middle.
+def ring(count: int, *, turn: float = 0.0, size: tuple[int, int] = (48, 36)) -> list[View]:
+    """Cameras on the unit circle, at three heights in turn, all looking at the middle.
 
     Args:
         turn: by how much of the step from camera to camera all are turned.
@@ -193,7 +191,7 @@ def ring(
     views = []
     for index in range(count):
         angle = 2 * math.pi * (index + turn) / count
-        eye = (radius * math.cos(angle), radius * math.sin(angle), 0.15 + 0.2 * (index % 3))
+        eye = (math.cos(angle), math.sin(angle), 0.15 + 0.2 * (index % 3))
         views.append(camera(eye, (0.0, 0.0, 0.0), index, size))
     return views
 

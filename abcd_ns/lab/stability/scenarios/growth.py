@@ -14,7 +14,7 @@ from abcd_ns.engine.train.density.control import (
     DensityControl,
 )
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
-from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_visit
+from abcd_ns.engine.train.schedule import DEFAULT_BATCH, passes_of_sweep, views_per_visit
 from abcd_ns.lab.stability.lab import Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.scenarios.freshness import objectives
@@ -84,12 +84,10 @@ def resets(lab: Lab) -> Finding:
     return Finding(numbers["worst rise abcd"] <= ALLOWED_RISE, said, numbers)
 
 
-def refinements(
-    cameras: int, sweep: int, config: DensityConfig, *, batch: int = 4, limit: int = VIEWS
-) -> int:
+def refinements(cameras: int, sweep: int) -> int:
     """How often a block that `cameras` see is refined in one visit, once it is warm."""
-    control = DensityControl(config)
-    used = views_per_visit(cameras, cameras, limit)
+    control, batch = DensityControl(DensityConfig()), DEFAULT_BATCH
+    used = views_per_visit(cameras, cameras, VIEWS)
     steps = -(-passes_of_sweep(sweep, PASSES, PASSES, used) * used // batch)
     views, done = min(cameras, steps * batch), 10 * max(cameras, 1)
     clocks = [
@@ -114,7 +112,7 @@ def splatfacto_refines(cameras: int, steps: int = 15_000) -> int:
 )
 def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no training
     """A7: the schedule alone, for captures of 1 to 15,000 photos."""
-    least = {cameras: min(refinements(cameras, s, DensityConfig()) for s in range(6)) for cameras in CAMERAS}
+    least = {cameras: min(refinements(cameras, s) for s in range(6)) for cameras in CAMERAS}
     never = [cameras for cameras in CAMERAS if splatfacto_refines(cameras) == 0]
     used = {cameras: views_per_visit(cameras, cameras, VIEWS) for cameras in CAMERAS}
     too_short = [c for c, views in used.items() if passes_of_sweep(0, PASSES, PASSES, views) * views < 30]
