@@ -35,7 +35,10 @@ def train(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         print(USAGE)
         return 0
-    command = [_find_ns_train(), *command_line(Path(words[0])), *words[1:]]
+    ns_train = find_ns_train()
+    if ns_train is None:
+        raise UserError("There is no ns-train here; install nerfstudio into this environment.")
+    command = [ns_train, *command_line(Path(words[0])), *words[1:]]
     os.execv(command[0], command)
 
 
@@ -62,9 +65,7 @@ def _flags(table: Mapping[str, Any], prefix: str, path: Path) -> Iterator[str]:
             raise UserError(f"{path}: {name} is a list or a date; an option has a single value.")
 
 
-def _find_ns_train() -> str:
-    beside = Path(sys.executable).parent / "ns-train"
-    found = str(beside) if beside.exists() else shutil.which("ns-train")
-    if found is None:
-        raise UserError("There is no ns-train here; install nerfstudio into this environment.")
-    return found
+def find_ns_train() -> str | None:
+    """The command beside this Python, or else on the PATH."""
+    beside = Path(sys.executable).with_name("ns-train")
+    return str(beside) if beside.exists() else shutil.which("ns-train")

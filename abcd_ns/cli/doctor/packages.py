@@ -2,15 +2,14 @@
 
 import importlib
 import platform
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from pathlib import Path
 
 from abcd_ns import __version__
+from abcd_ns.cli.train import find_ns_train
 from abcd_ns.errors import IMPORT_TROUBLE
 from abcd_ns.machine import own_commit, package_version
 
@@ -58,7 +57,6 @@ def look_at_packages(done: Callable[[], None]) -> Packages:
         broken[EXPORT] = error
     done()
     methods = {entry.name for entry in entry_points(group="nerfstudio.method_configs")}
-    beside = Path(sys.executable).with_name("ns-train")
     return Packages(
         abcd_ns=__version__,
         commit=own_commit(),
@@ -67,7 +65,7 @@ def look_at_packages(done: Callable[[], None]) -> Packages:
         ray=package_version(RAY),
         broken=broken,
         registered="abcd" in methods,
-        has_ns_train=beside.exists() or shutil.which("ns-train") is not None,
+        has_ns_train=find_ns_train() is not None,
     )
 
 
