@@ -117,7 +117,7 @@ class Health:
         self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
             return True, self._psnr
-        self._count("gradients", int(self._bad.sum()))
+        self.count("gradients", int(self._bad.sum()))
         self._bad = None
         self._mend()
         return False, self._psnr
@@ -138,7 +138,7 @@ class Health:
             return
         scales[rows] = torch.where(over[rows], allowed[rows], scales[rows])
         self._forget_moments("scales", rows)
-        self._count("giants", len(rows))
+        self.count("giants", len(rows))
 
     def end_visit(self, active: ActiveVisit, detach: Callable[[], BlockState]) -> BlockState:
         """What the visit leaves behind: the live block, mended, or the block as it was before.
@@ -163,9 +163,14 @@ class Health:
         record.damping = min(2 * record.damping, 1.0)
         return state
 
-    def count_shed(self, count: int) -> None:
-        """So many Gaussians of the live block were taken out, since they filled too little of its views."""
-        self._count("shed", count)
+    def count(self, what: str, count: int) -> None:
+        """So much of the live block had to be mended; see BlockHealth for what."""
+        if count:
+            record, active = self._record, self._active
+            setattr(record, what, getattr(record, what) + count)
+            alone = active is None or active.is_whole
+            number = 0 if active is None else active.number
+            self._announce(Mended(number, None if alone else active.geometry.block, what, count))
 
     def look_over(self) -> None:
         """Mend all that is no number in the live block; call when a visit ends, and before saving."""
@@ -200,7 +205,7 @@ class Health:
         bad = ~torch.isfinite(gradient.square()).flatten(1).all(dim=1)
         gradient[bad] = 0.0
         if self._bad is not None and self._bad.shape != bad.shape:  # another block, in exact joint training
-            self._count("gradients", int(self._bad.sum()))
+            self.count("gradients", int(self._bad.sum()))
             self._bad = None
         self._bad = bad if self._bad is None else self._bad | bad
 
@@ -212,7 +217,7 @@ class Health:
                 if moment in adam and not math.isfinite(float(torch.linalg.vector_norm(adam[moment]))):
                     bad = ~torch.isfinite(adam[moment]).flatten(1).all(dim=1)
                     adam[moment][bad] = 0.0
-                    self._count("moments", int(bad.sum()))
+                    self.count("moments", int(bad.sum()))
         live = live_gaussians(self._params)
         rows = unsound(live).nonzero()[:, 0]
         if len(rows) == 0:
@@ -221,7 +226,7 @@ class Health:
         for name, value in live.items():
             value[rows] = getattr(sound, name).to(value)
             self._forget_moments(name, rows)
-        self._count("values", len(rows))
+        self.count("values", len(rows))
 
     def _known(self, live: Gaussians, rows: Tensor) -> Gaussians:
         """Numbers for `rows`: as they are at rest where rows still are what they were, else stand-ins."""
@@ -268,7 +273,7 @@ class Health:
                 self._skips = False
                 self._guard.stop()
                 self._mend()
-            self._count("gradients", skipped)
+            self.count("gradients", skipped)
 
     def _note_losses(self, views: Sequence[int], losses: Sequence[float]) -> None:
         for view, loss in zip(views, losses, strict=True):
@@ -281,11 +286,3 @@ class Health:
     def _record(self) -> BlockHealth:
         block = WHOLE if self._active is None else self._active.geometry.block
         return self._ledger.setdefault(block, BlockHealth())
-
-    def _count(self, what: str, count: int) -> None:
-        if count:
-            record, active = self._record, self._active
-            setattr(record, what, getattr(record, what) + count)
-            alone = active is None or active.is_whole
-            number = 0 if active is None else active.number
-            self._announce(Mended(number, None if alone else active.geometry.block, what, count))

@@ -95,7 +95,7 @@ class LiveBlock:
         run, before = self._run, len(self)
         options = {"views": self._views, "progress": run.share}
         self.growth = run.density.shed(run.params, run.optimizers, self.growth, **options)
-        run.health.count_shed(before - len(self))
+        run.health.count("shed", before - len(self))
 
     def lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""
