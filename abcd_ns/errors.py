@@ -14,6 +14,11 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or "DefaultCPUAllocator: can't allocate memory" in str(error)
 
 
+def first_line(error: BaseException) -> str:
+    """Of what it says, or else its kind."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
 IMPORT_TROUBLE = (ImportError, OSError, RuntimeError, AttributeError, TypeError, ValueError)
 """What imports end with where packages or system libraries are missing or do not fit together."""
 

@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import Any
 
 from abcd_ns.cluster.lease import WorkersError
+from abcd_ns.errors import first_line
 
 MISSING = "Workers need Ray, which is not installed: pip install 'abcd-ns[cluster]'."
 LOOPBACK = "127.0.0.1"
@@ -52,11 +53,10 @@ def connect(address: str | None, *, cores: int, object_store_bytes: int | None =
         except Exception as error:
             with suppress(Exception):
                 ray.shutdown()
-            first = (str(error).strip() or type(error).__name__).splitlines()[0]
             if address is not None:
-                raise WorkersError(f"No Ray cluster answers at {address}: {first}") from error
+                raise WorkersError(f"No Ray cluster answers at {address}: {first_line(error)}") from error
             if attempt == STARTS - 1:
-                raise WorkersError(f"No Ray could be started here: {first}") from error
+                raise WorkersError(f"No Ray could be started here: {first_line(error)}") from error
 
 
 def keep_to_ourselves(starts: bool) -> None:

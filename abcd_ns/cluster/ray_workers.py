@@ -38,7 +38,7 @@ from abcd_ns.engine.events import StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.errors import UserError, is_out_of_memory
+from abcd_ns.errors import UserError, first_line, is_out_of_memory
 
 SILENCE, SLOW_START = 60.0, 600.0
 """Seconds after which a worker that does not answer, or does not begin, counts as lost."""
@@ -216,7 +216,7 @@ class RayWorkers(Members[Remote]):
                 return self._replace(member, "out of memory")
             raise _as_user_error(error, member.number) from error
         except RayError as error:
-            return self._replace(member, _first_line(error))
+            return self._replace(member, first_line(error))
         member.asked, lease = None, member.put_down()
         if not member.ready:
             member.ready, member.pid, self._failed_starts = True, answer, 0
@@ -239,13 +239,9 @@ class RayWorkers(Members[Remote]):
         return lost
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
-
-
 def _no_room(error: Exception) -> WorkersError:
     return WorkersError(
-        f"Ray has no room for a block: {_first_line(error)}. Free the disk of Ray's folder (RAY_TMPDIR "
+        f"Ray has no room for a block: {first_line(error)}. Free the disk of Ray's folder (RAY_TMPDIR "
         "says where), or start a cluster with a larger --object-store-memory."
     )
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 import pycolmap
 
-from abcd_ns.errors import UserError
+from abcd_ns.errors import UserError, first_line
 
 ENOUGH = 0.9
 """Once so large a share of the photos has a pose, no other focal length is tried."""
@@ -100,8 +100,7 @@ def find_poses(task: Task, show: Callable[[Progress], None]) -> Model | None:
             show(_progress(task, Stage(stage.value), posed.value))
         return found.result()
     except (RuntimeError, ValueError, IndexError, OSError) as error:
-        reason = str(error).strip().splitlines() or [type(error).__name__]
-        raise UserError(f"pycolmap could not find poses: {reason[0]}.") from error
+        raise UserError(f"pycolmap could not find poses: {first_line(error)}.") from error
     finally:
         for process in multiprocessing.active_children():  # pycolmap does not listen to Ctrl-C
             process.kill()

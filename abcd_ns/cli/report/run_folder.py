@@ -18,7 +18,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.parameter_store import StoreError
 from abcd_ns.engine.train.density.shedding import WEIGHED
 from abcd_ns.engine.train.run_state import RunState
-from abcd_ns.errors import UserError
+from abcd_ns.errors import UserError, first_line
 from abcd_ns.lab.results.records import read_record
 from abcd_ns.lab.runs.configs import registered
 from abcd_ns.lab.runs.options import set_options
@@ -189,8 +189,8 @@ def _newest(folder: Path) -> Checkpoint | None:
         tree = BlockTree.from_json(content["pipeline"]["_model._extra_state"]["tree"])
         return Checkpoint(path, int(content["step"]) + 1, content["pipeline"], tree)
     except _DAMAGE as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"{path} cannot be read ({reason}); remove it to use an earlier one.") from None
+        why = f"{path} cannot be read ({first_line(error)}); remove it to use an earlier one."
+        raise UserError(why) from None
 
 
 def _read_store(
