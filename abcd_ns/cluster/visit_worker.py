@@ -1,11 +1,10 @@
 """Trains single visits of somebody else's run, on parameters of its own."""
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 from torch.nn import Parameter
 
 from abcd_ns.cluster.lease import VisitOutcome, VisitTask
@@ -19,9 +18,10 @@ from abcd_ns.engine.store.lent_scene import LentScene
 from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
+from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
-from abcd_ns.engine.train.step.batch import Batch, Sample, Target
+from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians, View
 
@@ -53,8 +53,8 @@ class RunSetup:
     layer_room: LayerRoom
 
 
-class OnLease:
-    """The terms of a visit that somebody else has decided on; see Visits."""
+class OnLease(Visits):
+    """The terms of a visit that somebody else has decided on."""
 
     def __init__(self, run: TrainingRun, task: VisitTask, begun: int) -> None:
         self._run, self._task, self._begun = run, task, begun
@@ -72,15 +72,6 @@ class OnLease:
         config, live = self._run.config, len(self._run.params["means"])
         left = 0 if self._task.allowance is None else self._task.allowance - (live - self._begun)
         return config.room((config.density.limit or 0) - left, live, self._task.tree.num_blocks)
-
-    def compared(
-        self,
-        batch: Batch,  # noqa: ARG002 - all alike
-        pictures: Sequence[Tensor],
-        photos: Sequence[Tensor],
-    ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """Everything."""
-        return pictures, photos
 
 
 class VisitWorker:

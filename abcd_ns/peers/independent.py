@@ -36,7 +36,7 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest, join
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import BlockName, initial_of
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.planner import NothingSeenError
+from abcd_ns.engine.train.planner import NothingSeenError, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
 from abcd_ns.engine.train.schedule import plan_sweep
@@ -129,8 +129,8 @@ class Surfaces:
         return torch.where(alpha > 0.5, shown, BEYOND).float().cpu()
 
 
-class BlocksAlone:
-    """Visits each block once, in its enlarged cell, for its share of the budget; see `Visits`."""
+class BlocksAlone(Visits):
+    """Visits each block once, in its enlarged cell, for its share of the budget."""
 
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._scene = run, run.scene

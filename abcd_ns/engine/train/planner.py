@@ -60,12 +60,16 @@ class Visits(Protocol):
         """Gaussians that may be added to the block; None for any number."""
 
     def compared(
-        self, batch: Batch, pictures: Sequence[Tensor], photos: Sequence[Tensor]
+        self,
+        batch: Batch,  # noqa: ARG002 - all alike
+        pictures: Sequence[Tensor],
+        photos: Sequence[Tensor],
     ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """What the loss compares: pictures and photos, as far as they say something about the block."""
+        """What the loss compares, pictures and photos as far as they say something about the block: all."""
+        return pictures, photos
 
 
-class Planner:
+class Planner(Visits):
     """ABCD's visits: sweeps over all blocks that any view sees, after a warm-up; all that it remembers is in
     the run's state."""
 
@@ -102,15 +106,6 @@ class Planner:
             most = self._config.limits.scaffold_gaussians
             return (most if limit is None else min(most, limit - waiting)) - live
         return self._config.room(run.count(), live, run.blocks)
-
-    def compared(
-        self,
-        batch: Batch,  # noqa: ARG002 - all alike
-        pictures: Sequence[Tensor],
-        photos: Sequence[Tensor],
-    ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """Everything: pictures show the whole scene."""
-        return pictures, photos
 
     def _warm_up(self, sh_degree: int, began: float) -> ActiveVisit:
         """The visit in which the scaffold of all blocks is trained."""
