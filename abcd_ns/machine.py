@@ -135,17 +135,17 @@ def own_commit() -> str | None:
     checkout = Path(abcd_ns.__file__).resolve().parent.parent
     if not (checkout / ".git").exists():
         return None
-    head = _git(checkout, "rev-parse", "HEAD")
+    git = ("git", "-C", str(checkout))
+    head = output_of(*git, "rev-parse", "HEAD")
     if head is None:
         return None
-    return head + ("+changes" if _git(checkout, "status", "--porcelain") else "")
+    return head + ("+changes" if output_of(*git, "status", "--porcelain") else "")
 
 
-def _git(checkout: Path, *words: str) -> str | None:
+def output_of(*command: str) -> str | None:
+    """What a short command prints, without white space around; None where it fails or is not here."""
     try:
-        done = subprocess.run(
-            ["git", "-C", str(checkout), *words], capture_output=True, text=True, check=True, timeout=30
-        )
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -234,13 +235,13 @@ def test_hardware_is_what_others_see(monkeypatch, tmp_path):
 
 
 def test_the_driver_is_read_from_nvidias_tool(monkeypatch):
-    monkeypatch.setattr(hardware.subprocess, "run", lambda *_, **__: SimpleNamespace(stdout="580.1\n580.1\n"))
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(stdout="580.1\n580.1\n"))
     assert hardware._driver() == "580.1"
 
     def absent(*_, **__):
         raise FileNotFoundError
 
-    monkeypatch.setattr(hardware.subprocess, "run", absent)
+    monkeypatch.setattr(subprocess, "run", absent)
     assert hardware._driver() is None
 
 
@@ -302,14 +303,12 @@ def test_an_extension_that_does_not_load_is_a_finding(monkeypatch, tmp_path):
     [("Cuda compilation tools, release 13.0, V13.0.48", "13.0"), ("something else", "unknown")],
 )
 def test_nvcc_says_its_version(monkeypatch, said, version):
-    monkeypatch.setattr(kernels.subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=said))
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=said))
     assert kernels._nvcc() == version
 
 
 def test_it_starts_without_torch():
     """Otherwise it could not say what is wrong with torch."""
-    import subprocess
-
     code = (
         "import sys; sys.modules['torch'] = None\n"
         "from abcd_ns.cli.doctor import command, packages\n"

@@ -3,14 +3,13 @@
 import os
 import platform
 import shutil
-import subprocess
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
 
-from abcd_ns.machine import describe_machine
+from abcd_ns.machine import describe_machine, output_of
 
 OUTPUTS = Path("outputs")
 """Where `ns-train` writes by default."""
@@ -85,9 +84,5 @@ def _gpu() -> Gpu | None:
 
 def _driver() -> str | None:
     """The NVIDIA driver's version, of the first device."""
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        run = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return run.stdout.split()[0] if run.stdout.split() else None
+    said = output_of("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+    return said.split()[0] if said else None

@@ -8,11 +8,12 @@ import logging
 import os
 import re
 import shutil
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+
+from abcd_ns.machine import output_of
 
 EXTENSION = "gsplat_cuda"
 """gsplat's name for what it compiles at first use."""
@@ -139,9 +140,8 @@ def _compiler() -> str | None:
 
 
 def _nvcc() -> str | None:
-    try:
-        run = subprocess.run(["nvcc", "--version"], capture_output=True, text=True, timeout=30, check=True)
-    except (OSError, subprocess.SubprocessError):
+    said = output_of("nvcc", "--version")
+    if said is None:
         return None
-    found = re.search(r"release ([\d.]+)", run.stdout)
+    found = re.search(r"release ([\d.]+)", said)
     return found.group(1) if found else "unknown"
