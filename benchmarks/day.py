@@ -194,9 +194,7 @@ def main(args: Args) -> int:
     ended = [line for line in day.log() if line["kind"] == "end"]
     peak = max(process.peak for process in day.processes)
     found = {
-        "args": {
-            name: str(value) if isinstance(value, Path) else value for name, value in vars(args).items()
-        },
+        "args": vars(args) | {"data": args.data.name, "out": args.out.name},
         "machine": asdict(describe_machine()),
         "versions": asdict(describe_versions()),
         "date": date.today().isoformat(),
@@ -209,8 +207,6 @@ def main(args: Args) -> int:
             asdict(process) | {"rss": process.rss[::10], "peak": process.peak} for process in day.processes
         ],
     }
-    found["args"]["data"] = args.data.name
-    found["args"]["out"] = args.out.name
     (args.out / "day.json").write_text(json.dumps(found, indent=1) + "\n")
     draw(day.processes, args.ram_limit_gb, args.out)
     shutil.copy(day.run / "abcd" / "log.jsonl", args.out / "log.jsonl")
