@@ -277,10 +277,8 @@ class Health:
 
     def _note_losses(self, views: Sequence[int], losses: Sequence[float]) -> None:
         for view, loss in zip(views, losses, strict=True):
-            if math.isfinite(loss):
-                first = self._active.objective.get(view, [loss])[0]
-                seen = view in self._active.objective
-                self._active.objective[view] = [first, loss] if seen else [first]
+            if math.isfinite(loss):  # kept are the first and the last
+                self._active.objective[view] = [*self._active.objective.get(view, ())[:1], loss]
 
     @property
     def _record(self) -> BlockHealth:
