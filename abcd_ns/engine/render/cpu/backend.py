@@ -192,8 +192,11 @@ class TorchRasterizer(Rasterizer):
         found = []
         for k, drawn_in in enumerate(candidates.sheet.grids):
             grid, own = self.window_grid(drawn_in.crop), slice(ends[k], ends[k + 1])
-            held, again = grid.holding(drawn_in, tile[own].long() - firsts[k]).sort(stable=True)
-            found.append(showing(grid, held, z[own][again], weight[own][again], visible))
+            held, of_pairs = tile[own].long() - firsts[k], (z[own], weight[own])
+            if grid != drawn_in:
+                held, again = grid.holding(drawn_in, held).sort(stable=True)
+                of_pairs = tuple(values[again] for values in of_pairs)
+            found.append(showing(grid, held, *of_pairs, visible))
         return found
 
     @torch.no_grad()

@@ -18,7 +18,7 @@ from torch import Tensor
 WEIGHED = ("weight", "looks")
 """What is added up for each Gaussian: its weight, px, and the drawings in which it might have shown."""
 LAST = 0.7
-"""Share of the run after which nothing that fills anything goes, and nobody grows."""
+"""Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 GROWS = 4.0
 """Times its price that a Gaussian fills before it is cloned or split: more than both halves must."""
 PASSES = 4
