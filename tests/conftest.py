@@ -3,7 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 # Threads sleep while they wait: spinning, as is usual, burns a busy machine's time. torch reads it once.
 os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
@@ -13,6 +13,7 @@ import torch
 from hypothesis import settings
 from jaxtyping import config as checks
 from jaxtyping import install_import_hook
+from nerfstudio.configs import external_methods
 
 # Shapes and dtypes in these packages' signatures are checked when they are called. The hook only works on
 # modules that are not imported yet, hence here and not in a fixture.
@@ -21,6 +22,20 @@ install_import_hook(["abcd_ns.engine", "abcd_ns.peers"], "beartype.beartype")
 # The same sums in the same order on any machine, and room for other processes; those that tests start, too.
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"
+
+
+def light_stack() -> list[SimpleNamespace]:
+    """As `inspect.stack()`, of functions' names alone."""
+    frame, found = sys._getframe(1), []
+    while frame is not None:
+        found.append(SimpleNamespace(function=frame.f_code.co_name))
+        frame = frame.f_back
+    return found
+
+
+# nerfstudio asks 26 times who called it. pytest's stack is deep, and `inspect` reads each frame's source and
+# looks for its module among thousands: half of the time that all imports take.
+external_methods.inspect = SimpleNamespace(stack=light_stack)
 
 # derandomize: a failure shows up on every run or on none. No deadline: shared machines stall.
 settings.register_profile("abcd", derandomize=True, deadline=None, max_examples=25, database=None)
