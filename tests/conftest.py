@@ -5,6 +5,14 @@ import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+if sys.dont_write_bytecode:
+    # Where none is wanted beside sources it lies here: tests start dozens of processes, and without bytecode
+    # each compiles nerfstudio and Ray for itself.
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(__file__).resolve().parent.parent / ".pytest_cache" / "bytecode")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+
 # Threads sleep while they wait: spinning, as is usual, burns a busy machine's time. torch reads it once.
 os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
 
