@@ -84,8 +84,14 @@ def page_of(tmp_path, held_out: HeldOut | None = None, notes=(), **settings) -> 
     return text, Page(text)
 
 
-def test_the_headline_says_what_was_measured(tmp_path):
-    text, page = page_of(tmp_path, made_up_held_out())
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory) -> tuple[str, Page]:
+    """The page of a run, with pictures."""
+    return page_of(tmp_path_factory.mktemp("page"), made_up_held_out())
+
+
+def test_the_headline_says_what_was_measured(shown):
+    text, page = shown
     assert page.texts["h1"] == ["made-up"]
     said = [re.sub(r"\s+", " ", found).strip() for found in page.texts["dd"]]
     for value in ("24.00dB", "composited 23.50", "0.800", "45.0dB", "330", "40", "16.0 s", "19% for layers"):
@@ -124,8 +130,8 @@ def test_names_are_text_wherever_they_come_from(tmp_path):
     assert all(image["src"].startswith("data:") for image in page.all("img"))
 
 
-def test_nothing_is_fetched_from_anywhere(tmp_path):
-    text, page = page_of(tmp_path, made_up_held_out())
+def test_nothing_is_fetched_from_anywhere(shown):
+    text, page = shown
     for tag, attributes in page.elements:
         for name in ("src", "href", "xlink:href", "data", "action", "srcset", "poster"):
             assert re.match(r"data:|#", attributes.get(name) or "#"), (tag, name)
@@ -135,16 +141,16 @@ def test_nothing_is_fetched_from_anywhere(tmp_path):
         assert word not in outside
 
 
-def test_only_the_pages_own_script_may_run(tmp_path):
-    _, page = page_of(tmp_path, made_up_held_out())
+def test_only_the_pages_own_script_may_run(shown):
+    _, page = shown
     (policy,) = (meta["content"] for meta in page.all("meta") if "http-equiv" in meta)
     digest = base64.b64encode(hashlib.sha256(page.texts["script"][0].encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in policy
     assert "default-src 'none'" in policy
 
 
-def test_ids_are_unique_and_references_lead_somewhere(tmp_path):
-    text, page = page_of(tmp_path, made_up_held_out())
+def test_ids_are_unique_and_references_lead_somewhere(shown):
+    text, page = shown
     ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
     assert len(ids) == len(set(ids))
     wanted = re.findall(r"url\(#([^)]+)\)", text) + re.findall(r'href="#([^"]+)"', text)
@@ -153,8 +159,8 @@ def test_ids_are_unique_and_references_lead_somewhere(tmp_path):
     assert set(wanted) <= set(ids)
 
 
-def test_charts_are_all_there_and_follow_the_theme(tmp_path):
-    text, page = page_of(tmp_path, made_up_held_out())
+def test_charts_are_all_there_and_follow_the_theme(shown):
+    text, page = shown
     labels = [svg["aria-label"] for svg in page.all("svg") if svg.get("class") != "spark"]
     for title in ("Quality", "Visits", "Gaussians", "Quality by block", "Memory", "Budgets", "From above"):
         assert any(label.startswith(f"Chart: {title}.") for label in labels)
@@ -165,22 +171,22 @@ def test_charts_are_all_there_and_follow_the_theme(tmp_path):
     assert "var(--c-0072b2, #0072b2)" in drawn
 
 
-def test_a_visit_says_what_it_was_where_the_pointer_is(tmp_path):
-    _, page = page_of(tmp_path)
+def test_a_visit_says_what_it_was_where_the_pointer_is(shown):
+    _, page = shown
     assert "block 2, sweep 1: 4.0 s from 8.0 s on, 25% of it for layers, 22.00 dB" in page.texts["title"]
     assert "warm-up of the whole scene, 4.0 s" in page.texts["title"]
 
 
-def test_pictures_can_be_compared_by_keyboard_and_are_described(tmp_path):
-    _, page = page_of(tmp_path, made_up_held_out())
+def test_pictures_can_be_compared_by_keyboard_and_are_described(shown):
+    _, page = shown
     (slider,) = page.all("input")
     assert slider["type"] == "range"
     assert "0000.png" in slider["aria-label"]
     assert all(image["alt"] for image in page.all("img"))
 
 
-def test_blocks_have_a_row_each(tmp_path):
-    _, page = page_of(tmp_path)
+def test_blocks_have_a_row_each(shown):
+    _, page = shown
     rows = [re.sub(r"\s+", " ", found) for found in page.texts["tr"]]
     assert sum("trained" in row and "200" in row for row in rows) == 3
 
