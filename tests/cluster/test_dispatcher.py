@@ -15,18 +15,10 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.engine.types import PARAM_NAMES
-from tests.cluster.conftest import in_process
-from tests.reference.scenes import whole_scene
+from tests.cluster.conftest import GROWING, in_process
+from tests.reference.scenes import equal, listen, whole_scene
 
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4, price=2.0)
 STILL = DensityConfig(strategy="off")
-
-
-def equal(one, other) -> bool:
-    return len(one) == len(other) and all(
-        torch.equal(getattr(one, n), getattr(other, n)) for n in PARAM_NAMES
-    )
 
 
 class Unreliable:
@@ -110,8 +102,7 @@ def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, 
             return workers[-1]
 
         shaken = make(f"shaken {seed}", workers=unreliable, lag=lag, density=GROWING)
-        lost = []
-        shaken.announce.subscribe(lambda e, lost=lost: lost.append(e) if isinstance(e, WorkerLost) else None)
+        lost = listen(shaken, WorkerLost)
         train(shaken, photos)
         assert len(lost) == workers[0].lost > 0
         assert workers[0].answered_late >= shaken.refused
@@ -133,14 +124,13 @@ def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(m
             out.remove(event.block)
             ended.append(event.visit)
 
-    sweeps = []
     run.announce.subscribe(hear)
-    run.announce.subscribe(lambda e: sweeps.append(e.sweep) if isinstance(e, SweepEnded) else None)
+    sweeps = listen(run, SweepEnded)
     train(run, photos)
     assert most > 1
     assert ended == sorted(ended)
     assert not out
-    assert sweeps == list(range(run.state.sweep + 1))
+    assert [event.sweep for event in sweeps] == list(range(run.state.sweep + 1))
     assert run.state.step == 60
 
 

@@ -11,45 +11,23 @@ import pytest
 import torch
 
 from abcd_ns.cluster import forked_workers
-from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
+from abcd_ns.cluster.forked_workers import Failed, ForkedWorkers, can_fork
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import WorkerLost, WorkersSeen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.errors import UserError
-from tests.cluster.conftest import in_process, setup_of
-from tests.cluster.test_dispatcher import equal
-from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+from tests.cluster.conftest import GROWING, make_run, setup_of
+from tests.reference.scenes import equal, listen, whole_scene
 
 pytestmark = pytest.mark.skipif(not can_fork(torch.device("cpu")), reason="needs Linux without a GPU")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4, price=2.0)
-
-
-def make_run(folder, views, workers_of, **options):
-    def kind(run):
-        return Dispatcher(Coordinator(run), workers_of(run), lag=4)
-
-    folder.mkdir(exist_ok=True)
-    options = {"blocks": 6, "steps": 60, "density": GROWING, **options}
-    return make_coordinator(folder, random_gaussians(90, seed=2), views, kind=kind, **options)
-
-
-@pytest.fixture(scope="module")
-def steady(tmp_path_factory, views, photos):
-    """What visits in this very process make of the run."""
-    run = make_run(tmp_path_factory.mktemp("steady"), views, lambda run: in_process(run, photos, 2))
-    train(run, photos)
-    return whole_scene(run)
 
 
 @pytest.fixture
 def make(tmp_path, views, photos):
-    """Makes runs by two workers, which are given photos by `target`."""
+    """Makes the run that `steady` is of, by two workers; `target` is told of each sample."""
 
-    def made(target=lambda _: None, **options):
+    def made(target=lambda _: None):
         def watched(sample):
             target(sample)
             return photos(sample.view.index, sample.crop), None
@@ -57,7 +35,7 @@ def make(tmp_path, views, photos):
         def workers_of(run):
             return ForkedWorkers(2, VisitWorker(setup_of(run), TorchRasterizer(), watched))
 
-        return make_run(tmp_path / "forked", views, workers_of, **options)
+        return make_run(tmp_path / "forked", views, workers_of, lag=4, density=GROWING)
 
     return made
 
@@ -90,11 +68,11 @@ def is_alive(pid: int) -> bool:
 
 
 def test_a_run_is_the_one_that_a_single_process_makes(make, photos, steady):
-    run, seen = make(), []
-    run.announce.subscribe(lambda event: seen.append(event) if isinstance(event, WorkersSeen) else None)
+    run = make()
+    seen = listen(run, WorkersSeen)
     train(run, photos)
-    assert len(steady) > 90  # blocks grew
-    assert equal(steady, whole_scene(run))
+    assert len(steady[0]) > 90  # blocks grew
+    assert equal(steady[0], whole_scene(run))
     visits = [worker.visits for worker in seen[-1].workers]
     assert len(visits) == 2
     assert all(visits)
@@ -102,24 +80,28 @@ def test_a_run_is_the_one_that_a_single_process_makes(make, photos, steady):
 
 
 def test_whoever_is_killed_is_replaced_and_nothing_is_lost(make, photos, steady):
-    run, lost, alive = make(), [], set()
-    run.announce.subscribe(lambda event: lost.append(event) if isinstance(event, WorkerLost) else None)
+    run, alive = make(), set()
+    lost = listen(run, WorkerLost)
     while not run.finished:
         train_step(run, photos)
         if len(lost) < 4 and (pids := run.workers.pids):
             os.kill(pids[0], signal.SIGKILL)
         alive |= set(run.workers.pids)
     assert len(lost) >= 2
-    assert equal(steady, whole_scene(run))
+    assert equal(steady[0], whole_scene(run))
     assert not any(is_alive(pid) for pid in alive)
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
-def test_a_visit_that_had_no_memory_is_lent_again(make, photos, steady, tmp_path, error):
-    run = make(once(tmp_path, raising(error)))
+def test_full_ram_is_a_loss_whoever_says_so(error):
+    assert Failed.of(error) == Failed("out of memory", is_loss=True)
+
+
+def test_a_visit_that_had_no_memory_is_lent_again(make, photos, steady, tmp_path):
+    run = make(once(tmp_path, raising(MemoryError())))
     train(run, photos)
     assert [worker.deaths for worker in run.workers.seen()].count(1) == 1
-    assert equal(steady, whole_scene(run))
+    assert equal(steady[0], whole_scene(run))
 
 
 def test_so_is_one_that_nothing_is_heard_of(make, photos, steady, tmp_path, monkeypatch):
@@ -127,7 +109,7 @@ def test_so_is_one_that_nothing_is_heard_of(make, photos, steady, tmp_path, monk
     run = make(once(tmp_path, lambda: time.sleep(600)))
     train(run, photos)
     assert sum(worker.deaths for worker in run.workers.seen()) == 1
-    assert equal(steady, whole_scene(run))
+    assert equal(steady[0], whole_scene(run))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,14 @@ from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cuda import pairs as gsplat_pairs
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import (
+    Photos,
+    listen,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    whole_scene,
+)
 
 pytestmark = pytest.mark.gpu
 STEPS = 20
@@ -63,8 +70,7 @@ def mean_error(coordinator, views, photos) -> float:
 def test_steps_on_the_device_make_the_photos_more_alike(tmp_path, begin, views, photos, blocks, strategy):
     density = DensityConfig(strategy=strategy, **GROWING)
     coordinator = begin(tmp_path, blocks=blocks, density=density, ownership="fragments")
-    seen = []
-    coordinator.announce.subscribe(lambda event: seen.append(event) if isinstance(event, StepTaken) else None)
+    seen = listen(coordinator, StepTaken)
     before = mean_error(coordinator, views, photos)
     train(coordinator, photos)
     assert len(seen) == STEPS
@@ -78,8 +84,7 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, begin, photo
     if device.type != "cuda":
         pytest.skip("on the CPU rows are cleaned at once")
     coordinator = begin(tmp_path, blocks=1, density=DensityConfig(strategy="off"))
-    told = []
-    coordinator.announce.subscribe(lambda event: told.append(event) if isinstance(event, Mended) else None)
+    told = listen(coordinator, Mended)
     train(coordinator, photos, steps=2)
     optimizer, before = coordinator.optimizers["means"], coordinator.params["means"].detach().clone()
 

@@ -1,7 +1,6 @@
 """Scenes, folders and options may be called anything: no table and no chart breaks."""
 
 import dataclasses
-import xml.etree.ElementTree as ET
 from io import StringIO
 
 import pytest
@@ -15,6 +14,7 @@ from abcd_ns.lab.results.tables import markdown, print_rows
 from abcd_ns.lab.study.charts import draw_study
 from tests.lab.compare.records import made_up_results, made_up_run, made_up_settings
 from tests.lab.study.records import made_up_arm, options_study
+from tests.lab.svg import texts_of
 
 NAMES = st.text("ab |$\\\n\r[]/_^{}#%&<>`*:=", min_size=1, max_size=12)
 MARKDOWN = MarkdownIt("commonmark").enable("table")
@@ -54,7 +54,3 @@ def test_a_studys_changes_are_no_formulae(tmp_path):
     arms = (base.arms[0], made_up_arm(name, None, {0: 23.0}))
     (picture,) = (p for p in draw_study(dataclasses.replace(base, arms=arms), tmp_path) if p.suffix == ".svg")
     assert any(name in text for text in texts_of(picture))
-
-
-def texts_of(path) -> list[str]:
-    return ["".join(node.itertext()) for node in ET.parse(path).iter("{http://www.w3.org/2000/svg}text")]

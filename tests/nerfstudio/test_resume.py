@@ -1,6 +1,7 @@
 """`--load-dir` goes on from where a run was left: by a kill, a signal, a full disk. Or it says why not."""
 
 import random
+import shutil
 import signal
 from pathlib import Path
 
@@ -32,10 +33,18 @@ def trainings() -> Trainings:
     return Trainings()
 
 
+@pytest.fixture(scope="module")
+def broken_off(data, tmp_path_factory) -> Path:
+    """Where a run lies that was broken off, without saving, after its first checkpoint. Read only."""
+    out = tmp_path_factory.mktemp("stopped")
+    run(configure(data, out), stop_after=14)
+    return out
+
+
 @pytest.fixture
-def stopped(data, tmp_path) -> Path:
-    """The folder of a run that was broken off, without saving, after its first checkpoint."""
-    return run(configure(data, tmp_path / "stopped"), stop_after=14).base_dir
+def stopped(broken_off, tmp_path) -> Path:
+    """The folder of that run, copied."""
+    return run_folder(Path(shutil.copytree(broken_off, tmp_path / "stopped")))
 
 
 def assert_same(found: Path, expected: Path) -> None:
@@ -182,10 +191,15 @@ def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stoppe
     sound = checkpoint.read_bytes()
     assert sound.count(means) == 1
     start, draw = sound.index(means), random.Random(0)
+
+    def moved(config):
+        config.output_dir = stopped.parents[2]
+        return config
+
     for offset in (start, start + len(means) - 1, start + draw.randrange(len(means))):
         checkpoint.write_bytes(sound[:offset] + bytes([sound[offset] ^ 4]) + sound[offset + 1 :])
         with pytest.raises((UserError, RuntimeError), match=r"damaged|CRC|corrupt"):
-            eval_setup(stopped / "config.yml")
+            eval_setup(stopped / "config.yml", update_config_callback=moved)
     checkpoint.write_bytes(sound[: len(sound) // 2])
     resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped))
     assert_same(resumed.base_dir, undisturbed)

@@ -15,7 +15,7 @@ from abcd_ns.peers.independent import (
     independent_at_rest,
     independent_trainer,
 )
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, whole_scene
+from tests.reference.scenes import Photos, listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
@@ -26,12 +26,6 @@ def independent(folder, start, views, **options) -> independent_trainer:
     return make_coordinator(
         folder, start, views, kind=independent_trainer, content=independent_at_rest, **options
     )
-
-
-def visits(coordinator) -> list[VisitBegan]:
-    begun = []
-    coordinator.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
-    return begun
 
 
 def test_a_cell_is_enlarged_by_a_share_of_its_extent():
@@ -49,7 +43,7 @@ def test_a_cell_is_enlarged_by_a_share_of_its_extent():
 
 def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(tmp_path, views, photos, start):
     coordinator = independent(tmp_path, start, views, steps=30, density=STILL, batch=1)
-    begun, ended = visits(coordinator), []
+    begun, ended = listen(coordinator, VisitBegan), []
     coordinator.announce.subscribe(
         lambda e: ended.append(coordinator.state.step) if isinstance(e, VisitEnded) else None
     )
@@ -64,8 +58,7 @@ def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(tmp_path, 
 
 def test_a_block_begins_with_its_overlap_and_keeps_its_cell(tmp_path, views, photos, start):
     coordinator = independent(tmp_path, start, views, steps=12, density=STILL)
-    begun, ended = visits(coordinator), []
-    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    begun, ended = listen(coordinator, VisitBegan), listen(coordinator, VisitEnded)
     tree = coordinator.scene.tree
     initial = [coordinator.scene.gaussians(b) for b in range(4)]
     train(coordinator, photos)
@@ -84,7 +77,7 @@ def test_what_others_became_is_nothing_to_a_block(tmp_path, views, photos, start
     for name in ("plain", "spoilt"):
         (tmp_path / name).mkdir()
         coordinator = independent(tmp_path / name, start, views, steps=16, density=STILL, background="black")
-        begun = visits(coordinator)
+        begun = listen(coordinator, VisitBegan)
         while not coordinator.finished:
             train_step(coordinator, photos)
             if name == "spoilt" and len(begun) < 4:
@@ -175,7 +168,7 @@ def test_a_limit_on_gaussians_is_shared_out(tmp_path, views, photos, start):
     limit = len(start) + 20
     density = dataclasses.replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0)
     coordinator = independent(tmp_path, start, views, steps=80, density=density, batch=1)
-    began = visits(coordinator)
+    began = listen(coordinator, VisitBegan)
     most: dict[int, int] = {}
     while not coordinator.finished:
         train_step(coordinator, photos)

@@ -3,6 +3,8 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from types import UnionType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -146,3 +148,15 @@ def whole_scene(coordinator: Coordinator) -> Gaussians:
     """All blocks in one list, in the order of the blocks, on the CPU."""
     scene = coordinator.scene
     return Gaussians.cat([scene.gaussians(block).to("cpu") for block in range(scene.tree.num_blocks)])
+
+
+def equal(one: Gaussians, other: Gaussians) -> bool:
+    """To the last bit, row by row."""
+    return all(torch.equal(value, getattr(other, name)) for name, value in one.items())
+
+
+def listen(trainer: Trainer, kind: type | UnionType) -> list[Any]:
+    """A list of the events of this kind, which grows as they happen."""
+    heard: list[Any] = []
+    trainer.announce.subscribe(lambda event: heard.append(event) if isinstance(event, kind) else None)
+    return heard

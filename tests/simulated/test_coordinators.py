@@ -16,7 +16,7 @@ from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
-from tests.reference.scenes import make_coordinator, whole_scene
+from tests.reference.scenes import listen, make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 
 OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "refine_every": 3}
@@ -73,8 +73,7 @@ def test_what_is_hardly_missed_goes_at_the_end(tmp_path, start, views, photos, m
     target = lambda sample: (photos(sample.view.index, sample.crop).to(DEVICE), None)  # noqa: E731
     options = {"blocks": 2, "steps": 6, "pass_gaussians": together, "target": target}
     coordinator = on_device(tmp_path, start, views, **options, density=DensityConfig())
-    told: list = []
-    coordinator.announce.subscribe(lambda event: told.append(event) if isinstance(event, ShedAtEnd) else None)
+    told = listen(coordinator, ShedAtEnd)
     train(coordinator, photos)
     (found,) = told
     assert found.gone > 0
@@ -134,8 +133,7 @@ def test_blocks_that_outgrow_their_limit_are_split(tmp_path, start, views, photo
     coordinator = on_device(
         tmp_path, start, views, blocks=2, steps=14, density=GROWING, block_limit=60, sole_limit=60
     )
-    splits = []
-    coordinator.announce.subscribe(lambda e: splits.append(e) if isinstance(e, BlockSplit) else None)
+    splits = listen(coordinator, BlockSplit)
     train(coordinator, photos)
     assert splits
     assert coordinator.scene.tree.num_blocks == 2 + len(splits)
@@ -143,13 +141,12 @@ def test_blocks_that_outgrow_their_limit_are_split(tmp_path, start, views, photo
 
 def test_gaussians_migrate(tmp_path, start, views, photos):
     coordinator = on_device(tmp_path, start, views, blocks=4, steps=12)
-    moved = []
-    coordinator.announce.subscribe(lambda e: moved.append(e.migrated) if isinstance(e, VisitEnded) else None)
+    ended = listen(coordinator, VisitEnded)
     while not coordinator.finished:
         train(coordinator, photos, steps=1)
         with torch.no_grad():
             coordinator.params["means"].add_(0.1 * torch.randn_like(coordinator.params["means"]))
-    assert sum(moved) > 0
+    assert sum(event.migrated for event in ended) > 0
 
 
 def test_what_is_no_number_is_mended(tmp_path, start, views, photos):

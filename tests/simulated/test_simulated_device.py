@@ -5,13 +5,7 @@ import gc
 import pytest
 import torch
 
-from tests.reference.simulated_device import DEVICE, OnDevice, kernel, simulated_device
-
-
-@pytest.fixture
-def counts():
-    with simulated_device() as counts:
-        yield counts
+from tests.reference.simulated_device import DEVICE, OnDevice, kernel
 
 
 def test_tensors_on_different_devices_are_refused(counts):

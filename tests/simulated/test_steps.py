@@ -15,17 +15,11 @@ from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Crop
 from benchmarks.device import Watch
 from tests.reference.rasterizer_scenes import as_leaves
-from tests.reference.scenes import make_coordinator, whole_scene
+from tests.reference.scenes import listen, make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 
 GATHERING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=10**6, reset_every=0)
 STILL = DensityConfig(strategy="off")
-
-
-def listen(coordinator, kind) -> list:
-    found = []
-    coordinator.announce.subscribe(lambda event: found.append(event) if isinstance(event, kind) else None)
-    return found
 
 
 @pytest.mark.parametrize(("blocks", "parts"), [(1, 0), (4, 0), (4, 300)])

@@ -9,8 +9,7 @@ from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Layer
-from tests.engine.train.test_coordinator import equal
-from tests.reference.scenes import make_coordinator, whole_scene
+from tests.reference.scenes import equal, make_coordinator, whole_scene
 
 CPU = torch.device("cpu")
 

@@ -45,16 +45,19 @@ def facing(k: int, view: View, primitive: str) -> torch.Tensor:
     return -normal if float(normal @ (SCENE.means[k] - view.center)) > 0 else normal
 
 
-@PRIMITIVES
-@pytest.mark.parametrize("pass_gaussians", [0, 1000])
-def test_both_are_those_of_a_loop_over_fragments(primitive, pass_gaussians):
-    """Drawn at once, and unit by unit; in pixels all over a picture."""
-    view, flat = VIEWS[1], primitive == "2dgs"
+def drawn(primitive: str, view: View, pass_gaussians: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The median depth and the normals of a picture."""
     depth = median_depth(painter_of(primitive, pass_gaussians), view, SETTINGS)
-    painter = painter_of(primitive, pass_gaussians, lambda g: colored_by_normal(g, view, flat))
+    painter = painter_of(primitive, pass_gaussians, lambda g: colored_by_normal(g, view, primitive == "2dgs"))
     assert (len(painter.units()) == 4) == (pass_gaussians == 0)
-    normals = normals_in(BlockPictures(painter, view, SETTINGS).everything())
-    crossed = 0
+    return depth, normals_in(BlockPictures(painter, view, SETTINGS).everything())
+
+
+@PRIMITIVES
+def test_both_are_those_of_a_loop_over_fragments(primitive):
+    """Drawn at once, and unit by unit; in pixels all over a picture."""
+    view, crossed = VIEWS[1], 0
+    ways = [drawn(primitive, view, pass_gaussians) for pass_gaussians in (0, 1000)]
     for x, y in ((5, 5), (18, 12), (24, 18), (29, 22), (33, 9), (20, 26)):
         left, expected, mean = 1.0, 0.0, torch.zeros(3, dtype=torch.float64)
         for z, k, alpha in fragments_at(primitive, view, x, y):
@@ -62,9 +65,10 @@ def test_both_are_those_of_a_loop_over_fragments(primitive, pass_gaussians):
             mean += left * alpha * facing(k, view, primitive)
             left *= 1 - alpha
         crossed += left < 0.5
-        assert float(depth[y, x]) == pytest.approx(expected, abs=1e-9)
-        if left < 1:
-            assert torch.allclose(normals[y, x], mean / mean.norm(), atol=2e-3)
+        for depth, normals in ways:
+            assert float(depth[y, x]) == pytest.approx(expected, abs=1e-9)
+            if left < 1:
+                assert torch.allclose(normals[y, x], mean / mean.norm(), atol=2e-3)
     assert crossed >= 2
 
 

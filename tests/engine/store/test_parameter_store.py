@@ -16,13 +16,6 @@ from tests.reference.store_helpers import FailAt, assert_block, block, names_in
 DTYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool)
 
 
-@pytest.fixture
-def store(tmp_path):
-    with ParameterStore.create(tmp_path / "store", {"tree": [1, 2]}) as store:
-        store.commit({0: block(3, 1.0), 7: block(0, 2.0)}, state={"clock": 5})
-        yield store
-
-
 def test_what_was_committed_is_there_after_reopening(store):
     assert store.generation == 1
     store.commit({7: block(2, 9.0)}, header={"tree": "new"})

@@ -16,13 +16,6 @@ from abcd_ns.engine.store.manifest import Manifest, manifest_path, read_manifest
 from tests.reference.store_helpers import FailAt, assert_block, block, names_in
 
 
-@pytest.fixture
-def store(tmp_path):
-    with ParameterStore.create(tmp_path / "store", {"tree": [1, 2]}) as store:
-        store.commit({0: block(3, 1.0), 7: block(0, 2.0)}, state={"clock": 5})
-        yield store
-
-
 def assert_intact(store: ParameterStore) -> None:
     """The first generation, whole, and nothing else in the folder."""
     for view in (store, ParameterStore.open(store.folder, read_only=True)):

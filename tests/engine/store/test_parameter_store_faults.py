@@ -12,14 +12,6 @@ from abcd_ns.engine.store import FolderLockedError, ParameterStore, StoreError, 
 from abcd_ns.engine.store.manifest import FORMAT_VERSION
 from tests.reference.store_helpers import FailAt, assert_block, block, names_in
 
-
-@pytest.fixture
-def store(tmp_path):
-    with ParameterStore.create(tmp_path / "store", {"tree": [1, 2]}) as store:
-        store.commit({0: block(3, 1.0), 7: block(0, 2.0)}, state={"clock": 5})
-        yield store
-
-
 FAULTS = [(atomic.os, "replace", 3), (atomic.os, "fsync", 5), (shard, "save_file", 2)]
 
 

@@ -13,7 +13,7 @@ from abcd_ns.engine.store.special_blocks import RESERVE, in_order
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
-from tests.reference.scenes import make_coordinator, whole_scene
+from tests.reference.scenes import listen, make_coordinator, whole_scene
 
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=1e-5, price=0.0)
@@ -77,8 +77,7 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
     coordinator = make_coordinator(
         tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL
     )
-    begun = []
-    coordinator.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
+    begun = listen(coordinator, VisitBegan)
     train(coordinator, photos, steps=10)
     assert coordinator.state.active is None
     scene = coordinator.scene
@@ -209,8 +208,7 @@ def test_the_warm_up_ends_when_each_view_was_used_often_enough(
         warmup=0.5,
         density=STILL,
     )
-    ended = []
-    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    ended = listen(coordinator, VisitEnded)
     while not ended:
         train_step(coordinator, photos)
     assert coordinator.state.step == expected
@@ -226,8 +224,7 @@ def test_the_warm_up_goes_on_for_twice_its_share_until_each_view_was_used_often_
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 2)
     options = {"blocks": 4, "steps": 50, "scaffold": len(start), "warmup": 0.2, "density": STILL}
     coordinator = make_coordinator(tmp_path, start, views, **options)
-    ended = []
-    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    ended = listen(coordinator, VisitEnded)
     while not ended:
         train_step(coordinator, photos)
     assert coordinator.state.step == expected

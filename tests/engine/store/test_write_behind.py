@@ -19,7 +19,7 @@ from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+from tests.reference.scenes import listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")
 PATIENCE = 20.0
@@ -278,8 +278,7 @@ def shaken(coordinator, photos) -> None:
 def test_a_visit_writes_its_block_and_the_inbox_alone(tmp_path, views, photos, start):
     options = {"blocks": 4, "steps": 60, "density": STILL, "commit_seconds": 0.0}
     coordinator = make_coordinator(tmp_path, start, views, **options)
-    disk, ended = Disk(coordinator.scene.store), []
-    coordinator.announce.subscribe(lambda e: ended.append(e) if isinstance(e, VisitEnded) else None)
+    disk, ended = Disk(coordinator.scene.store), listen(coordinator, VisitEnded)
     while not coordinator.finished:
         shaken(coordinator, photos)
     assert sum(event.migrated for event in ended) > 0
@@ -292,7 +291,6 @@ def test_a_visit_writes_its_block_and_the_inbox_alone(tmp_path, views, photos, s
 def test_those_in_the_inbox_are_drawn_survive_a_stop_and_join(tmp_path, views, photos, start):
     options = {"blocks": 2, "steps": 60, "density": STILL}
     coordinator = make_coordinator(tmp_path, start, views, **options)
-    begun = []
     while coordinator.scene.inbox is None or not len(coordinator.scene.inbox):
         shaken(coordinator, photos)
     (block,) = coordinator.scene._mail
@@ -302,7 +300,7 @@ def test_those_in_the_inbox_are_drawn_survive_a_stop_and_join(tmp_path, views, p
     coordinator.close()
     again = make_coordinator(tmp_path, start, views, resume=True, **options)
     assert equal(with_mail(again.scene, block), expected)
-    again.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
+    begun = listen(again, VisitBegan)
     while not begun or begun[-1].block != block:
         train_step(again, photos)
     assert begun[-1].gaussians == len(expected)

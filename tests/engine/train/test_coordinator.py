@@ -17,13 +17,16 @@ from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.plain_3dgs import train_plain
-from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import (
+    equal,
+    listen,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    whole_scene,
+)
 
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
-
-
-def equal(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(value, getattr(b, name)) for name, value in a.items())
 
 
 BOTH = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
@@ -225,10 +228,9 @@ def test_blocks_that_no_view_sees_are_left_alone(tmp_path, views, photos, start)
     unseen = [b for b in range(8) if bool((coordinator.scene.gaussians(b).means > 40).all())]
     assert unseen
     before = [coordinator.scene.gaussians(b) for b in unseen]
-    visited = []
-    coordinator.announce.subscribe(lambda e: visited.append(e.block) if isinstance(e, VisitBegan) else None)
+    begun = listen(coordinator, VisitBegan)
     train(coordinator, photos)
-    assert not set(visited) & set(unseen)
+    assert not {event.block for event in begun} & set(unseen)
     assert all(coordinator.state.views[b] == 0 for b in unseen)
     assert all(equal(coordinator.scene.gaussians(b), g) for b, g in zip(unseen, before, strict=True))
 

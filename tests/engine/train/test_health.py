@@ -18,20 +18,10 @@ from abcd_ns.engine.train.memory import OutOfRoomError, bytes_for, check_room
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+from tests.reference.scenes import equal, listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4, price=0.0)
-
-
-def equal(a: Gaussians, b: Gaussians) -> bool:
-    return len(a) == len(b) and all(torch.equal(value, getattr(b, name)) for name, value in a.items())
-
-
-def listen(coordinator, kind) -> list:
-    found = []
-    coordinator.announce.subscribe(lambda event: found.append(event) if isinstance(event, kind) else None)
-    return found
 
 
 def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:

@@ -10,7 +10,7 @@ from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.schedule import plan_sweep
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import make_coordinator
+from tests.reference.scenes import listen, make_coordinator
 
 STILL = DensityConfig(strategy="off")
 
@@ -25,8 +25,7 @@ def test_fixed_steps_for_each_cell_are_one_visit_to_each(tmp_path, views, photos
     coordinator = make_coordinator(
         tmp_path, start, views, blocks=4, steps=20, visit_steps=5, batch=1, density=STILL
     )
-    begun = []
-    coordinator.announce.subscribe(lambda e: begun.append(e) if isinstance(e, VisitBegan) else None)
+    begun = listen(coordinator, VisitBegan)
     train(coordinator, photos)
     assert [event.steps for event in begun] == [5] * 4
     assert {event.block for event in begun} == {0, 1, 2, 3}

@@ -15,7 +15,14 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.shedding import PASSES, faded, may_grow, price_at, weigh, worthless
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import (
+    Photos,
+    listen,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    whole_scene,
+)
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
 """Nothing grows, and the price is the full one from the beginning."""
@@ -80,8 +87,7 @@ def test_what_no_view_shows_goes_and_what_fills_much_stays(tmp_path, blocks):
     photos = Photos(random_gaussians(150, seed=7, size=0.12), views)
     options = {"blocks": blocks, "steps": 80, "density": replace(STILL, price=1.0), "batch": 1}
     coordinator = make_coordinator(tmp_path, start, views, **options)
-    told: list[Mended] = []
-    coordinator.announce.subscribe(lambda event: told.append(event) if isinstance(event, Mended) else None)
+    told = listen(coordinator, Mended)
     train(coordinator, photos)
     left = whole_scene(coordinator)
     assert sum(event.count for event in told if event.what == "shed") == len(start) - len(left)

@@ -12,7 +12,7 @@ from abcd_ns.engine.train.density.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import make_coordinator, random_gaussians, whole_scene
+from tests.reference.scenes import listen, make_coordinator, random_gaussians, whole_scene
 
 GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=1e-5)
 
@@ -203,7 +203,6 @@ def test_a_run_goes_on_with_a_smaller_limit(tmp_path, views, photos, start):
     assert store.generation == generation
     store.close()
     again = make_coordinator(tmp_path, start, views, resume=True, block_limit=40, **options)
-    visited = []
-    again.announce.subscribe(lambda e: visited.append(e.block) if isinstance(e, VisitBegan) else None)
+    begun = listen(again, VisitBegan)
     train(again, photos)
-    assert max(visited) >= 2
+    assert max(event.block for event in begun) >= 2

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import xml.etree.ElementTree as ET
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,11 +22,7 @@ from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS, spread
 from abcd_ns.lab.results.tables import MEASURES, cell, notes, print_table, rows, write_table
 from tests.lab.compare.records import made_up_results, made_up_run
-
-
-def svg_texts(path) -> list[str]:
-    return ["".join(node.itertext()) for node in ET.parse(path).iter("{http://www.w3.org/2000/svg}text")]
-
+from tests.lab.svg import texts_of
 
 # The chart
 
@@ -38,7 +33,7 @@ def test_chart_shows_every_method_in_its_own_colour_with_units(tmp_path):
     paths = draw_speed_accuracy(results, tmp_path)
 
     assert sorted(path.name for path in paths) == ["speed_accuracy.png", "speed_accuracy.svg"]
-    texts = svg_texts(tmp_path / "speed_accuracy.svg")
+    texts = texts_of(tmp_path / "speed_accuracy.svg")
     for method in METHODS:
         assert sum(text.startswith(f"{method}  ") for text in texts) == 1
     assert {"training time (s)", "held-out PSNR (dB)"} <= set(texts)
@@ -77,7 +72,7 @@ def test_the_way_through_numbers_of_gaussians_has_a_chart(tmp_path):
     results = made_up_results(counted(100, 900, 2000), counted(100, 500, 800, method="abcd-monolithic"))
     paths = draw_size_accuracy(results, tmp_path)
     assert [path.name for path in paths] == ["size_accuracy.png", "size_accuracy.svg"]
-    texts = svg_texts(paths[1])
+    texts = texts_of(paths[1])
     assert {"held-out PSNR (dB)", "2,000"} <= set(texts)
     assert any(text.startswith("Gaussians in the scene") for text in texts)
 

@@ -15,20 +15,9 @@ from abcd_ns.lab.compare.command import Options, carry_out, impossible, make_pla
 from abcd_ns.lab.job import Job, Plan
 from abcd_ns.lab.results.records import encode
 from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.runs import runner
 from abcd_ns.lab.runs.experiment import run_jobs
 from abcd_ns.lab.runs.runner import last_line
-from tests.lab.compare.fake_worker import FakeWorker
 from tests.lab.compare.records import MACHINE, read_results
-
-
-@pytest.fixture
-def worker(tmp_path, monkeypatch) -> FakeWorker:
-    fake = FakeWorker(tmp_path / "worker")
-    monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
-    monkeypatch.setattr(runner, "command_of", lambda job: fake.command)  # noqa: ARG005
-    monkeypatch.setattr("abcd_ns.lab.runs.experiment.describe_machine", lambda: MACHINE)
-    return fake
 
 
 @pytest.fixture

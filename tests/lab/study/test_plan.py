@@ -12,14 +12,8 @@ from abcd_ns.lab.job import Change, Variant
 from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.lab.runs.options import change_options, option_names, parse_variant
 from abcd_ns.lab.study.command import BlocksStudy, GaussiansStudy, OptionsStudy
-from tests.reference.colmap_scene import write_scene
 
 PIPELINE = methods.abcd.config.pipeline
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("study") / "scene")
 
 
 def given(scene: Path, **more) -> dict:

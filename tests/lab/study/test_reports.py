@@ -1,8 +1,6 @@
 """What a study says of its runs: findings, table, chart; and runs that are reused or fail."""
 
-import xml.etree.ElementTree as ET
 from io import StringIO
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -14,10 +12,8 @@ from abcd_ns.lab.results.frontier import LIMIT, MCMC, PRICE, curves, fewest_near
 from abcd_ns.lab.results.records import encode, write_json
 from abcd_ns.lab.results.results import Arm
 from abcd_ns.lab.results.tables import notes, rows, write_table
-from abcd_ns.lab.runs import runner
 from abcd_ns.lab.study.charts import draw_study
 from abcd_ns.lab.study.command import BlocksStudy, OptionsStudy, carry_out
-from tests.lab.compare.fake_worker import FakeWorker
 from tests.lab.compare.records import read_results
 from tests.lab.in_process import jobs_in_this_process
 from tests.lab.study.records import (
@@ -27,7 +23,7 @@ from tests.lab.study.records import (
     made_up_study,
     options_study,
 )
-from tests.reference.colmap_scene import write_scene
+from tests.lab.svg import texts_of
 
 STUDIES = [blocks_study, gaussians_study, options_study]
 
@@ -151,11 +147,6 @@ def name_of(study) -> str:
     return study.kind.removeprefix("study of ")
 
 
-def texts_of(svg: Path) -> list[str]:
-    nodes = ET.fromstring(svg.read_bytes()).iter("{http://www.w3.org/2000/svg}text")
-    return ["".join(node.itertext()) for node in nodes]
-
-
 @pytest.mark.parametrize("seeds", [(0,), (0, 1, 2)])
 @pytest.mark.parametrize("make", STUDIES)
 def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp_path):
@@ -199,19 +190,6 @@ def test_a_single_run_has_a_chart_too(study, tmp_path):
 
 
 # Runs
-
-
-@pytest.fixture
-def worker(tmp_path, monkeypatch) -> FakeWorker:
-    fake = FakeWorker(tmp_path / "worker")
-    monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
-    monkeypatch.setattr(runner, "command_of", lambda job: fake.command)  # noqa: ARG005
-    return fake
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("study") / "scene")
 
 
 @pytest.fixture

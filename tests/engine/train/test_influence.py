@@ -1,0 +1,120 @@
+"""A block is trained on the views that it has influence on."""
+
+import pytest
+
+from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.render import Shot
+from abcd_ns.engine.space.influence import influence, weights
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.training_loop import train
+from abcd_ns.engine.types import Gaussians
+from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
+
+
+def grown(tmp_path, start, views, **options):
+    density = DensityConfig(strategy="off")
+    return make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=4,
+        steps=60,
+        scaffold=40,
+        warmup=0.2,
+        **{"density": density, **options},
+    )
+
+
+def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views, influence_share=0.6)
+    seen = []
+
+    def note(event):
+        if isinstance(event, VisitBegan) and event.block is not None:
+            seen.append((event.block, coordinator.state.active.views, coordinator.state.active.looked_at))
+
+    coordinator.announce.subscribe(note)
+    train(coordinator, photos, steps=12)
+    known = coordinator.state.influence
+    assert sorted(known) == [0, 1, 2, 3]
+    assert all(0 < sum(row[view] for row in known.values()) <= 1 + 1e-5 for view in range(5))
+    train(coordinator, photos)
+    assert any(len(used) < 5 for _, used, _ in seen)
+    assert all(len(looked_at) <= 1 and set(looked_at) <= set(used) for _, used, looked_at in seen)
+    for block in range(4):
+        visits = [set(looked_at) for b, _, looked_at in seen if b == block]
+        assert set.union(*visits), "a doubtful view of every block is looked at sooner or later"
+
+
+def test_with_a_share_of_one_every_view_counts(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views, influence_share=1.0)
+    train(coordinator, photos)
+    assert all(count == 5 for count in coordinator.state.views.values())
+
+
+def test_the_warm_up_draws_no_view_again_that_it_has_used(tmp_path, views, photos, start, monkeypatch):
+    drawn = []
+
+    def watched(gaussians, owner, others, *rest, **options):
+        drawn.extend(others)
+        return influence(gaussians, owner, others, *rest, **options)
+
+    monkeypatch.setattr("abcd_ns.engine.train.coordinator.influence", watched)
+    coordinator = grown(tmp_path, start, views, density=DensityConfig(price=1.0, refine_every=1000))
+    train(coordinator, photos, steps=4)
+    coordinator.save()
+    coordinator.restore()
+    noted = coordinator.visit.influence.found()
+    assert len(noted[1]) == 1
+    while coordinator.state.visit == 1:
+        train(coordinator, photos, steps=coordinator.state.step + 1)
+    assert not drawn
+    known = coordinator.state.influence
+    whole = Gaussians.cat([coordinator.scene.gaussians(block) for block in range(4)])
+    for view in views:
+        seen = float(weights(whole, coordinator.run.rasterizer, [Shot(view, view.full)]).sum())
+        assert sum(row[view.index] for row in known.values()) == pytest.approx(
+            seen / view.full.pixels, rel=0.1
+        )
+
+
+def test_influence_survives_a_save(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views, influence_share=0.6)
+    train(coordinator, photos, steps=12)
+    coordinator.next_batch()
+    assert coordinator.state.influence
+    again = RunState.from_json(coordinator.state.to_json())
+    assert again.influence == coordinator.state.influence
+    assert again.active.looked_at == coordinator.state.active.looked_at
+
+
+def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(tmp_path, views, photos, start):
+    coordinator = grown(tmp_path, start, views)
+    train(coordinator, photos, steps=12)
+    coordinator.state.influence = {0: {}, 1: {99: 0.5}}
+    visited = {}
+
+    def note(event):
+        if isinstance(event, VisitBegan):
+            visited.setdefault(event.block, coordinator.state.active.views)
+
+    coordinator.announce.subscribe(note)
+    train(coordinator, photos)
+    assert sorted(visited) == [0, 1, 2, 3]
+    assert all(sorted(used) == [0, 1, 2, 3, 4] for used in visited.values())
+
+
+def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):
+    views = ring_of_views(4)
+    run = make_coordinator(tmp_path, random_gaussians(60, seed=3), views, blocks=4, steps=80)
+    first = run.visits.begin(at_once=2)
+    state = run.state
+    queued = [plan.block for plan in state.queue]
+    out, last = first.geometry.block, queued[-1]
+    everywhere, elsewhere = {0: 0.5, 1: 0.5}, {2: 0.1, 3: 0.1}
+    state.influence = {block: elsewhere if block == last else everywhere for block in (out, *queued)}
+    state.in_flight.append(first)
+    assert run.visits.begin(at_once=2).geometry.block == last
+    state.in_flight.clear()
+    assert run.visits.begin().geometry.block == queued[0]  # one at a time goes by the sweep's order
