@@ -3,15 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-
-if sys.dont_write_bytecode:
-    # Where none is wanted beside sources it lies here: tests start dozens of processes, and without bytecode
-    # each compiles nerfstudio and Ray for itself.
-    sys.dont_write_bytecode = False
-    sys.pycache_prefix = str(Path(__file__).resolve().parent.parent / ".pytest_cache" / "bytecode")
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+from types import ModuleType
 
 # Threads sleep while they wait: spinning, as is usual, burns a busy machine's time. torch reads it once.
 os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
@@ -21,7 +13,6 @@ import torch
 from hypothesis import settings
 from jaxtyping import config as checks
 from jaxtyping import install_import_hook
-from nerfstudio.configs import external_methods
 
 # Shapes and dtypes in these packages' signatures are checked when they are called. The hook only works on
 # modules that are not imported yet, hence here and not in a fixture.
@@ -30,20 +21,6 @@ install_import_hook(["abcd_ns.engine", "abcd_ns.peers"], "beartype.beartype")
 # The same sums in the same order on any machine, and room for other processes; those that tests start, too.
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"
-
-
-def light_stack() -> list[SimpleNamespace]:
-    """As `inspect.stack()`, of functions' names alone."""
-    frame, found = sys._getframe(1), []
-    while frame is not None:
-        found.append(SimpleNamespace(function=frame.f_code.co_name))
-        frame = frame.f_back
-    return found
-
-
-# nerfstudio asks 26 times who called it. pytest's stack is deep, and `inspect` reads each frame's source and
-# looks for its module among thousands: half of the time that all imports take.
-external_methods.inspect = SimpleNamespace(stack=light_stack)
 
 # derandomize: a failure shows up on every run or on none. No deadline: shared machines stall.
 settings.register_profile("abcd", derandomize=True, deadline=None, max_examples=25, database=None)
