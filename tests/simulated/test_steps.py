@@ -10,12 +10,21 @@ from abcd_ns.engine.gaussians.param_swap import PARAM_NAMES
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.density.degrees import lowered
+from abcd_ns.engine.train.density.shedding import WEIGHED
+from abcd_ns.engine.train.health.health_rules import wider_than
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Crop
 from benchmarks.device import Watch
 from tests.reference.rasterizer_scenes import as_leaves
-from tests.reference.scenes import listen, make_coordinator, whole_scene
+from tests.reference.scenes import (
+    listen,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    whole_scene,
+)
 from tests.reference.simulated_device import DEVICE
 
 GATHERING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=10**6, reset_every=0)
@@ -65,6 +74,18 @@ def test_a_drawing_leaves_nothing_behind(start, views, simulated_gsplat, crop):
         del raster
         live.append(simulated_gsplat.live_bytes)
     assert live[1] == live[2]
+
+
+@pytest.mark.parametrize("views", [3, 12])
+def test_rules_of_a_refinement_copy_cameras_once_however_many_there_are(counts, views):
+    gaussians, ring = random_gaussians(5).to(DEVICE), ring_of_views(views)
+    growth = {name: torch.ones(5).to(DEVICE) for name in WEIGHED}
+    before = counts.copy()
+    wider_than(0.05, gaussians.scales, gaussians.means, ring)
+    assert counts.since(before).copies_to_device == 1
+    before = counts.copy()
+    lowered(gaussians, growth, ring, 1)
+    assert counts.since(before).copies_to_device == 2
 
 
 def test_numbers_of_a_step_are_there_a_step_later(counts):

@@ -8,6 +8,7 @@ one is taken for which this and the price of the numbers are least together; tho
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussia
 from abcd_ns.engine.gaussians.sh_degrees import up_to_degree
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows
 from abcd_ns.engine.train.density.shedding import WEIGHED
+from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
 GONE = "gone"
@@ -85,12 +87,20 @@ def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[
     weight, looks = (growth[name] for name in WEIGHED)
     weight = torch.where(looks >= seen, weight * seen / looks.clamp_min(1.0), torch.nan)
     gone = growth.get(GONE, torch.zeros_like(weight))
-    chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
+    chosen = _beside(gaussians.means, views[:: max(-(-len(views) // MOST_VIEWS), 1)])
     coefficients = gaussians.features_rest.shape[1] + 1
     step = max(AT_ONCE // (coefficients * max(len(chosen), coefficients)), 1)
     parts = [slice(start, start + step) for start in range(0, max(len(gaussians), 1), step)]
     found = [_lowered(gaussians[rows], weight[rows], gone[rows], chosen) for rows in parts]
     return Lowered(*(torch.cat(values) for values in zip(*found, strict=True)))
+
+
+def _beside(means: Tensor, views: Sequence[View]) -> list[View]:
+    """Views on the device of the means, in two copies for all parts."""
+    stacked = (torch.stack([getattr(view, name) for view in views]) for name in ("viewmat", "K"))
+    viewmats, intrinsics = (upload(matrices.to(means.dtype), means.device) for matrices in stacked)
+    triples = zip(views, viewmats, intrinsics, strict=True)
+    return [replace(view, viewmat=viewmat, K=K) for view, viewmat, K in triples]
 
 
 def _lowered(
@@ -133,13 +143,12 @@ def _gram(gaussians: Gaussians, views: Sequence[View], bases: int) -> Float[Tens
     means, reach = gaussians.means, REACH * gaussians.scales.amax(dim=1).exp()
     rows, shows = [], []
     for view in views:
-        view = view.to(means)
         inside = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
         depth = inside[:, 2].clamp_min(view.near)
         per_unit = view.K[0, 0] / depth
-        pixel, beyond = (inside @ view.K.T)[:, :2] / depth[:, None], (reach * per_unit)[:, None]
-        within = (pixel > -beyond) & (pixel < pixel.new_tensor([view.width, view.height]) + beyond)
-        seen = within.all(dim=1) & (inside[:, 2] > view.near)
+        (x, y), beyond = ((inside @ view.K.T)[:, :2] / depth[:, None]).unbind(dim=1), reach * per_unit
+        seen = (x > -beyond) & (x < view.width + beyond) & (inside[:, 2] > view.near)
+        seen &= (y > -beyond) & (y < view.height + beyond)
         away = torch.nn.functional.normalize(means - view.center, dim=1)
         harmonics = sh_basis_rows(*away.unbind(dim=1))[: bases - 1]
         rows.append(torch.stack((torch.full_like(depth, SH_C0), *harmonics), dim=1))

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, Layer, View
 
 SHOWS = 1 / 255
@@ -49,10 +50,11 @@ def wider_than(
     Args:
         scales: logarithms of standard deviations.
     """
+    views = tuple(views)
+    centers = upload(torch.stack([view.center.to(means.dtype) for view in views]), means.device)
     nearest = means.new_full((len(means),), math.inf)
-    for view in views:
-        away = (means - view.center.to(means)).norm(dim=1).clamp_min(view.near)
-        nearest = torch.minimum(nearest, away)
+    for center, view in zip(centers, views, strict=True):
+        nearest = torch.minimum(nearest, (means - center).norm(dim=1).clamp_min(view.near))
     allowed = (angle * nearest).log()[:, None]
     return scales > allowed, allowed
 
