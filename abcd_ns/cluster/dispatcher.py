@@ -187,7 +187,6 @@ class Dispatcher(Trainer):
             step=state.planned,
             seconds=self.stopwatch.seconds,
             sweep=state.sweep,
-            views=state.views.get(block, len(active.geometry.views)),
             health=state.health.get(block, BlockHealth()),
             light=self._light_of(active.views),
             poses=self.run.poses.to_json(),
@@ -239,7 +238,7 @@ class Dispatcher(Trainer):
                 self.workers.submit(lent.lease)
                 lent.submitted = True
                 active, task = lent.active, lent.lease.task
-                seen, gaussians = len(active.geometry.views), task.outlines.counts[active.geometry.block]
+                seen, gaussians = len(active.trained_on), task.outlines.counts[active.geometry.block]
                 if not lent.losses:
                     block = active.geometry.block
                     self.announce(VisitBegan(active.number, task.sweep, block, active.steps, seen, gaussians))

@@ -37,8 +37,6 @@ class VisitTask:
     seconds: float
     """Training time when it begins."""
     sweep: int
-    views: int
-    """Worth training the block on."""
     health: BlockHealth
     light: dict[int, Tensor]
     """By view in use, its transform, on the CPU; the worker applies it and leaves it as it is. Empty for none

@@ -153,7 +153,6 @@ class VisitWorker:
             step=task.step,
             sweep=task.sweep,
             visit=task.active.number + 1,
-            views={block: task.views},
             influence={block: {}},
             health={block: copy.copy(task.health)},
             active=copy.deepcopy(task.active),

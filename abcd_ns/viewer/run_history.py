@@ -77,7 +77,7 @@ class RunHistory:
         history.sweep = state.sweep if state.views else None
         if (active := state.active) is not None:
             block = None if active.is_whole else active.geometry.block
-            seen = len(active.geometry.views)
+            seen = len(active.trained_on)
             history._begin(VisitBegan(active.number, state.sweep, block, active.steps, seen, 0))
             history.steps[active.number] = active.done
         return history

@@ -84,7 +84,7 @@ def test_rules_of_a_refinement_copy_cameras_once_however_many_there_are(counts, 
     wider_than(0.05, gaussians.scales, gaussians.means, ring)
     assert counts.since(before).copies_to_device == 1
     before = counts.copy()
-    lowered(gaussians, growth, ring, 1)
+    lowered(gaussians, growth, ring)
     assert counts.since(before).copies_to_device == 2
 
 

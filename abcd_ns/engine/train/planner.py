@@ -1,6 +1,6 @@
 """Which block is trained next, on which views, and for how many steps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
@@ -118,15 +118,14 @@ class Planner(Visits):
             plan = self._next_plan(state, at_once)
             if self._is_hidden(state, plan.block) and state.sweep % LOOK_AGAIN:
                 continue
-            reduction = self._run.reduction
-            geometry = self._survey(plan.block, reduction)
-            kept = self._worth_training(state, geometry)
-            state.views[plan.block] = len(kept)
-            if kept and self._scene.tree.num_blocks == 1:
-                return self._sole_visit(state, plan.block, kept, sh_degree, began)
-            if kept:
-                active = self._visit(state, plan, geometry, kept, sh_degree, began)
-                active.reduction = reduction
+            views = self._may_see(plan.block, self._run.reduction)
+            # Where nothing is known, or what shows the block has changed, all views are asked.
+            known = self._known_to_show(state, plan.block, views)
+            active = self._visit(state, plan, views, known, sh_degree) or self._visit(
+                state, plan, views, self._survey(plan.block, views).views, sh_degree
+            )
+            if active is not None:
+                active.began = began
                 return active
 
     @staticmethod
@@ -137,42 +136,59 @@ class Planner(Visits):
         self,
         state: RunState,
         plan: VisitPlan,
-        geometry: VisitGeometry,
-        kept: tuple[int, ...],
+        views: Mapping[int, View],
+        showing: tuple[int, ...],
         sh_degree: int,
-        began: float,
-    ) -> ActiveVisit:
-        seed, used = self._config.seed, self._views_used(state, len(kept))
-        earlier = self._scene.clocks(plan.block).visits
-        doubtful = tuple(view for view in geometry.views if view not in set(kept))
+    ) -> ActiveVisit | None:
+        """The next visit to a block; None if those of its views whose turn it is do not see it after all.
+
+        Args:
+            views: that may see the block.
+            showing: those of them that are worth training it on.
+        """
+        block, seed = plan.block, self._config.seed
+        state.views[block] = len(showing)
+        if not showing:
+            return None
+        if self._scene.tree.num_blocks == 1:
+            return self._sole_visit(state, block, showing, sh_degree)
+        used, earlier = self._views_used(state, len(showing)), self._scene.clocks(block).visits
+        doubtful = tuple(view for view in views if view not in set(showing))
+        chosen = visit_views(showing, used, earlier, seed)
         looked_at = visit_views(doubtful, 1, earlier, seed) if doubtful else ()
+        # Of thousands of views, only those that it uses are asked where they see the block.
+        geometry = self._survey(block, {view: views[view] for view in (*chosen, *looked_at)})
+        chosen, looked_at = (tuple(v for v in some if v in geometry.crops) for some in (chosen, looked_at))
+        if not chosen:
+            return None
         return ActiveVisit(
             number=state.visit,
             geometry=geometry,
             sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
             steps=plan.steps,
-            views=(*visit_views(kept, used, earlier, seed), *looked_at),
+            views=(*chosen, *looked_at),
             looked_at=looked_at,
-            began=began,
+            showing=showing,
+            reduction=self._run.reduction,
         )
 
     def _sole_visit(
-        self, state: RunState, block: int, kept: tuple[int, ...], sh_degree: int, began: float
+        self, state: RunState, block: int, showing: tuple[int, ...], sh_degree: int
     ) -> ActiveVisit:
         """The visit to a block that is the whole scene: all that is left of the run, on whole views, for the
         block may grow anywhere."""
         steps = UNLIMITED if self._budget.steps is None else self._budget.steps - state.step
-        geometry = VisitGeometry(block, {view: self._run.views[view].full for view in kept})
-        return ActiveVisit(state.visit, geometry, sh_degree, steps, geometry.views, began=began, sole=True)
+        geometry = VisitGeometry(block, {view: self._run.views[view].full for view in showing})
+        return ActiveVisit(state.visit, geometry, sh_degree, steps, geometry.views, sole=True)
 
-    def _worth_training(self, state: RunState, geometry: VisitGeometry) -> tuple[int, ...]:
-        """Of the views that see the block, those that show nearly all that is to be seen of it."""
-        known = state.influence.get(geometry.block)
+    def _known_to_show(self, state: RunState, block: int, views: Iterable[int]) -> tuple[int, ...]:
+        """Of the views that may see the block, those that show nearly all that is to be seen of it, as far as
+        that is known; empty if it is not."""
+        known = state.influence.get(block)
         if known is None or self._config.influence_share >= 1:
-            return geometry.views
-        seen = {view: known[view] for view in geometry.views if view in known}
-        # What a block has got since, Gaussians from the reserve say, may be seen where it was not before.
-        return worth_training(seen, self._config.influence_share) or geometry.views
+            return ()
+        seen = {view: known[view] for view in views if view in known}
+        return worth_training(seen, self._config.influence_share)
 
     def _next_plan(self, state: RunState, at_once: int) -> VisitPlan:
         config = self._config
@@ -205,7 +221,9 @@ class Planner(Visits):
         views, share = {}, self._config.influence_share
         for block in range(self._scene.tree.num_blocks):
             known = state.influence.get(block) if share < 1 else None
-            views[block] = len(worth_training(known, share) if known else self._survey(block, 1).views)
+            views[block] = len(
+                worth_training(known, share) if known else self._survey(block, self._may_see(block, 1)).views
+            )
         return views
 
     def _views_used(self, state: RunState, seen: int) -> int:
@@ -213,18 +231,22 @@ class Planner(Visits):
         most = max(state.views.values())
         return views_per_visit(seen, most, self._config.visit_views) if most else 0
 
-    def _survey(self, block: int, reduction: int) -> VisitGeometry:
+    def _may_see(self, block: int, reduction: int) -> dict[int, View]:
+        """The views whose frusta meet the block's bounds, by index."""
         bounds = self._scene.bounds(block)
         if bounds is None:
-            return VisitGeometry(block, {})
+            return {}
         found = self._run.views_at(reduction)
-        views = list(found.values())
         if reduction not in self._culling or self._culling[reduction][0] is not found:  # or poses moved
-            slack = self._run.rasterizer.slack
+            views, slack = list(found.values()), self._run.rasterizer.slack
             frusta = Frusta(((v, v.full) for v in views), slack)
             self._culling[reduction] = found, frusta, Optics(views, slack)
         _, frusta, optics = self._culling[reduction]
         (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
-        seeing = [view for view, may in zip(views, shows, strict=True) if may]
+        return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
+
+    def _survey(self, block: int, views: Mapping[int, View]) -> VisitGeometry:
+        if not views:
+            return VisitGeometry(block, {})
         gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)
-        return survey(gaussians, block, seeing, self._run.rasterizer)
+        return survey(gaussians, block, views.values(), self._run.rasterizer)

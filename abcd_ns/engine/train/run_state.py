@@ -48,6 +48,9 @@ class ActiveVisit:
     steps: int
     views: tuple[int, ...]
     """Indices of the views in use, of those that see the block."""
+    showing: tuple[int, ...] = ()
+    """Indices of the views that are worth training the block on, of which each visit uses some; empty where
+    they are all in use."""
     looked_at: tuple[int, ...] = ()
     """Those of them that hardly show the block, as far as known: used to see whether they still do not."""
     done: int = 0
@@ -71,6 +74,11 @@ class ActiveVisit:
     """Whether any picture has shown the block so far."""
     objective: dict[int, list[float]] = field(default_factory=dict)
     """By view, its loss when the visit first used it and, from its second use on, when it last did."""
+
+    @property
+    def trained_on(self) -> tuple[int, ...]:
+        """Indices of the views that the block is trained on, in this visit or another."""
+        return self.showing or self.geometry.views
 
     @property
     def is_whole(self) -> bool:

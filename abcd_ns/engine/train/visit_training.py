@@ -54,7 +54,7 @@ class VisitTraining:
         found it."""
         run, state = self.run, self.run.state
         self.live.attach(active, self.batch)
-        block, seen = None if active.is_whole else active.geometry.block, len(active.geometry.views)
+        block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
         run.scene.set_live(block, self._visits.attached(active))
         gaussians, self.influence = len(self.live), None
         if active.is_whole:

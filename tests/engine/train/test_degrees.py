@@ -59,7 +59,7 @@ def test_every_gaussian_gets_what_a_list_of_views_says(price, monkeypatch):
     monkeypatch.setattr(degrees, "NUMBER_PRICE", price)
     monkeypatch.setattr(degrees, "AT_ONCE", 3 * 16 * 16)  # several parts
     gaussians, views = random_gaussians(20, seed=3, sh_degree=3), ring_of_views(12)
-    found = lowered(gaussians, weighed(20), views, 12)
+    found = lowered(gaussians, weighed(20), views)
     for row in range(20):
         degree, expected = slow(gaussians, row, views, 30.0, price)
         assert int(found.gone[row]) == 3 - degree
@@ -72,7 +72,7 @@ def test_the_dearer_a_number_the_fewer_there_are(monkeypatch):
     counts = []
     for price in (0.0, 1e-3, 1e-2, 1e-1, 10.0):
         monkeypatch.setattr(degrees, "NUMBER_PRICE", price)
-        found = lowered(gaussians, weighed(50), views, 12)
+        found = lowered(gaussians, weighed(50), views)
         counts.append(count_parameters(found.features_rest))
         assert counts[-1] <= before
         before = counts[-1]
@@ -84,7 +84,7 @@ def test_the_dearer_a_number_the_fewer_there_are(monkeypatch):
 def test_seen_from_one_place_a_colour_is_all_that_there_is():
     """And it is the colour that was seen there."""
     (view, *_), gaussians = ring_of_views(4), random_gaussians(30, sh_degree=3)
-    found = lowered(gaussians, weighed(30, looks=1.0), [view], 1)
+    found = lowered(gaussians, weighed(30, looks=1.0), [view])
     away = torch.nn.functional.normalize(gaussians.means - view.center, dim=1)
     bases = torch.stack(sh_basis_rows(*away.unbind(1)), dim=1)
     inside = gaussians.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
@@ -100,7 +100,7 @@ def test_nobody_is_judged_who_was_not_looked_at_in_every_view():
     gaussians, growth = random_gaussians(10, sh_degree=2), weighed(10)
     growth["looks"][4:] = 11.0
     growth["weight"][:] = 1e-9
-    found = lowered(gaussians, growth, ring_of_views(12), 12)
+    found = lowered(gaussians, growth, ring_of_views(12))
     assert found.gone.tolist() == [2.0] * 4 + [0.0] * 6
     assert torch.equal(found.features_rest[4:], gaussians.features_rest[4:])
     assert torch.equal(found.features_dc[4:], gaussians.features_dc[4:])
@@ -109,7 +109,7 @@ def test_nobody_is_judged_who_was_not_looked_at_in_every_view():
 def test_what_is_gone_does_not_come_back_by_being_looked_at_again():
     gaussians, views = random_gaussians(30, sh_degree=3), ring_of_views(12)
     growth = {**weighed(30, weight=1e6), GONE: torch.arange(30.0) % 4}
-    found = lowered(gaussians, growth, views, 12)
+    found = lowered(gaussians, growth, views)
     assert bool((found.gone >= growth[GONE]).all())
 
 
@@ -117,17 +117,17 @@ def test_numbers_that_are_none_are_left_to_who_mends_them():
     gaussians = random_gaussians(4, sh_degree=3)
     gaussians.means[1] = math.nan
     gaussians.features_rest[2, 5] = math.inf
-    found = lowered(gaussians, weighed(4, weight=1e-9), ring_of_views(12), 12)
+    found = lowered(gaussians, weighed(4, weight=1e-9), ring_of_views(12))
     assert found.gone.tolist() == [3.0, 0.0, 0.0, 3.0]
     assert torch.equal(found.features_rest[1], gaussians.features_rest[1])
 
 
 def test_a_scene_without_harmonics_has_none_to_lose():
     gaussians = random_gaussians(5, sh_degree=0)
-    found = lowered(gaussians, weighed(5), ring_of_views(12), 12)
+    found = lowered(gaussians, weighed(5), ring_of_views(12))
     assert torch.equal(found.features_dc, gaussians.features_dc)
     assert found.gone.tolist() == [0.0] * 5
-    assert len(lowered(gaussians[:0], weighed(0), ring_of_views(12), 12).gone) == 0
+    assert len(lowered(gaussians[:0], weighed(0), ring_of_views(12)).gone) == 0
 
 
 def half_matt(seed: int = 7) -> Gaussians:

@@ -316,7 +316,7 @@ def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
 ):
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, visit_steps=10)
     train_step(coordinator, photos)
-    coordinator.state.views[coordinator.state.active.geometry.block] = seen
+    coordinator.state.active.showing = tuple(range(seen))
     assert coordinator.visit.live.density_clock(4, coordinator.batch, None).views == expected
 
 

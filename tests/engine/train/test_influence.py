@@ -1,6 +1,7 @@
 """A block is trained on the views that it has influence on."""
 
 import pytest
+import torch
 
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.render import Shot
@@ -103,6 +104,43 @@ def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(tmp
     train(coordinator, photos)
     assert sorted(visited) == [0, 1, 2, 3]
     assert all(sorted(used) == [0, 1, 2, 3, 4] for used in visited.values())
+
+
+def test_a_visit_asks_no_other_views_than_its_own_where_they_see_the_block(
+    tmp_path, views, photos, start, monkeypatch
+):
+    coordinator = grown(tmp_path, start, views, visit_views=2)
+    train(coordinator, photos, steps=12)
+    asked, extents = [], coordinator.run.rasterizer.extents
+
+    def watched(gaussians, some):
+        asked.append([view.index for view in some])
+        return extents(gaussians, some)
+
+    monkeypatch.setattr(coordinator.run.rasterizer, "extents", watched)
+    for number in range(4):
+        active = coordinator.visits.begin()
+        assert asked[number:] == [list(active.views)]
+        assert sorted(active.geometry.crops) == sorted(active.views)
+        assert len(active.views) <= 3 < len(active.trained_on)
+
+
+def test_views_that_show_a_block_no_more_are_found_out(tmp_path, views, photos, start, monkeypatch):
+    coordinator = grown(tmp_path, start, views, visit_views=2)
+    train(coordinator, photos, steps=12)
+    extents, blind = coordinator.run.rasterizer.extents, (0, 1, 2)
+
+    def partly_blind(gaussians, some):
+        found = extents(gaussians, some)
+        nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
+        return torch.stack([nowhere if v.index in blind else row for v, row in zip(some, found, strict=True)])
+
+    monkeypatch.setattr(coordinator.run.rasterizer, "extents", partly_blind)
+    coordinator.state.influence = {block: dict.fromkeys(blind, 0.1) for block in range(4)}
+    for _ in range(4):
+        active = coordinator.visits.begin()
+        assert active.trained_on == (3, 4)
+        assert not set(active.views) & set(blind)
 
 
 def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):

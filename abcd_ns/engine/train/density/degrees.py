@@ -56,7 +56,7 @@ def are_gone(gone: Float[Tensor, "n"], features_rest: Float[Tensor, "n k 3"]) ->
 
 @torch.no_grad()
 def lower(
-    params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View], seen: int
+    params: Params, optimizers: Optimizers, growth: dict[str, Tensor], views: Sequence[View]
 ) -> dict[str, Tensor]:
     """Let harmonics of the live block go that do not pay, with their moments; see `lowered`.
 
@@ -66,7 +66,7 @@ def lower(
     if any(name not in growth for name in WEIGHED):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
-    found = lowered(live_gaussians(params).detach(), growth, views, seen)
+    found = lowered(live_gaussians(params).detach(), growth, views)
     dc.copy_(found.features_dc)
     rest.copy_(found.features_rest)
     adam, gone = optimizers["features_rest"].state.get(rest, {}), are_gone(found.gone, rest)
@@ -76,14 +76,14 @@ def lower(
     return {**growth, GONE: found.gone}
 
 
-def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View], seen: int) -> Lowered:
+def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View]) -> Lowered:
     """Gaussians with the degrees that pay. Nobody is judged before as many drawings as there are views.
 
     Args:
         growth: with WEIGHED.
-        views: that see the block.
-        seen: how many of them it is trained on.
+        views: that the block is trained on.
     """
+    seen = len(views)
     weight, looks = (growth[name] for name in WEIGHED)
     weight = torch.where(looks >= seen, weight * seen / looks.clamp_min(1.0), torch.nan)
     gone = growth.get(GONE, torch.zeros_like(weight))

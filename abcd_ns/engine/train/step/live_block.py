@@ -93,16 +93,16 @@ class LiveBlock:
     def shed(self) -> None:
         """Take out Gaussians that fill too little of the block's views; tells how many."""
         run, before = self._run, len(self)
-        options = {"views": self._views, "progress": run.share}
+        options = {"views": len(run.active.trained_on), "progress": run.share}
         self.growth = run.density.shed(run.params, run.optimizers, self.growth, **options)
         run.health.count("shed", before - len(self))
 
     def lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""
-        run, seen = self._run, self._run.active.geometry.views
+        run = self._run
         if run.density.weighs and run.share >= START:
-            views, trained = [run.views[view] for view in seen], self._views
-            self.growth = lower(run.params, run.optimizers, self.growth, views, trained)
+            views = [run.views[view] for view in run.active.trained_on]
+            self.growth = lower(run.params, run.optimizers, self.growth, views)
 
     def _hold_degrees(self, *_: object) -> None:
         """Before the optimizer steps: harmonics that are gone get no gradient."""
@@ -112,12 +112,6 @@ class LiveBlock:
         if self._held is None or self._held[0] is not gone:
             self._held = gone, are_gone(gone, rest)
         rest.grad.masked_fill_(self._held[1], 0.0)
-
-    @property
-    def _views(self) -> int:
-        """That the block is trained on."""
-        run, active = self._run, self._run.active
-        return run.state.views.get(active.geometry.block, len(active.geometry.views))
 
     def is_due_to_shed(self, taken: int) -> bool:
         """Whether all that is trained at once has been drawn often enough since it last shed.
@@ -136,7 +130,7 @@ class LiveBlock:
             batch: views in each step.
             room: Gaussians that may be added.
         """
-        run, active, views = self._run, self._run.active, self._views
+        run, active, views = self._run, self._run.active, len(self._run.active.trained_on)
         blocks = run.blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
         if blocks > 1:
