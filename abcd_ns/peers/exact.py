@@ -81,7 +81,6 @@ class ExactTrainer(Trainer):
 
     def __init__(self, run: TrainingRun) -> None:
         super().__init__(run)
-        self._optics = Optics(list(self.views.values()), run.rasterizer.slack)
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
         self._batch: Batch | None = None
         self._degree = 0
@@ -203,11 +202,12 @@ class ExactTrainer(Trainer):
     def _cells(self) -> Iterator[tuple[int, Int64[Tensor, "m"], Gaussians]]:
         """(block, rows, Gaussians on the device) of every layer that holds any."""
         everything, tree = self._all.gaussians, self.scene.tree
-        owner, slack = self._owner_of_all(), self._optics.slack(everything.means)
+        optics = Optics([sample.view for sample in self._batch.samples], self.run.rasterizer.slack)
+        owner, slack = self._owner_of_all(), optics.slack(everything.means)
         for block in range(tree.num_blocks):
             inside = owner == block
             if self.config.recipe.ownership == "fragments":
-                inside = inside | reaches(everything, tree.cell(block), slack, self._optics.slant)
+                inside = inside | reaches(everything, tree.cell(block), slack, optics.slant)
             rows = inside.nonzero()[:, 0]
             if len(rows):
                 yield block, rows, everything[rows].to(self.device)

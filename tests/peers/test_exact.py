@@ -64,6 +64,20 @@ def test_gradients_are_those_of_the_merged_picture(tmp_path, blocks, dtype, tole
         assert torch.equal(found.radii[place][order], info["radii"][0])
 
 
+def test_reduced_pictures_are_exact_too(tmp_path, monkeypatch):
+    """A pixel of theirs is as much wider, and what lies beyond a cell's border may still show within."""
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.LEAST_SIDE", 1)
+    start = scene(torch.float64)
+    start.scales[:] -= 3.0  # it is the blur that reaches over borders
+    coordinator = exact(tmp_path, start, ring_of_views(3, dtype=torch.float64), blocks=5, sh_ramp=0.0)
+    batch = coordinator.next_batch()
+    assert coordinator.run.reduction == 4
+    (picture,), (sample,) = coordinator.render(batch).pictures, batch.samples
+    raster = coordinator.run.rasterizer(whole_scene(coordinator), sample.view, sh_degree=1)
+    merged = composite(raster.layer, sample.background).clamp(0, 1)
+    assert float((picture - merged).detach().abs().max()) <= 1e-10
+
+
 def test_what_density_control_judges_by_adds_up_over_cells(tmp_path, views, photos):
     found = []
     for blocks in (1, 5):

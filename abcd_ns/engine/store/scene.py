@@ -169,10 +169,11 @@ class StoredScene:
                 self._versions[name] = next(self._numbers)
             if header is not None or INBOX in blocks:
                 self._sort(blocks.get(INBOX, self.inbox))
-            self._memory.shrink(self.unsaved_bytes)
+            unsaved = self.unsaved_bytes  # under the lock: the writer takes out what it has written
+            self._memory.shrink(unsaved)
             self._rested = time.monotonic()
             self._writer.put(Snapshot(packed, header, state), within or math.inf)
-        if within <= 0 or self.unsaved_bytes > self.ram_bytes:
+        if within <= 0 or unsaved > self.ram_bytes:
             self.flush()
         self._writer.check()
 

@@ -27,6 +27,8 @@ from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 
+DOUBTED = 8
+"""Views that hardly show a block, as far as known, of which a visit looks at the first that sees it at all."""
 LOOK_AGAIN = 4
 """Blocks that were hidden behind others are looked at again every so many sweeps."""
 
@@ -118,14 +120,15 @@ class Planner(Visits):
             plan = self._next_plan(state, at_once)
             if self._is_hidden(state, plan.block) and state.sweep % LOOK_AGAIN:
                 continue
-            views = self._may_see(plan.block, self._run.reduction)
+            reduction = self._run.reduction  # of this moment: time may run on
+            views = self._may_see(plan.block, reduction)
             # Where nothing is known, or what shows the block has changed, all views are asked.
             known = self._known_to_show(state, plan.block, views)
             active = self._visit(state, plan, views, known, sh_degree) or self._visit(
                 state, plan, views, self._survey(plan.block, views).views, sh_degree
             )
             if active is not None:
-                active.began = began
+                active.began, active.reduction = began, reduction
                 return active
 
     @staticmethod
@@ -153,14 +156,16 @@ class Planner(Visits):
         if self._scene.tree.num_blocks == 1:
             return self._sole_visit(state, block, showing, sh_degree)
         used, earlier = self._views_used(state, len(showing)), self._scene.clocks(block).visits
-        doubtful = tuple(view for view in views if view not in set(showing))
+        doubtful = tuple(sorted(views.keys() - set(showing)))
         chosen = visit_views(showing, used, earlier, seed)
-        looked_at = visit_views(doubtful, 1, earlier, seed) if doubtful else ()
+        doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
         # Of thousands of views, only those that it uses are asked where they see the block.
-        geometry = self._survey(block, {view: views[view] for view in (*chosen, *looked_at)})
-        chosen, looked_at = (tuple(v for v in some if v in geometry.crops) for some in (chosen, looked_at))
+        found = self._survey(block, {view: views[view] for view in (*chosen, *doubted)})
+        chosen, doubted = (tuple(v for v in some if v in found.crops) for some in (chosen, doubted))
         if not chosen:
             return None
+        looked_at = doubted[:1]
+        geometry = VisitGeometry(block, {view: found.crops[view] for view in (*chosen, *looked_at)})
         return ActiveVisit(
             number=state.visit,
             geometry=geometry,
@@ -169,7 +174,6 @@ class Planner(Visits):
             views=(*chosen, *looked_at),
             looked_at=looked_at,
             showing=showing,
-            reduction=self._run.reduction,
         )
 
     def _sole_visit(
@@ -197,6 +201,7 @@ class Planner(Visits):
                 state.views = self._views_of_blocks(state)
             else:
                 state.sweep += 1
+                self._look_at_arrivals(state)
             remaining = None if self._budget.steps is None else self._budget.steps - state.planned
             last = config.recipe.last_passes or passes_for_layers(state.trained, state.frozen)
             state.trained = state.frozen = 0
@@ -215,6 +220,12 @@ class Planner(Visits):
         if not free:
             raise BlocksBusyError
         return state.queue.pop(min(free, key=lambda k: overlap(state.influence, state.queue[k].block, busy)))
+
+    def _look_at_arrivals(self, state: RunState) -> None:
+        """A block that no view saw may be seen once others have come into it."""
+        for block, seen in state.views.items():
+            if not seen and self._scene.mail(block) is not None:
+                state.views[block] = len(self._survey(block, self._may_see(block, 1)).views)
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
         """As far as influences are known they tell; a visit looks again."""

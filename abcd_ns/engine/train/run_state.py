@@ -101,6 +101,8 @@ class ActiveVisit:
         Args:
             progress: share of the run.
         """
+        if self.until <= self.since:  # time ran out as it began
+            return 1.0
         return min(max((progress - self.since) / (self.until - self.since), 0.0), 1.0)
 
 

@@ -113,8 +113,12 @@ class VisitTraining:
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
     def _note_influence(self, rendered: Rendered) -> None:
-        """Views of several sizes may have another order in the infos: they are drawn again afterwards."""
+        """Views of several sizes may have another order in the infos, and of those that are drawn in part
+        only a part is told: they are drawn again afterwards."""
         if self.influence is None or len(rendered.infos) != 1 or "weights" not in rendered.infos[0]:
+            return
+        most = self.run.config.limits.crop_pixels
+        if most and any(view.full.pixels > most for view in rendered.views):
             return
         weights = rendered.infos[0]["weights"].grad
         if weights is not None:

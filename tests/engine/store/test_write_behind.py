@@ -35,6 +35,24 @@ def scene(tmp_path) -> StoredScene:
     return StoredScene(tree, store)
 
 
+class Guarded(dict):
+    """Whoever goes through it must hold the lock: the writer takes things out."""
+
+    def __init__(self, scene: StoredScene) -> None:
+        super().__init__(scene._unsaved)
+        self._lock = scene._writer.lock
+
+    def values(self):
+        assert self._lock._is_owned()
+        return super().values()
+
+
+def test_what_is_not_on_disk_yet_is_counted_under_the_lock(scene):
+    scene._unsaved = Guarded(scene)
+    scene.rest(scene.tree, {0: moved(scene.state(0), 1)}, {"step": 1}, within=60.0)
+    assert scene.cached_bytes > 0
+
+
 class Disk:
     """Stands before a store's commits: notes them, and holds them up or refuses them."""
 

@@ -11,7 +11,7 @@ from abcd_ns.engine.layers.compositing import composite, fold
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.store.settle import with_mail
-from abcd_ns.engine.store.special_blocks import LIVE
+from abcd_ns.engine.store.special_blocks import INBOX, LIVE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -233,6 +233,22 @@ def test_blocks_that_no_view_sees_are_left_alone(tmp_path, views, photos, start)
     assert not {event.block for event in begun} & set(unseen)
     assert all(coordinator.state.views[b] == 0 for b in unseen)
     assert all(equal(coordinator.scene.gaussians(b), g) for b, g in zip(unseen, before, strict=True))
+
+
+def test_a_block_that_no_view_saw_is_visited_once_others_have_come_into_it(tmp_path, views, photos, start):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=3, steps=60)
+    first = coordinator.visits.begin().geometry.block
+    unseen = (first + 1) % 3
+    coordinator.state.views[unseen] = 0
+    coordinator.state.active = None
+    coordinator.state.queue.clear()
+    come = coordinator.scene.state(unseen)[:3]
+    coordinator.run.rest(coordinator.scene.tree, {INBOX: come}, within=0.0)
+    assert coordinator.scene.mail(unseen) is not None
+    begun = listen(coordinator, VisitBegan)
+    train(coordinator, photos)
+    assert unseen in {event.block for event in begun}
+    assert coordinator.state.views[unseen] > 0
 
 
 def test_events_tell_the_whole_story(tmp_path, views, photos, start):

@@ -197,6 +197,14 @@ def test_mcmc_relocates_the_dead_and_grows_up_to_the_limit(monkeypatch):
     assert len(params["means"]) == 103
 
 
+def test_mcmc_leaves_the_dead_where_none_is_alive():
+    gaussians = random_gaussians(20)
+    gaussians.opacities[:] = -9.0
+    params, optimizers = live(gaussians)
+    DensityControl(DensityConfig(strategy="mcmc")).after_step(params, optimizers, {}, (), clock(room=3))
+    assert len(params["means"]) == 20
+
+
 def test_mcmc_noise_moves_the_transparent_and_depends_on_the_seed():
     gaussians = random_gaussians(20, size=0.5)
     gaussians.opacities[:10], gaussians.opacities[10:] = -6.0, 6.0

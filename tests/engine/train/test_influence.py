@@ -80,6 +80,56 @@ def test_the_warm_up_draws_no_view_again_that_it_has_used(tmp_path, views, photo
         )
 
 
+def test_what_is_drawn_in_part_is_drawn_again_to_know_its_influence(tmp_path, views, photos, start):
+    density = DensityConfig(price=1.0, refine_every=1000)
+    coordinator = grown(tmp_path, start, views, density=density, crop_pixels=views[0].full.pixels // 4)
+    while coordinator.state.visit < 2:
+        train(coordinator, photos, steps=coordinator.state.step + 1)
+    known = coordinator.state.influence
+    whole = Gaussians.cat([coordinator.scene.gaussians(block) for block in range(4)])
+    for view in views:
+        seen = float(weights(whole, coordinator.run.rasterizer, [Shot(view, view.full)]).sum())
+        told = sum(row.get(view.index, 0.0) for row in known.values())
+        assert told == pytest.approx(seen / view.full.pixels, rel=0.15)
+
+
+def test_a_block_looks_at_a_doubtful_view_that_sees_it(tmp_path, views, photos, start, monkeypatch):
+    coordinator = grown(tmp_path, start, views)
+    train(coordinator, photos, steps=12)
+    extents = coordinator.run.rasterizer.extents
+
+    def partly_blind(gaussians, some):
+        nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
+        found = extents(gaussians, some)
+        return torch.stack(
+            [row if v.index in (0, 3) else nowhere for v, row in zip(some, found, strict=True)]
+        )
+
+    monkeypatch.setattr(coordinator.run.rasterizer, "extents", partly_blind)
+    coordinator.state.influence = {block: {0: 0.1} for block in range(4)}
+    active = coordinator.visits.begin()
+    assert active.views == (0, 3)
+    assert active.looked_at == (3,)
+
+
+def test_a_visit_trains_in_the_size_that_its_crops_are_of_though_time_runs_on(
+    tmp_path, views, photos, start, monkeypatch
+):
+    coordinator = grown(tmp_path, start, views)
+    train(coordinator, photos, steps=12)
+    sizes, seen = iter((2, 1, 1, 1)), []
+    monkeypatch.setattr(type(coordinator.run), "reduction", property(lambda _: next(sizes)))
+    extents = coordinator.run.rasterizer.extents
+
+    def watched(gaussians, some):
+        seen.extend(some)
+        return extents(gaussians, some)
+
+    monkeypatch.setattr(coordinator.run.rasterizer, "extents", watched)
+    active = coordinator.visits.begin()
+    assert {view.width for view in seen} == {views[0].reduced(active.reduction).width}
+
+
 def test_influence_survives_a_save(tmp_path, views, photos, start):
     coordinator = grown(tmp_path, start, views, influence_share=0.6)
     train(coordinator, photos, steps=12)

@@ -329,7 +329,9 @@ class DensityControl:
             refine_every=REFINE,
             min_opacity=MCMC_MIN_OPACITY,
         )
-        step = REFINE if self.is_due(clock) else GATHER
+        # gsplat puts the dead where some are alive, and fails where none is.
+        alive = self.is_due(clock) and bool((params["opacities"].sigmoid() > MCMC_MIN_OPACITY).any())
+        step = REFINE if alive else GATHER
         learning_rate = optimizers["means"].param_groups[0]["lr"]
         self._binomials = self._binomials.to(params["means"].device)
         strategy.step_post_backward(
