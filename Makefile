@@ -1,4 +1,4 @@
-# Needs Linux, Python 3.10 to 3.12, make and a C compiler. Everything else goes into .venv.
+# Needs Linux, Python 3.10 to 3.12, make and a C++ compiler. Everything else goes into .venv.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help

@@ -131,7 +131,7 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     scene = out / "scene"
     steps.begin(f"1/5  A scene: a walled court, seen by {SCENE['views_per_court']} cameras")
     flags = [word for name, value in SCENE.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    steps.run("synth", [*_abcd("synth"), str(scene), *flags])
+    steps.run("synth", [*_abcd("synth"), str(scene), *flags, "--overwrite"])
     steps.begin(f"2/5  Training in {blocks} blocks for {seconds:g} s")
     trained = _train(steps, out, scene, seconds, blocks)
     steps.begin("3/5  Held-out views: scores and pictures")

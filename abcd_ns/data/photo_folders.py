@@ -37,7 +37,7 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
     if full.is_dir():
         return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene)
     if not copies:
-        count, example = len(scene.frames), scene.frames[0].name
+        count, example = len(scene.frames), next((frame.name for frame in scene.frames), "none")
         raise InputError(
             f"{full} does not exist: put the {count} photos of {scene.model} there ({example}, ...)."
         )

@@ -84,7 +84,7 @@ def read_split_transforms(folder: Path) -> Scene:
         InputError: as `read_transforms`, or the two are in different worlds.
     """
     paths = [folder / f"{TRANSFORMS}_{split}.json" for split in ("train", "test", "val")]
-    scenes = [read_transforms(path) for path in paths if path.exists()][:2]
+    scenes = [read_transforms(path) for path in [path for path in paths if path.exists()][:2]]
     train, lists = scenes[0], []
     for scene in scenes:
         same = np.array_equal(train.applied_transform, scene.applied_transform)

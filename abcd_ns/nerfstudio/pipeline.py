@@ -88,8 +88,8 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
     the nearest distance at which a photo shows a point."""
     ram_budget_gb: float = 0.0
-    """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it.
-    0 takes 8, or 40% of the machine's memory where that is less."""
+    """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it, but
+    that `workers` 0 is one where it is set. 0 takes 8, or 40% of the machine's memory where that is less."""
     workers: int = 0
     """Blocks that are trained at once, each by a process of its own: on a core each, or on a GPU each, which
     needs Ray (pip install 'abcd-ns[cluster]'). 0 takes all cores where there is no GPU, as far as there are

@@ -23,7 +23,7 @@ from abcd_ns.engine.events import (
     WorkersSeen,
 )
 from abcd_ns.engine.space.influence import worth_training
-from abcd_ns.engine.space.tree import BlockTree
+from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
@@ -75,6 +75,7 @@ class AbcdPanel(ViewerControl):
         self._workers: tuple[WorkerSeen, ...] = ()
         self._laid_out = 0
         """Blocks for which boxes and lists are made; 0 before that."""
+        self._bounds: Box | None = None
         self._first_look: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
@@ -131,12 +132,15 @@ class AbcdPanel(ViewerControl):
     # -- what is shown -------------------------------------------------------------------------------
 
     def _lay_out(self) -> None:
-        """Boxes and the list of blocks, once the cut of space is known."""
+        """Boxes and the list of blocks, once the cut of space is known, and when blocks were cut in two."""
         tree, scene = self._model.tree, self._model.scene()
-        means = [scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)]  # one may be live
-        bounds = bulk(torch.cat(means))
-        self._scenery.set_boxes(boxes_of(tree, bounds))
-        self._first_look = first_look(bounds, self._views())
+        if self._bounds is None:  # once: every block is read for it
+            means = [
+                scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)
+            ]  # one may be live
+            self._bounds = bulk(torch.cat(means))
+        self._scenery.set_boxes(boxes_of(tree, self._bounds))
+        self._first_look = first_look(self._bounds, self._views())
         self._controls.set_blocks(tree.num_blocks)
         self._laid_out = tree.num_blocks
 

@@ -1,6 +1,7 @@
 """Folders that are laid out otherwise: photos and masks elsewhere, a file for each split, other splits."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,14 @@ def test_blender_scenes_come_in_their_splits(tmp_path, splits, held_out):
     assert torch.allclose(train.cameras.fx, theirs.cameras.fx.float())
     back = train.transform_poses_to_original_space(train.cameras.camera_to_worlds, "opengl")
     assert torch.allclose(back.float(), theirs.cameras.camera_to_worlds, atol=1e-5)
+
+
+def test_a_split_that_is_not_used_may_lack_its_photos(tmp_path):
+    data = write_blender(tmp_path, ("train", "test", "val"))
+    shutil.rmtree(data / "val")
+    assert {path.parent.name for path in parser(data).get_dataparser_outputs("test").image_filenames} == {
+        "test"
+    }
 
 
 def test_one_file_is_a_scene_without_a_split(tmp_path):

@@ -173,9 +173,12 @@ def test_more_rays_per_pixel_converge() -> None:
     assert 0 < error_two < 0.6 * error_one
 
 
-def test_finished_scene_is_left_alone(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_finished_scene_is_left_alone(
+    scene: Path, capsys: pytest.CaptureFixture[str], overwrite: bool
+) -> None:
     before = {p: p.stat().st_mtime_ns for p in scene.rglob("*")}
-    synth(scene, Settings(**TINY))
+    synth(scene, Settings(**TINY), overwrite)
     assert "already holds this scene" in capsys.readouterr().err
     assert {p: p.stat().st_mtime_ns for p in scene.rglob("*")} == before
 

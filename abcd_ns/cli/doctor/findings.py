@@ -128,9 +128,9 @@ def ram(facts: Facts) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "little-ram",
-            f"Only {free / GIB:.1f} GiB of RAM are free. By default, blocks take up to 2 GiB of it, and "
-            "decoded photos a tenth of all.",
-            "Close other programs, or reduce photos: --pipeline.datamanager.dataparser.downscale-factor 2",
+            f"Only {free / GIB:.1f} GiB of RAM are free. By default photos, blocks and layers take up "
+            "to 8 GB of it, or 40% of all.",
+            "Close other programs, or lower --pipeline.ram-budget-gb",
         )
 
 

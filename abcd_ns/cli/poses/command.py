@@ -1,6 +1,7 @@
 """`abcd poses`: from a folder of photos to a data set that can be trained on."""
 
 import os
+import shlex
 import shutil
 from pathlib import Path
 from typing import Annotated
@@ -143,7 +144,7 @@ def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) 
     few = 2 * len(model.posed) < len(names)
     if few:
         lines.append("That is fewer than half. Take photos between those that do not fit, or try --lens.")
-    lines.append(f"Next: ns-train abcd --data {data}")
+    lines.append(f"Next: ns-train abcd --data {shlex.quote(str(data))}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     return int(few)

@@ -28,7 +28,7 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 
 DOUBTED = 8
-"""Views that hardly show a block, as far as known, of which a visit looks at the first that sees it at all."""
+"""Views that hardly show a block, as far as known, of which a visit looks at the first that sees it."""
 LOOK_AGAIN = 4
 """Blocks that were hidden behind others are looked at again every so many sweeps."""
 

@@ -159,7 +159,7 @@ def _prepare(out: Path, settings: Settings, overwrite: bool) -> bool:
     if not take_folder(out, path, "scene of this command"):
         return True
     earlier = read_json(path)
-    if earlier == _marker(settings, complete=True) and not overwrite:
+    if earlier == _marker(settings, complete=True):
         return False
     if not overwrite:
         state = "another scene" if earlier.get("complete") else "an unfinished scene"

@@ -101,9 +101,8 @@ def test_a_block_looks_at_a_doubtful_view_that_sees_it(tmp_path, views, photos, 
     def partly_blind(gaussians, some):
         nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
         found = extents(gaussians, some)
-        return torch.stack(
-            [row if v.index in (0, 3) else nowhere for v, row in zip(some, found, strict=True)]
-        )
+        pairs = zip(some, found, strict=True)
+        return torch.stack([row if view.index in (0, 3) else nowhere for view, row in pairs])
 
     monkeypatch.setattr(coordinator.run.rasterizer, "extents", partly_blind)
     coordinator.state.influence = {block: {0: 0.1} for block in range(4)}

@@ -60,8 +60,8 @@ class DensityConfig:
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
-    """Share of the run after which the number of Gaussians no longer changes; a block grows in its first
-    visit all the same, unless that is in the last third."""
+    """Share of the run after which none is cloned or split; a block grows in its first visit all the same,
+    unless that is in the last third. Who fills less than the `price` goes later, too."""
     refine_every: int = 0
     """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
     where all is trained at once, as splatfacto has it, also in the warm-up, and 30 elsewhere."""
