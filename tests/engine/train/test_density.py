@@ -160,18 +160,21 @@ def test_giants_are_pruned_only_once_opacities_were_reset():
         assert len(params["means"]) == left
 
 
-def test_only_those_grow_that_fill_several_prices():
-    """Eight alike by their gradients, of which the last four fill too little."""
+@pytest.mark.parametrize(("views", "visit"), [(1, None), (3000, 40)])
+def test_only_those_grow_that_fill_several_prices(views, visit):
+    """Eight alike by their gradients, of which the last four fill too little in all views, however few of
+    them a visit draws."""
     gaussians = random_gaussians(8, size=0.005)
     params, optimizers = live(gaussians)
     growth = {
         "grad2d": torch.full((8,), 9.0),
         "count": torch.ones(8),
-        "weight": torch.tensor([13.0] * 4 + [11.0] * 4),
+        "weight": torch.tensor([13.0] * 4 + [11.0] * 4) / views,
         "looks": torch.ones(8),
     }
     control = DensityControl(DensityConfig(price=3.0, refine_every=10))
-    growth = control.after_step(params, optimizers, growth, (fake_info(8, 0.0),), clock(steps=100, views=1))
+    now = clock(steps=40, taken=40, views=views, visit=visit)
+    growth = control.after_step(params, optimizers, growth, (fake_info(8, 0.0),), now)
     assert len(params["means"]) == 12
     assert all(len(value) == 12 for value in growth.values())
 

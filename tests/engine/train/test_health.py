@@ -1,6 +1,7 @@
 """What goes wrong while a block is trained is noticed, told and mended; what is healthy is left as it is."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
 from abcd_ns.engine.gaussians.param_swap import attach
 from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.store.special_blocks import WHOLE
-from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.health.health_rules import is_worse, loss_rise, stand_ins, unsound
@@ -317,7 +318,11 @@ def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, visit_steps=10)
     train_step(coordinator, photos)
     coordinator.state.active.showing = tuple(range(seen))
-    assert coordinator.visit.live.density_clock(4, coordinator.batch, None).views == expected
+    clock = coordinator.visit.live.density_clock(4, coordinator.batch, None)
+    assert (clock.views, min(clock.views, clock.visit)) == (seen, expected)
+    due, control = replace(clock, progress=0.1, refined=0), DensityControl(DensityConfig(refine_every=1))
+    assert control.is_due(replace(due, steps=expected))
+    assert not control.is_due(replace(due, steps=expected - 1))
 
 
 @pytest.mark.parametrize("blocks", [1, 3])

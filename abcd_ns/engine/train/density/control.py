@@ -109,7 +109,7 @@ class DensityClock:
     taken: int
     """This step's."""
     views: int
-    """Views that see the block."""
+    """Views that the block is trained on."""
     room: int | None
     """Gaussians that may still be added to the scene; None for no limit."""
     seed: int
@@ -125,6 +125,9 @@ class DensityClock:
     spent: float = 0.0
     """Share of the visit that is done, for what is left must make good what growing and resets upset before
     others see the block; 0 where there are no others."""
+    visit: int | None = None
+    """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
+    show it."""
 
     def reached(self, every: int) -> bool:
         """Whether `steps` has come to a multiple of `every` in this step."""
@@ -169,7 +172,8 @@ class DensityControl:
             ends = max(ends, LAST)
         if not begins <= clock.progress < ends:
             return False
-        every = max(self.config.refine_every or clock.usual, clock.views, 1)
+        views = clock.views if clock.visit is None else min(clock.views, clock.visit)
+        every = max(self.config.refine_every or clock.usual, views, 1)
         if clock.refined is None:
             return clock.reached(every)
         return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= every

@@ -130,16 +130,15 @@ class LiveBlock:
             batch: views in each step.
             room: Gaussians that may be added.
         """
-        run, active, views = self._run, self._run.active, len(self._run.active.trained_on)
+        run, active = self._run, self._run.active
         blocks = run.blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
-        if blocks > 1:
-            views = min(views, active.steps * batch)  # once a visit, even with thousands of photos
         return DensityClock(
             progress=run.share,
             steps=self.clocks.steps,
             taken=taken,
-            views=views,
+            views=len(active.trained_on),
+            visit=active.steps * batch if blocks > 1 else None,
             room=room,
             usual=REFINE_EVERY_SCENE if blocks == 1 else REFINE_EVERY_BLOCK,
             seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
