@@ -14,8 +14,8 @@ Numbers = dict[str, list[float]]
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
-    """A tensor of the host on a device, which copies it when it comes to it."""
-    if device.type == "cuda":
+    """A tensor of the host on a device, which copies it when it comes to it, if it is not there."""
+    if device.type == "cuda" and tensor.device.type == "cpu":
         tensor = tensor.contiguous().pin_memory()
     return tensor.to(device, non_blocking=True)
 

@@ -134,10 +134,8 @@ class AbcdPanel(ViewerControl):
     def _lay_out(self) -> None:
         """Boxes and the list of blocks, once the cut of space is known, and when blocks were cut in two."""
         tree, scene = self._model.tree, self._model.scene()
-        if self._bounds is None:  # once: every block is read for it
-            means = [
-                scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)
-            ]  # one may be live
+        if self._bounds is None:  # once: every block is read for it, and one may be on the device
+            means = [scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)]
             self._bounds = bulk(torch.cat(means))
         self._scenery.set_boxes(boxes_of(tree, self._bounds))
         self._first_look = first_look(self._bounds, self._views())

@@ -132,6 +132,7 @@ class Coordinator(Trainer):
         state = self.visit.finish()
         if active.is_whole:
             self._end_warm_up()
+            self.visit.live.let_go(state.nobody)  # a worker may share the device for the rest of the run
         updates = settle(self.scene, active.geometry.block, state, self.config.recipe.migrate)
         if active.saved:
             updates[LIVE] = state.nobody

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from abcd_ns.engine.events import VisitBegan
+from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import influence, weights
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -153,6 +153,20 @@ def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(tmp
     train(coordinator, photos)
     assert sorted(visited) == [0, 1, 2, 3]
     assert all(sorted(used) == [0, 1, 2, 3, 4] for used in visited.values())
+
+
+def test_when_the_warm_up_is_over_nothing_of_it_stays_live(tmp_path, views, photos, start):
+    coordinator, seen = grown(tmp_path, start, views), []
+
+    def note(event):
+        if isinstance(event, VisitEnded) and event.block is None:
+            for name, parameter in coordinator.params.items():
+                moments = coordinator.optimizers[name].state[parameter]
+                seen.append([len(parameter), len(moments["exp_avg"]), len(moments["exp_avg_sq"])])
+
+    coordinator.announce.subscribe(note)
+    train(coordinator, photos, steps=20)
+    assert seen == [[0, 0, 0]] * 6
 
 
 def test_a_visit_asks_no_other_views_than_its_own_where_they_see_the_block(

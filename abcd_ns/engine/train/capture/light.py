@@ -119,7 +119,7 @@ class Light:
 
     @torch.no_grad()
     def _adapt(self, rows: Sequence[int], gradients: Tensor, damping: float) -> None:
-        places = torch.tensor(rows, device=self._home)
+        places = upload(torch.tensor(rows), torch.device(self._home))
         summed = (gradients * self._free).nan_to_num(0.0, 0.0, 0.0)
         self._uses[places] += 1
         uses = self._uses[places].view(-1, *[1] * (summed.ndim - 1))

@@ -58,6 +58,15 @@ class LiveBlock:
             rest.data.masked_fill_(are_gone(self.growth[GONE], rest), 0.0)
         return detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
 
+    def let_go(self, nobody: BlockState) -> None:
+        """Nothing is live any more, and the device has its memory back.
+
+        Args:
+            nobody: a state like the live block's, without Gaussians.
+        """
+        attach(nobody.to(self._run.device), self._run.params, self._run.optimizers)
+        self.growth, self._held = {}, None
+
     def count_step(self, views: int, taken: int) -> None:
         """The optimizers have stepped.
 
