@@ -79,6 +79,15 @@ def test_steps_on_the_device_make_the_photos_more_alike(tmp_path, begin, views, 
     assert mean_error(coordinator, views, photos) < 0.9 * before
 
 
+@pytest.mark.parametrize("light", ["exposure", "affine", "bilateral"])
+def test_light_is_found_on_the_device(tmp_path, begin, photos, light):
+    coordinator = begin(tmp_path, blocks=1, light=light, density=DensityConfig(strategy="off"))
+    train(coordinator, photos)
+    found = torch.stack([coordinator.run.light.of(view).detach().cpu() for view in coordinator.run.views])
+    assert bool(found.isfinite().all())
+    assert bool((found != found[0]).any())
+
+
 def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, begin, photos, device):
     """CUDA's fused Adam is told by a tensor that it is to do nothing."""
     if device.type != "cuda":

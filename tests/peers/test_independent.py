@@ -56,6 +56,14 @@ def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(tmp_path, 
         assert abs(steps - 30 * count / sum(seen)) <= 2
 
 
+def test_a_visit_that_begins_as_time_runs_out_is_at_its_end(tmp_path, views, photos, start):
+    coordinator = independent(tmp_path, start, views, blocks=3, steps=30)
+    train(coordinator, photos, steps=1)
+    coordinator.state.step = 30
+    active = coordinator.visits.begin()
+    assert active.share(coordinator.progress) == 1.0
+
+
 def test_a_block_begins_with_its_overlap_and_keeps_its_cell(tmp_path, views, photos, start):
     coordinator = independent(tmp_path, start, views, steps=12, density=STILL)
     begun, ended = listen(coordinator, VisitBegan), listen(coordinator, VisitEnded)

@@ -27,6 +27,22 @@ def grown(tmp_path, start, views, **options):
     )
 
 
+def asked_of(coordinator, monkeypatch, blind=()):
+    """Views that are asked where they see a block, a list for each time; the blind ones never see any."""
+    asked, extents = [], coordinator.run.rasterizer.extents
+    nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
+
+    def watched(gaussians, views):
+        asked.append(list(views))
+        found = extents(gaussians, views)
+        return torch.stack(
+            [nowhere if v.index in blind else row for v, row in zip(views, found, strict=True)]
+        )
+
+    monkeypatch.setattr(coordinator.run.rasterizer, "extents", watched)
+    return asked
+
+
 def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(tmp_path, views, photos, start):
     coordinator = grown(tmp_path, start, views, influence_share=0.6)
     seen = []
@@ -96,15 +112,7 @@ def test_what_is_drawn_in_part_is_drawn_again_to_know_its_influence(tmp_path, vi
 def test_a_block_looks_at_a_doubtful_view_that_sees_it(tmp_path, views, photos, start, monkeypatch):
     coordinator = grown(tmp_path, start, views)
     train(coordinator, photos, steps=12)
-    extents = coordinator.run.rasterizer.extents
-
-    def partly_blind(gaussians, some):
-        nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
-        found = extents(gaussians, some)
-        pairs = zip(some, found, strict=True)
-        return torch.stack([row if view.index in (0, 3) else nowhere for view, row in pairs])
-
-    monkeypatch.setattr(coordinator.run.rasterizer, "extents", partly_blind)
+    asked_of(coordinator, monkeypatch, blind=(1, 2, 4))
     coordinator.state.influence = {block: {0: 0.1} for block in range(4)}
     active = coordinator.visits.begin()
     assert active.views == (0, 3)
@@ -116,17 +124,10 @@ def test_a_visit_trains_in_the_size_that_its_crops_are_of_though_time_runs_on(
 ):
     coordinator = grown(tmp_path, start, views)
     train(coordinator, photos, steps=12)
-    sizes, seen = iter((2, 1, 1, 1)), []
+    sizes, asked = iter((2, 1, 1, 1)), asked_of(coordinator, monkeypatch)
     monkeypatch.setattr(type(coordinator.run), "reduction", property(lambda _: next(sizes)))
-    extents = coordinator.run.rasterizer.extents
-
-    def watched(gaussians, some):
-        seen.extend(some)
-        return extents(gaussians, some)
-
-    monkeypatch.setattr(coordinator.run.rasterizer, "extents", watched)
     active = coordinator.visits.begin()
-    assert {view.width for view in seen} == {views[0].reduced(active.reduction).width}
+    assert {view.width for few in asked for view in few} == {views[0].reduced(active.reduction).width}
 
 
 def test_influence_survives_a_save(tmp_path, views, photos, start):
@@ -174,16 +175,10 @@ def test_a_visit_asks_no_other_views_than_its_own_where_they_see_the_block(
 ):
     coordinator = grown(tmp_path, start, views, visit_views=2)
     train(coordinator, photos, steps=12)
-    asked, extents = [], coordinator.run.rasterizer.extents
-
-    def watched(gaussians, some):
-        asked.append([view.index for view in some])
-        return extents(gaussians, some)
-
-    monkeypatch.setattr(coordinator.run.rasterizer, "extents", watched)
+    asked = asked_of(coordinator, monkeypatch)
     for number in range(4):
         active = coordinator.visits.begin()
-        assert asked[number:] == [list(active.views)]
+        assert [[view.index for view in few] for few in asked[number:]] == [list(active.views)]
         assert sorted(active.geometry.crops) == sorted(active.views)
         assert len(active.views) <= 3 < len(active.trained_on)
 
@@ -191,14 +186,8 @@ def test_a_visit_asks_no_other_views_than_its_own_where_they_see_the_block(
 def test_views_that_show_a_block_no_more_are_found_out(tmp_path, views, photos, start, monkeypatch):
     coordinator = grown(tmp_path, start, views, visit_views=2)
     train(coordinator, photos, steps=12)
-    extents, blind = coordinator.run.rasterizer.extents, (0, 1, 2)
-
-    def partly_blind(gaussians, some):
-        found = extents(gaussians, some)
-        nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
-        return torch.stack([nowhere if v.index in blind else row for v, row in zip(some, found, strict=True)])
-
-    monkeypatch.setattr(coordinator.run.rasterizer, "extents", partly_blind)
+    blind = (0, 1, 2)
+    asked_of(coordinator, monkeypatch, blind)
     coordinator.state.influence = {block: dict.fromkeys(blind, 0.1) for block in range(4)}
     for _ in range(4):
         active = coordinator.visits.begin()

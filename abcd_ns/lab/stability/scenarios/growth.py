@@ -89,9 +89,9 @@ def refinements(cameras: int, sweep: int) -> int:
     control, batch = DensityControl(DensityConfig()), DEFAULT_BATCH
     used = views_per_visit(cameras, cameras, VIEWS)
     steps = -(-passes_of_sweep(sweep, PASSES, PASSES, used) * used // batch)
-    views, done = min(cameras, steps * batch), 10 * max(cameras, 1)
+    drawn, done = steps * batch, 10 * max(cameras, 1)
     clocks = [
-        DensityClock(0.2, done + batch * (k + 1), batch, views, None, 0, REFINE_EVERY_BLOCK)
+        DensityClock(0.2, done + batch * (k + 1), batch, cameras, None, 0, REFINE_EVERY_BLOCK, visit=drawn)
         for k in range(steps)
     ]  # see LiveBlock.density_clock
     return sum(control.is_due(clock) for clock in clocks)
