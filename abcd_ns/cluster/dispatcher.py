@@ -99,7 +99,7 @@ class Dispatcher(Trainer):
         """
         self.stopwatch.start()
         if not self._leases and self.device.type == "cuda":
-            torch.cuda.empty_cache()  # of the warm-up: a worker may share this device
+            torch.cuda.empty_cache()  # of what was trained here: a worker may share this device
         while self._counted >= self.state.step and not self.finished:
             self._lend()
             if self._counted < self.state.step or self.finished:
@@ -108,8 +108,10 @@ class Dispatcher(Trainer):
                 self._hear(report)
             self.announce(WorkersSeen(tuple(self.workers.seen())))
         self._counted += 1
-        if self.finished:
-            self._local.shed_at_end()
+
+    def complete(self) -> None:
+        """As the coordinator's."""
+        self._local.complete()
 
     @property
     def finished(self) -> bool:

@@ -131,12 +131,13 @@ class AbcdModel(SplatfactoModel):
             self._parted = means, tree, MemoryScene(tree, self.merged())
         return self._parted[2]
 
-    def merged(self) -> Gaussians:
-        """The whole scene in one list, without a graph. Not a property: it may read everything from disk."""
+    def merged(self, device: torch.device | str = "cpu") -> Gaussians:
+        """The whole scene in one list, without a graph; while training, on a device. Not a property: it may
+        read everything from disk."""
         if self._coordinator is None:
             return live_gaussians(self.gauss_params).detach()
         scene = self._coordinator.scene
-        return Gaussians.cat([scene.gaussians(block).to("cpu") for block in range(scene.tree.num_blocks)])
+        return Gaussians.cat([scene.drawn(block, device) for block in range(scene.tree.num_blocks)])
 
     def initial_gaussians(self, views: Sequence[View], point_pixels: float) -> Gaussians:
         """What a run begins with: random Gaussians, or one for each point that the views can tell apart.
@@ -241,7 +242,7 @@ class AbcdModel(SplatfactoModel):
         """
         if self._is_too_large():
             return self._by_units(view, "fragments").everything()
-        gaussians = self._crop(self.merged().to(self.device))
+        gaussians = self._crop(self.merged(self.device).to(self.device))
         return self.draws_with()(
             gaussians,
             view,

@@ -142,6 +142,7 @@ class AbcdPipeline(VanillaPipeline):
             if step_check(step, trainer.config.logging.steps_per_log, run_at_zero=True):
                 writer.put_dict("ABCD", report.scalars(), step)
             if self.coordinator.finished:
+                self.coordinator.complete()
                 trainer.stop_training = True
 
         def end_run(step: int) -> None:  # noqa: ARG001

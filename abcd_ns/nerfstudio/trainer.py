@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
-from abcd_ns.engine.events import Event, LayersDrawn, WorkersSeen
+from abcd_ns.engine.events import Event, LayersDrawn, Shedding, WorkersSeen
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder
 from abcd_ns.errors import UserError
@@ -137,7 +137,7 @@ class AbcdTrainer(Trainer):
         """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
         with exit_on_user_error():
             super().setup(*args, **kwargs)
-        self.pipeline.coordinator.announce.subscribe(self._between_layers)
+        self.pipeline.coordinator.announce.subscribe(self._may_stop)
 
         def begin_step(step: int) -> None:  # noqa: ARG001 - nerfstudio passes it
             self._signals.hold()
@@ -156,6 +156,7 @@ class AbcdTrainer(Trainer):
         """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
         try:
             with self._signals:
+                self._complete()
                 super().train()
         except Stopped as stopped:
             self._end_report()
@@ -180,6 +181,14 @@ class AbcdTrainer(Trainer):
                 self.pipeline.coordinator.scene.flush()
             raise
 
+    def _complete(self) -> None:
+        """A run that has had its steps or seconds takes no more; what comes after may be missing."""
+        if self.pipeline.coordinator.finished:
+            self._signals.hold()
+            self.pipeline.coordinator.complete()
+            self._signals.release()
+            self.config.max_num_iterations = 0
+
     def _memory_is_full(self) -> str:
         limit = self.pipeline.coordinator.config.limits.block_limit
         room = f"blocks of {limit:,} Gaussians" if limit else f"{self.config.pipeline.blocks} blocks"
@@ -203,9 +212,9 @@ class AbcdTrainer(Trainer):
         with suppress(Stopped):
             super()._train_complete_viewer()
 
-    def _between_layers(self, event: Event) -> None:
-        # Drawing layers, or waiting for workers, may take long, and nothing could be lost meanwhile.
-        if isinstance(event, (LayersDrawn, WorkersSeen)):
+    def _may_stop(self, event: Event) -> None:
+        # They may take long, and nothing could be lost meanwhile.
+        if isinstance(event, (LayersDrawn, Shedding, WorkersSeen)):
             self._signals.check()
 
     def _end_report(self) -> None:

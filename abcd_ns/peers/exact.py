@@ -204,10 +204,11 @@ class ExactTrainer(Trainer):
         everything, tree = self._all.gaussians, self.scene.tree
         optics = Optics([sample.view for sample in self._batch.samples], self.run.rasterizer.slack)
         owner, slack = self._owner_of_all(), optics.slack(everything.means)
+        shapes = everything.means, everything.scales
         for block in range(tree.num_blocks):
             inside = owner == block
             if self.config.recipe.ownership == "fragments":
-                inside = inside | reaches(everything, tree.cell(block), slack, optics.slant)
+                inside = inside | reaches(*shapes, tree.cell(block), slack, optics.slant)
             rows = inside.nonzero()[:, 0]
             if len(rows):
                 yield block, rows, everything[rows].to(self.device)

@@ -80,7 +80,7 @@ class BlockPictures:
         """
         if show is Show.EVERYTHING or block is None:
             return self.everything()
-        own = self.painter.scene.gaussians(block).to(self.painter.device)
+        own = self.painter.scene.drawn(block, self.painter.device)
         if show is Show.BLOCK:
             return self._raster(own)
         window = self._window(own)

@@ -317,3 +317,21 @@ def test_workers_draw_from_the_poses_that_the_warm_up_has_found(make, photos, mo
     assert drawn_from
     assert all(torch.equal(seen[view], pose) for seen in drawn_from for view, pose in found.items())
     assert run.run.poses.refined == found
+
+
+@pytest.mark.parametrize("stopped_in", ["the warm-up", "a visit"])
+def test_what_was_trained_here_leaves_the_device_before_anything_is_lent(make, photos, stopped_in):
+    options = {"density": STILL} | ({"scaffold": 40, "warmup": 0.3} if stopped_in == "the warm-up" else {})
+    alone = make("run", **options)
+    train(alone, photos, steps=3)
+    assert alone.state.active is not None
+    alone.save()
+    alone.close()
+    run = make("run", workers=2, resume=True, **options)
+    while not run.trains_elsewhere:
+        train(run, photos, steps=1)
+    held, submit = [], run.workers.submit
+    run.workers.submit = lambda lease: (held.append(len(run.params["means"])), submit(lease))
+    train(run, photos)
+    assert held
+    assert not any(held)

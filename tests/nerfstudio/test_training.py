@@ -222,8 +222,13 @@ def test_seconds_end_a_run(data, tmp_path):
     config.pipeline.max_seconds = 2.0
     trainer = run(config)
     assert trainer.pipeline.coordinator.finished
-    assert trainer.pipeline.coordinator.state.step < 100_000
-    assert trainer.pipeline.coordinator.state.active is None
+    ended = trainer.pipeline.coordinator
+    assert ended.state.step < 100_000
+    assert ended.state.active is None
+    config = configure(data, tmp_path / "again", steps=100_000, load_dir=trainer.checkpoint_dir)
+    config.pipeline.max_seconds = 2.0
+    again = run(config).pipeline.coordinator
+    assert (again.state.step, again.count()) == (ended.state.step, ended.count())
 
 
 def test_the_saved_config_is_the_config(trained):

@@ -85,7 +85,7 @@ def test_rules_of_a_refinement_copy_cameras_once_however_many_there_are(counts, 
     assert counts.since(before).copies_to_device == 1
     before = counts.copy()
     lowered(gaussians, growth, ring)
-    assert counts.since(before).copies_to_device == 2
+    assert counts.since(before).copies_to_device == 1
 
 
 def test_numbers_of_a_step_are_there_a_step_later(counts):

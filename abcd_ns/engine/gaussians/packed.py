@@ -7,6 +7,8 @@ Gaussian, then those of the second, as many each as the column `degrees` says.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.sh_degrees import degrees_in_use, up_to_degree
@@ -35,13 +37,20 @@ class Packed(NamedTuple):
         """Bytes of all tensors."""
         return sum(value.nbytes for value in self.tensors.values())
 
-    def gaussians(self, before: str = "") -> Gaussians:
-        """As they are drawn; or their moments, whose names have something before them."""
-        values = {name: self.tensors[before + name] for name in PARAM_NAMES}
+    def gaussians(self, before: str = "", device: torch.device | str = "cpu") -> Gaussians:
+        """As they are drawn; or their moments, whose names have something before them. Unpacked on a device,
+        which is sent no zeros."""
+        values = {name: self.tensors[before + name].to(device) for name in PARAM_NAMES}
         packed, coefficients = values["features_rest"], self.meta["coefficients"]
         rest = packed.new_zeros(len(values["means"]), coefficients, 3)
-        rest[up_to_degree(self.tensors[DEGREES], coefficients)] = packed
+        rest[up_to_degree(self.tensors[DEGREES].to(device), coefficients)] = packed
         return Gaussians(**{**values, "features_rest": rest})
+
+    def drawn_at(self, rows: Bool[Tensor, "n"]) -> "Packed":
+        """Some Gaussians, as others draw them; `parameters` stays that of all."""
+        kept = rows.repeat_interleave((self.tensors[DEGREES].long() + 1).square() - 1)
+        chosen = {name: self.tensors[name][kept if name == "features_rest" else rows] for name in DRAWN}
+        return Packed(chosen, self.meta)
 
     def part(self, names: set[str]) -> "Packed":
         """Some columns."""

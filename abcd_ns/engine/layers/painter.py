@@ -7,6 +7,7 @@ With ownership by *means* a layer holds a node's own Gaussians whole, as the pap
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -142,10 +143,9 @@ class Painter:
                 for k, (view, _) in enumerate(seen_by.seen)
                 if any(row[k] for row in shown.values())
             )
-        # The live block is on the device already, the others are not.
-        parts = [self.scene.gaussians(block).to(self.device) for block in inside]
-        own = sum(map(len, parts))
-        parts += [self.reaching(block, self.tree.box(unit)).to(self.device) for block in outside]
+        parts = [self.scene.drawn(block, self.device) for block in inside]
+        own, box = sum(map(len, parts)), self.tree.box(unit)
+        parts += [self.scene.drawn(block, self.device, partial(self._reach, box)) for block in outside]
         return Loaded(Gaussians.cat(parts) if parts else Gaussians.empty(device=self.device), own, seen)
 
     def _shown(self, unit: int, blocks: Sequence[int], seen_by: Frusta) -> dict[int, list[bool]]:
@@ -159,10 +159,9 @@ class Painter:
         rows = seen_by.may_show(list(boxes.values())).tolist()
         return {b: row for b, row in zip(boxes, rows, strict=True) if any(row)}
 
-    def reaching(self, block: int, box: Box) -> Gaussians:
-        """The block's Gaussians that some view may see inside `box`."""
-        gaussians = self.scene.gaussians(block)
-        return gaussians[reaches(gaussians, box, self._optics.slack(gaussians.means), self._optics.slant)]
+    def _reach(self, box: Box, means: Tensor, scales: Tensor) -> Tensor:
+        """Which Gaussians some view may see inside a box, [n]."""
+        return reaches(means, scales, box, self._optics.slack(means), self._optics.slant)
 
     def paint(
         self,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from abcd_ns.engine.render.primitive import DRAWN_SIGMAS
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import Crop, View
 
 
 def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int = 16) -> Crop | None:
@@ -62,7 +62,11 @@ def widest_slant(view: View) -> float:
 
 
 def reaches(
-    gaussians: Gaussians, box: Box, slack: Float[Tensor, "n"] | float = 0.0, slant: float = 2.0
+    means: Float[Tensor, "n 3"],
+    scales: Float[Tensor, "n 3"],
+    box: Box,
+    slack: Float[Tensor, "n"] | float = 0.0,
+    slant: float = 2.0,
 ) -> Bool[Tensor, "n"]:
     """Whether any fragment of each Gaussian may lie in `box`, from any view: False is certain.
 
@@ -74,9 +78,8 @@ def reaches(
         slant: the largest `widest_slant` of the views in question. 2 covers fields of view up to about
             90 degrees horizontally by 60 vertically.
     """
-    means = gaussians.means
     outside = torch.maximum(box.lower.to(means) - means, means - box.upper.to(means)).clamp(min=0)
-    return outside.norm(dim=1) <= slant * reach_radius(gaussians.scales) + slack
+    return outside.norm(dim=1) <= slant * reach_radius(scales) + slack
 
 
 def _aligned_span(low: float, high: float, size: int, margin: int, align: int) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.space.tree import BlockTree, Box
+from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Gaussians
 
@@ -19,7 +20,7 @@ class Outlines:
     """See BlockScene."""
 
 
-class LentScene:
+class LentScene(VisitScene):
     """The blocks of a moment: one with all that its training goes on from, the others to be drawn.
 
     Args:

@@ -9,6 +9,8 @@ from itertools import accumulate, pairwise
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.packed import DRAWN, WAITS, Packed
@@ -22,6 +24,9 @@ from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
 from abcd_ns.engine.store.table import Table
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import Gaussians
+
+Which = Callable[[Float[Tensor, "n 3"], Float[Tensor, "n 3"]], Bool[Tensor, "n"]]
+"""Picks Gaussians by their means and scales."""
 
 
 @runtime_checkable
@@ -41,6 +46,10 @@ class BlockScene(Protocol):
     def bounds(self, block: int) -> Box | None:
         """`bounds_of` the block's Gaussians."""
         ...
+
+    def drawn(self, block: int, device: torch.device | str, which: Which | None = None) -> Gaussians:
+        """As `gaussians`, on a device; of them those that are picked, if all are not wanted."""
+        return _picked(self.gaussians(block), which).to(device)
 
 
 @runtime_checkable
@@ -68,7 +77,7 @@ class VisitScene(BlockScene, Protocol):
         ...
 
 
-class MemoryScene:
+class MemoryScene(BlockScene):
     """A scene that is one list of Gaussians in memory, parted by a tree."""
 
     def __init__(self, tree: BlockTree, gaussians: Gaussians) -> None:
@@ -94,7 +103,7 @@ class MemoryScene:
         return self._bounds[block]
 
 
-class ChangedScene:
+class ChangedScene(BlockScene):
     """A scene of which others see something else.
 
     Args:
@@ -115,7 +124,7 @@ class ChangedScene:
         return self._scene.bounds(block)
 
 
-class StoredScene:
+class StoredScene(VisitScene):
     """A scene at rest in a ParameterStore, read block by block, with the live block laid over it.
 
     Blocks that were read stay in RAM, least recently used first out, within `ram_bytes`.
@@ -290,25 +299,32 @@ class StoredScene:
             return everything[self.tree.assign(everything.means) == block]
         if self._live is not None and self._live[0] == block:
             return self._live[1]().detach()
-        return self._with_mail(block, self.stored(block, waiting=False))
+        return self._seen_at_rest(block, "cpu", None)
+
+    def drawn(self, block: int, device: torch.device | str, which: Which | None = None) -> Gaussians:
+        """As for any scene; what is at rest is cut while it is packed, and unpacked on the device."""
+        if self._live is not None and self._live[0] in (None, block):
+            return super().drawn(block, device, which)
+        return self._seen_at_rest(block, device, which)
+
+    def _seen_at_rest(self, block: int, device: torch.device | str, which: Which | None) -> Gaussians:
+        packed, mail = self._drawn(block), self.mail(block)
+        rows = ~packed.tensors[WAITS]  # they are not to be seen before the block's next visit
+        if which is not None:
+            rows &= which(packed.tensors["means"], packed.tensors["scales"])
+        found = (packed if bool(rows.all()) else packed.drawn_at(rows)).gaussians(device=device)
+        if mail is None:
+            return found
+        return Gaussians.cat([found, _picked(mail.gaussians, which).to(device)])
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
-        return self._with_mail(block, self.stored(block))
-
-    def _with_mail(self, block: int, stored: Gaussians) -> Gaussians:
-        mail = self.mail(block)
+        stored, mail = self.stored(block), self.mail(block)
         return stored if mail is None else Gaussians.cat([stored, mail.gaussians])
 
-    def stored(self, name: BlockName, waiting: bool = True) -> Gaussians:
-        """What is at rest under a name, without mail.
-
-        Args:
-            waiting: also who is not to be seen before the block's next visit.
-        """
-        packed = self._drawn(name)
-        gaussians, waits = packed.gaussians(), packed.tensors[WAITS]
-        return gaussians if waiting or not bool(waits.any()) else gaussians[~waits]
+    def stored(self, name: BlockName) -> Gaussians:
+        """What is at rest under a name, without mail; those included who wait for the block's next visit."""
+        return self._drawn(name).gaussians()
 
     def _drawn(self, name: BlockName) -> Packed:
         with self._writer.lock:
@@ -365,3 +381,7 @@ class StoredScene:
         if block not in self._bounds or self._bounds[block][0] != version:
             self._bounds[block] = (version, bounds_of(self.gaussians_at_rest(block)))
         return self._bounds[block][1]
+
+
+def _picked(gaussians: Gaussians, which: Which | None) -> Gaussians:
+    return gaussians if which is None else gaussians[which(gaussians.means, gaussians.scales)]

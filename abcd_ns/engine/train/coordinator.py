@@ -104,8 +104,6 @@ class Coordinator(Trainer):
         self.visit.after_step(rendered, psnrs)
         if self.visit.is_over:
             self.end_visit()
-            if self.finished:
-                self.shed_at_end()
         elif self.scene.is_due(self.config.commit_seconds):
             self.rest(AT_ONCE)
 
@@ -132,7 +130,7 @@ class Coordinator(Trainer):
         state = self.visit.finish()
         if active.is_whole:
             self._end_warm_up()
-            self.visit.live.let_go(state.nobody)  # a worker may share the device for the rest of the run
+        self.visit.live.let_go()  # a worker, or the next survey, may need the device's memory
         updates = settle(self.scene, active.geometry.block, state, self.config.recipe.migrate)
         if active.saved:
             updates[LIVE] = state.nobody
@@ -143,11 +141,14 @@ class Coordinator(Trainer):
         if not active.is_whole and not self.state.queue:
             self.announce(SweepEnded(self.state.sweep, self.state.step))
 
-    def shed_at_end(self) -> None:
+    def complete(self) -> None:
         """Take out what the complete run's pictures hardly miss, where options ask for it and there are
-        photos to tell."""
-        if self._last is not None and self._last.is_wanted:
-            self._last.take()
+        photos to tell. Whoever goes on from a kill in its midst does it anew, with what is left by then."""
+        if self.state.shed_at == self.state.step or self._last is None or not self._last.is_wanted:
+            return
+        self._last.take()
+        self.state.shed_at = self.state.step
+        self.run.rest(self.scene.tree, {}, 0.0)
 
     def _end_warm_up(self) -> None:
         """From now on it is known what views show of which block."""

@@ -131,6 +131,8 @@ class RunState:
     """Of each view by the whole scene, so far; counted where poses are refined. A block is its part of it."""
     posed: float = 0.0
     """Uses after which poses were last refined."""
+    shed_at: int = -1
+    """Steps after which the last shedding was done."""
     health: Ledger = field(default_factory=dict)
     """What had to be mended, by block."""
     active: ActiveVisit | None = None

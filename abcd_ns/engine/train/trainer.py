@@ -58,6 +58,9 @@ class Trainer(ABC):
             psnrs: of each picture, dB; listeners are told their mean.
         """
 
+    def complete(self) -> None:  # noqa: B027 - most have nothing left to do
+        """Call when the run is finished: does what comes after the last step, if it was not done."""
+
     # -- elsewhere -----------------------------------------------------------------------------------
 
     @property

@@ -19,6 +19,8 @@ def train(coordinator: Trainer, photo: PhotoReader, steps: int | None = None) ->
     while not coordinator.finished and (steps is None or taken < steps):
         train_step(coordinator, photo)
         taken += 1
+    if coordinator.finished:
+        coordinator.complete()
 
 
 def train_step(coordinator: Trainer, photo: PhotoReader) -> None:

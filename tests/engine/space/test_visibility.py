@@ -127,7 +127,7 @@ def test_no_gaussian_draws_in_a_box_it_is_said_not_to_reach(seed, cropped):
     box = Box(middle - 0.7, torch.tensor([math.inf, 0.5, 0.9]).double() + middle)
     truth = drawn_in_box(view, crop, box, means2d, radii, depths, conics)
     blur = world_size(SPLATS.blur_pixels, depths.clamp(min=0), view)
-    anywhere = reaches(gaussians, box, blur, widest_slant(view))
+    anywhere = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant(view))
     assert not bool((truth & ~anywhere).any())
 
 
@@ -138,7 +138,7 @@ def test_the_tests_of_reach_are_not_vacuous():
     box = Box(middle - 1.2, middle + 1.2)
     truth = drawn_in_box(view, view.full, box, means2d, radii, depths, conics)
     blur = world_size(SPLATS.blur_pixels, depths.clamp(min=0), view)
-    anywhere = reaches(gaussians, box, blur, widest_slant(view))
+    anywhere = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant(view))
     assert int(truth.sum()) >= 20
     assert int(anywhere.sum()) < 400
 
@@ -149,12 +149,10 @@ def test_reach_is_measured_to_the_nearest_point_of_the_box():
     gaussians.scales.copy_(torch.log(torch.tensor([[0.1, 0.1, 0.1], [0.1, 1.0, 0.2], [1.0, 1.0, 1.0]])))
     box = Box(torch.zeros(3).double(), torch.ones(3).double())
     assert reach_radius(gaussians.scales, sigma=3.0).tolist() == pytest.approx([0.3, 3.0, 3.0])
+    shapes = gaussians.means, gaussians.scales
     # Distances 0, 5 and 9.
-    assert reaches(gaussians, box, slant=1.0).tolist() == [True, False, False]
-    assert reaches(gaussians, box, slack=1.7, slant=1.0).tolist() == [True, True, False]
-    assert reaches(gaussians, box, slant=3.0).tolist() == [True, True, True]
-    assert reaches(gaussians, box, slack=torch.tensor([0.0, 0.0, 6.0]), slant=1.0).tolist() == [
-        True,
-        False,
-        True,
-    ]
+    assert reaches(*shapes, box, slant=1.0).tolist() == [True, False, False]
+    assert reaches(*shapes, box, slack=1.7, slant=1.0).tolist() == [True, True, False]
+    assert reaches(*shapes, box, slant=3.0).tolist() == [True, True, True]
+    of_each = torch.tensor([0.0, 0.0, 6.0])
+    assert reaches(*shapes, box, slack=of_each, slant=1.0).tolist() == [True, False, True]

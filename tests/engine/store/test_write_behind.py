@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
+from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")
@@ -85,6 +87,27 @@ def on_disk(scene: StoredScene) -> dict:
 def equal(a: BlockState, b: BlockState) -> bool:
     (first, meta), (second, other) = a.packed(), b.packed()
     return meta == other and all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+# What others draw of a block at rest
+
+
+def every_other(means, scales):
+    return ((means[:, 0] + scales[:, 1]) * 1000).long() % 2 == 0
+
+
+@pytest.mark.parametrize("which", [None, every_other])
+def test_who_waits_is_left_out_and_mail_is_drawn_picked_or_not(scene, which):
+    state = scene.state(1)
+    waits = torch.arange(len(state)) % 3 == 0
+    # Mail lies in the block's cell.
+    mail = BlockState.fresh(state.gaussians[2:5])
+    scene.rest(scene.tree, {1: replace(state, waits=waits), INBOX: mail}, {}, within=60.0)
+    seen = Gaussians.cat([state.gaussians[~waits], mail.gaussians])
+    expected = seen if which is None else seen[which(seen.means, seen.scales)]
+    drawn = scene.drawn(1, "cpu", which)
+    assert which is None or 0 < len(expected) < len(seen)
+    assert all(torch.equal(value, getattr(drawn, name)) for name, value in expected.items())
 
 
 # The queue

@@ -8,11 +8,19 @@ import torch
 from abcd_ns.engine.events import ShedAtEnd, Shedding
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step import last_shedding
 from abcd_ns.engine.train.step.last_shedding import LastShedding, _Probe, random_signs
 from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
+from tests.reference.scenes import (
+    Photos,
+    listen,
+    make_coordinator,
+    random_gaussians,
+    ring_of_views,
+    whole_scene,
+)
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, price=1e-9)
 """Nothing grows, and training sheds nobody that fills anything."""
@@ -132,6 +140,47 @@ def test_a_complete_run_goes_on_with_those_that_are_left(tmp_path, ring, picture
     assert not [event for event in again if isinstance(event, ShedAtEnd)]
     train(longer, pictured)
     assert at_end(again).before - at_end(again).after <= 0.05
+
+
+class KilledError(Exception):
+    """The process ends."""
+
+
+def test_who_is_killed_in_it_does_it_anew_and_once(tmp_path, ring, pictured, monkeypatch):
+    def killed_at(block, *_):
+        if block == 2:
+            raise KilledError
+
+    target = lambda sample: (pictured(sample.view.index, sample.crop), None)  # noqa: E731
+    options = {"steps": 40, "density": STILL, "batch": 1, "background": "black", "target": target}
+    coordinator = make_coordinator(tmp_path, scene(), ring, blocks=4, **options)
+    with monkeypatch.context() as patched:
+        take_out = LastShedding._take_out
+        patched.setattr(LastShedding, "_take_out", lambda self, *of: killed_at(*of) or take_out(self, *of))
+        with pytest.raises(KilledError):
+            train(coordinator, pictured)
+    coordinator.close()
+    for times in (1, 0):
+        again = make_coordinator(tmp_path, scene(), ring, resume=True, **options)
+        told = listen(again, ShedAtEnd)
+        assert again.finished
+        train(again, pictured)
+        again.complete()
+        assert len(told) == times
+        again.close()
+
+
+def test_a_run_whose_time_is_up_between_two_looks_is_complete_all_the_same(tmp_path, ring, pictured):
+    target = lambda sample: (pictured(sample.view.index, sample.crop), None)  # noqa: E731
+    options = {"blocks": 2, "steps": 40, "density": STILL, "batch": 1, "target": target}
+    coordinator = make_coordinator(tmp_path, scene(), ring, **options)
+    told = listen(coordinator, ShedAtEnd)
+    while coordinator.state.step == 0 or coordinator.state.active is not None:
+        train(coordinator, pictured, steps=1)
+    assert not coordinator.finished
+    coordinator.run.budget = Budget(steps=coordinator.state.step)
+    train(coordinator, pictured)
+    assert len(told) == 1
 
 
 def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian(tmp_path, ring, pictured):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from abcd_ns.engine.events import BlockSplit, VisitBegan
+from abcd_ns.engine.events import BlockSplit, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import RESERVE
@@ -94,13 +94,11 @@ def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, sta
 def test_a_block_that_is_alone_may_be_larger_until_it_is_cut(tmp_path, views, photos, start):
     options = {"blocks": 1, "steps": 50, "density": GROWING, "block_limit": 90, "warmup": 0.0}
     coordinator = make_coordinator(tmp_path, start, views, **options, sole_limit=200)
-    largest = {True: 0, False: 0}
-    while not coordinator.finished:
-        alone = coordinator.scene.tree.num_blocks == 1
-        train_step(coordinator, photos)
-        largest[alone] = max(largest[alone], len(coordinator.params["means"]))
-    assert 0.75 * 200 < largest[True] <= 200
-    assert 0 < largest[False] <= 90
+    ended = listen(coordinator, VisitEnded)
+    train(coordinator, photos)
+    alone, *others = (visit.gaussians for visit in ended)
+    assert 0.75 * 200 < alone <= 200
+    assert 0 < max(others) <= 90
 
 
 def test_a_block_that_has_room_is_not_cut(tmp_path, views, photos, start):

@@ -8,7 +8,6 @@ one is taken for which this and the price of the numbers are least together; tho
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -35,8 +34,18 @@ RIDGE = 1e-3 / (4 * torch.pi)
 """Added to the fit: a share of the mean square of a harmonic, so that what no view tells stays as it is."""
 REACH = 3.0
 """Standard deviations up to which a Gaussian shows, about."""
-AT_ONCE = 1 << 22
-"""Numbers of a tensor, about, where Gaussians are fitted part by part."""
+AT_ONCE, OF_EACH = 1 << 22, 32
+"""Numbers of a tensor, about, where Gaussians are fitted part by part: so many, or so many for each Gaussian
+where that is more, half of what gradients take. However large a block is, an accelerator has few parts."""
+
+
+class _Cameras(NamedTuple):
+    """Views, on the device of the Gaussians."""
+
+    viewmats: Float[Tensor, "v 4 4"]
+    intrinsics: Float[Tensor, "v 3 3"]
+    ends: Float[Tensor, "v 3"]
+    """Width and height, px, and the near plane."""
 
 
 class Lowered(NamedTuple):
@@ -87,24 +96,30 @@ def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[
     weight, looks = (growth[name] for name in WEIGHED)
     weight = torch.where(looks >= seen, weight * seen / looks.clamp_min(1.0), torch.nan)
     gone = growth.get(GONE, torch.zeros_like(weight))
-    chosen = _beside(gaussians.means, views[:: max(-(-len(views) // MOST_VIEWS), 1)])
+    chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
+    cameras = _beside(gaussians.means, chosen)
     coefficients = gaussians.features_rest.shape[1] + 1
-    step = max(AT_ONCE // (coefficients * max(len(chosen), coefficients)), 1)
+    room = max(AT_ONCE, OF_EACH * len(gaussians))
+    step = max(room // (coefficients * max(len(chosen), coefficients)), 1)
     parts = [slice(start, start + step) for start in range(0, max(len(gaussians), 1), step)]
-    found = [_lowered(gaussians[rows], weight[rows], gone[rows], chosen) for rows in parts]
+    found = [_lowered(gaussians[rows], weight[rows], gone[rows], cameras) for rows in parts]
     return Lowered(*(torch.cat(values) for values in zip(*found, strict=True)))
 
 
-def _beside(means: Tensor, views: Sequence[View]) -> list[View]:
-    """Views on the device of the means, in two copies for all parts."""
-    stacked = (torch.stack([getattr(view, name) for view in views]) for name in ("viewmat", "K"))
-    viewmats, intrinsics = (upload(matrices.to(means.dtype), means.device) for matrices in stacked)
-    triples = zip(views, viewmats, intrinsics, strict=True)
-    return [replace(view, viewmat=viewmat, K=K) for view, viewmat, K in triples]
+def _beside(means: Tensor, views: Sequence[View]) -> _Cameras:
+    """In one copy."""
+    numbers = torch.stack([_numbers(view) for view in views])
+    viewmats, intrinsics, ends = upload(numbers.to(means.dtype), means.device).split((16, 9, 3), dim=1)
+    return _Cameras(viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3), ends)
+
+
+def _numbers(view: View) -> Float[Tensor, "28"]:
+    ends = view.K.new_tensor([view.width, view.height, view.near])
+    return torch.cat((view.viewmat.flatten(), view.K.flatten(), ends))
 
 
 def _lowered(
-    gaussians: Gaussians, weight: Float[Tensor, "n"], gone: Float[Tensor, "n"], views: Sequence[View]
+    gaussians: Gaussians, weight: Float[Tensor, "n"], gone: Float[Tensor, "n"], cameras: _Cameras
 ) -> Lowered:
     """As `lowered`, at once.
 
@@ -113,7 +128,7 @@ def _lowered(
     """
     values = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
     highest = _highest(gaussians.features_rest.shape[1])
-    gram = _gram(gaussians, views, values.shape[1])
+    gram = _gram(gaussians, cameras, values.shape[1])
     before, least = highest - gone, torch.full_like(weight, torch.inf)
     best, degree = values, before
     for candidate in range(highest + 1):
@@ -137,24 +152,27 @@ def _fitted(gram: Float[Tensor, "n b b"], values: Float[Tensor, "n b 3"], kept: 
     return torch.cat((values[:, :kept] + more, torch.zeros_like(values[:, kept:])), dim=1)
 
 
-def _gram(gaussians: Gaussians, views: Sequence[View], bases: int) -> Float[Tensor, "n b b"]:
+def _gram(gaussians: Gaussians, cameras: _Cameras, bases: int) -> Float[Tensor, "n b b"]:
     """Mean products of the harmonics in the directions of views. Each counts as it shows a Gaussian: by the
     square of its size there, and not at all where it is beside the picture. NaN where none shows it."""
-    means, reach = gaussians.means, REACH * gaussians.scales.amax(dim=1).exp()
-    rows, shows = [], []
-    for view in views:
-        inside = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        depth = inside[:, 2].clamp_min(view.near)
-        per_unit = view.K[0, 0] / depth
-        (x, y), beyond = ((inside @ view.K.T)[:, :2] / depth[:, None]).unbind(dim=1), reach * per_unit
-        seen = (x > -beyond) & (x < view.width + beyond) & (inside[:, 2] > view.near)
-        seen &= (y > -beyond) & (y < view.height + beyond)
-        away = torch.nn.functional.normalize(means - view.center, dim=1)
-        harmonics = sh_basis_rows(*away.unbind(dim=1))[: bases - 1]
-        rows.append(torch.stack((torch.full_like(depth, SH_C0), *harmonics), dim=1))
-        shows.append(torch.where(seen, per_unit.square(), 0.0))
-    basis, counts = torch.stack(rows, dim=1), torch.stack(shows, dim=1)
+    means, (viewmats, intrinsics, ends) = gaussians.means, cameras
+    turns, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    # Matrices of Gaussians by views, for each axis.
+    x, y, z = (means @ turn.T + shift for turn, shift in zip(turns.unbind(1), shifts.unbind(1), strict=True))
+    width, height, near = ends.unbind(dim=1)
+    per_unit = intrinsics[:, 0, 0] / torch.maximum(z, near)
+    beyond = REACH * gaussians.scales.amax(dim=1, keepdim=True).exp() * per_unit
+    seen = z > near
+    for row, end in ((0, width), (1, height)):
+        place = (intrinsics[:, row, 0] * x + intrinsics[:, row, 1] * y) / z + intrinsics[:, row, 2]
+        seen &= (place > -beyond) & (place < end + beyond)
+    counts = torch.where(seen, per_unit.square(), 0.0)
     counts = counts / counts.sum(dim=1, keepdim=True)
+    centers = -(turns.mT @ shifts[..., None])[..., 0]
+    away = [means[:, axis, None] - centers[:, axis] for axis in range(3)]
+    distance = sum(part.square() for part in away).sqrt().clamp_min(1e-12)
+    harmonics = sh_basis_rows(*(part / distance for part in away))[: bases - 1]
+    basis = torch.stack((torch.full_like(distance, SH_C0), *harmonics), dim=2)
     return (basis * counts[..., None]).mT @ basis
 
 

@@ -16,6 +16,7 @@ from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.types import Gaussians
 
 
 class LiveBlock:
@@ -58,13 +59,11 @@ class LiveBlock:
             rest.data.masked_fill_(are_gone(self.growth[GONE], rest), 0.0)
         return detach(self._run.params, self._run.optimizers, self.growth, self.clocks)
 
-    def let_go(self, nobody: BlockState) -> None:
-        """Nothing is live any more, and the device has its memory back.
-
-        Args:
-            nobody: a state like the live block's, without Gaussians.
-        """
-        attach(nobody.to(self._run.device), self._run.params, self._run.optimizers)
+    def let_go(self) -> None:
+        """Nothing is live any more, and the device has its memory back."""
+        run = self._run
+        nobody = BlockState.fresh(Gaussians.empty(run.config.sh_degree, run.device))
+        attach(nobody, run.params, run.optimizers)
         self.growth, self._held = {}, None
 
     def count_step(self, views: int, taken: int) -> None:
