@@ -15,6 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import thin_out
+from abcd_ns.engine.render import loss
 from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -200,6 +201,7 @@ class AbcdPipeline(VanillaPipeline):
         keeps_photos = not self._on_cpu and self.config.workers <= 1 and self.config.cluster is None
         self.datamanager.device_photo_bytes = int(PHOTO_SHARE * self._budget) if keeps_photos else 0
         self.model.draws_with().warm_up()
+        loss.warm_up(self.device)
         store, resumed = self._open_store(asked, views)
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
         limits = replace(config.training.limits, **self._fitted(store, resumed))

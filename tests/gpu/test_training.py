@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import Mended, StepTaken, VisitEnded
-from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render import TorchRasterizer, loss
 from abcd_ns.engine.render.cuda import pairs as gsplat_pairs
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -171,3 +171,13 @@ def test_memory_is_after_a_visit_what_it_was_before(tmp_path, begin, photos, dev
             held.append(torch.cuda.memory_allocated())
     # The first visit leaves what is kept for good: cameras, caches.
     assert max(held[1:]) <= held[1] + 2**18, held
+
+
+def test_once_warm_the_loss_compiles_nothing_for_other_sizes(device):
+    loss.warm_up(device)
+    with torch.compiler.set_stance("fail_on_recompile"):
+        for height, width in ((53, 80), (106, 160), (40, 33)):
+            picture = torch.rand(height, width, 3, device=device, requires_grad=True)
+            counts = {"full_pixels": height * width, "full_windows": loss.ssim_windows(height, width)}
+            loss.photometric_loss(picture, torch.rand_like(picture), **counts).backward()
+            assert bool(picture.grad.isfinite().all())

@@ -61,6 +61,14 @@ def photometric_loss(
     return loss if pixel_loss == "l1" else loss + by_pixel * _by_pixels(rendered, photo, pixel_loss)
 
 
+def warm_up(device: torch.device | str) -> None:
+    """Do now, before a clock runs, what the first loss on an accelerator would do: compile."""
+    if torch.device(device).type != "cpu":
+        picture = torch.zeros(2 * SSIM_WINDOW, 2 * SSIM_WINDOW, 3, device=device, requires_grad=True)
+        options = {"full_pixels": 4 * SSIM_WINDOW**2, "full_windows": ssim_windows(*picture.shape[:2])}
+        photometric_loss(picture, torch.ones_like(picture), **options).backward()
+
+
 @functools.lru_cache(maxsize=1024)
 def _pair(first: float, second: float, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2"]:
     """Two numbers on the device, without a copy."""

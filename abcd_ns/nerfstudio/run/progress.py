@@ -32,6 +32,8 @@ from abcd_ns.viewer.texts import clock
 
 SECONDS_BETWEEN_LINES = 10.0
 """Where the output is no terminal (a log file, say), a line is printed this often."""
+SECONDS_BETWEEN_LOOKS = 0.1
+"""On a terminal no line is made more often: a step may be shorter, and memory takes asking."""
 SMOOTHING = 0.98
 """Of the PSNR shown: the weight of what was there before."""
 
@@ -49,7 +51,7 @@ class ProgressReport:
         self._visit: VisitBegan | None = None
         self._layer_seconds = self._visit_seconds = 0.0
         self._workers: tuple[WorkerSeen, ...] = ()
-        self._last_line = time.monotonic()
+        self._last_line = self._last_look = time.monotonic()
         self._live: Progress | None = None
         self._task: TaskID | None = None
 
@@ -142,9 +144,12 @@ class ProgressReport:
         return self._layer_seconds / self._visit_seconds if self._visit_seconds else 0.0
 
     def _show(self, what: str) -> None:
+        now = time.monotonic()
         if CONSOLE.is_terminal:
-            self._bar().update(self._task, completed=self._coordinator.progress, what=self._line(what))
-        elif time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
+            if now - self._last_look >= SECONDS_BETWEEN_LOOKS:
+                self._last_look = now
+                self._bar().update(self._task, completed=self._coordinator.progress, what=self._line(what))
+        elif now - self._last_line > SECONDS_BETWEEN_LINES:
             self._print(f"{self._coordinator.progress:6.1%}  {self._line(what)}")
 
     def _print(self, line: str) -> None:
