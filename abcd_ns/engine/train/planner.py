@@ -118,8 +118,6 @@ class Planner(Visits):
     def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:
         while True:
             plan = self._next_plan(state, at_once)
-            if self._is_hidden(state, plan.block) and state.sweep % LOOK_AGAIN:
-                continue
             reduction = self._run.reduction  # of this moment: time may run on
             views = self._may_see(plan.block, reduction)
             # Where nothing is known, or what shows the block has changed, all views are asked.
@@ -195,31 +193,36 @@ class Planner(Visits):
         return worth_training(seen, self._config.influence_share)
 
     def _next_plan(self, state: RunState, at_once: int) -> VisitPlan:
-        config = self._config
-        if not state.queue:
-            if not state.views:
-                state.views = self._views_of_blocks(state)
-            else:
-                state.sweep += 1
-                self._look_at_arrivals(state)
-            remaining = None if self._budget.steps is None else self._budget.steps - state.planned
-            last = config.recipe.last_passes or passes_for_layers(state.trained, state.frozen)
-            state.trained = state.frozen = 0
-            used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
-            most = max(used.values(), default=0)
-            passes = passes_of_sweep(state.sweep, config.first_passes, last, most)
-            blocks = self._scene.tree.num_blocks
-            passes = passes_at_once(passes, at_once, blocks)
-            batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
-            steps = (passes / batch, remaining, config.seed, config.recipe.visit_steps)
-            state.queue = list(plan_sweep(state.sweep, used, *steps))
-            if not state.queue:
-                raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
+        while not state.queue:
+            self._plan_sweep(state, at_once)
         busy = sorted({visit.geometry.block for visit in state.in_flight})
         free = [place for place, plan in enumerate(state.queue) if plan.block not in busy]
         if not free:
             raise BlocksBusyError
         return state.queue.pop(min(free, key=lambda k: overlap(state.influence, state.queue[k].block, busy)))
+
+    def _plan_sweep(self, state: RunState, at_once: int) -> None:
+        """Queue the visits of the next sweep; none where all that are seen are hidden behind others."""
+        config = self._config
+        if not state.views:
+            state.views = self._views_of_blocks(state)
+        else:
+            state.sweep += 1
+            self._look_at_arrivals(state)
+        if not any(state.views.values()):
+            raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
+        remaining = None if self._budget.steps is None else self._budget.steps - state.planned
+        last = config.recipe.last_passes or passes_for_layers(state.trained, state.frozen)
+        state.trained = state.frozen = 0
+        used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
+        passes = passes_of_sweep(state.sweep, config.first_passes, last, max(used.values()))
+        blocks = self._scene.tree.num_blocks
+        passes = passes_at_once(passes, at_once, blocks)
+        batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
+        if state.sweep % LOOK_AGAIN:
+            used = {block: views for block, views in used.items() if not self._is_hidden(state, block)}
+        steps = (passes / batch, remaining, config.seed, config.recipe.visit_steps)
+        state.queue = list(plan_sweep(state.sweep, used, *steps))
 
     def _look_at_arrivals(self, state: RunState) -> None:
         """A block that no view saw may be seen once others have come into it."""

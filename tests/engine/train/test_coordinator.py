@@ -13,6 +13,8 @@ from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.planner import LOOK_AGAIN
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
@@ -389,3 +391,23 @@ def test_layers_show_what_earlier_visits_made_of_the_other_blocks(tmp_path, view
     coordinator.render = compared
     train(coordinator, photos)
     assert begun > 4
+
+
+def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=10_000, density=DensityConfig(strategy="off")
+    )
+    ended, began = listen(coordinator, SweepEnded), listen(coordinator, VisitBegan)
+    while not ended:
+        train(coordinator, photos, steps=1)
+    for block in range(4):
+        for other in {0, 1, 2, 3} - {block}:
+            coordinator.state.health[other] = BlockHealth(hidden=True)
+        before = len(ended)
+        while len(ended) == before:
+            train(coordinator, photos, steps=1)
+        sweep = ended[-1].sweep
+        assert sweep == before
+        expected = {block} if sweep % LOOK_AGAIN else {0, 1, 2, 3}
+        assert {visit.block for visit in began if visit.sweep == sweep} == expected
+        coordinator.state.health.clear()
