@@ -53,7 +53,7 @@ class Forecast:
     warnings: tuple[str, ...]
     workers: int = 1
     sent: tuple[Share, ...] = ()
-    """What a visit by a worker moves through Ray; nothing without workers."""
+    """What a visit by a worker moves; nothing without workers."""
 
     @property
     def hours(self) -> tuple[float, float]:

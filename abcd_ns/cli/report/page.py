@@ -141,7 +141,7 @@ def _charts(run: RunFolder, held_out: HeldOut | None) -> list[Chart]:
 def _plans(plan: Plan | None) -> list[Chart]:
     if plan is None:
         return []
-    text = "Cells, Gaussians (grey), cameras" + (" (orange: held out)." if len(plan.cameras) else ".")
+    text = "Cells, Gaussians (grey)" + (", cameras (orange: held out)." if len(plan.cameras) else ".")
     drawn = [("plan", "From above", text, draw_plan(plan))]
     if plan.is_stacked:
         drawn.append(("side", "From the side", "Where cells lie above others.", draw_plan(plan, 0, 2)))

@@ -68,6 +68,29 @@ def test_a_block_grows_in_its_first_visit_unless_that_is_in_the_last_third():
     assert not never.is_due(clock(first=True, **late))
 
 
+@pytest.mark.parametrize("steps", [17, 32, 39, 64, 250])
+def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
+    """It was refined in the warm-up, just now perhaps; later visits count from the one before."""
+    control, batch = DensityControl(DensityConfig()), 4
+
+    def due(first: bool) -> list[int]:
+        options = {
+            "refined": 1000,
+            "taken": batch,
+            "views": batch * steps,
+            "visit": batch * steps,
+            "usual": 30,
+        }
+        each = (
+            clock(steps=1000 + batch * k, spent=k / steps, first=first, **options)
+            for k in range(1, steps + 1)
+        )
+        return [k for k, at in enumerate(each, start=1) if control.is_due(at)]
+
+    assert due(first=True)
+    assert not due(first=False)
+
+
 def test_the_default_strategy_clones_where_gradients_are_high():
     params, optimizers = live(random_gaussians(8, size=0.001))
     control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))

@@ -173,6 +173,8 @@ class DensityControl:
         if not begins <= clock.progress < ends:
             return False
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
+        if clock.first and clock.visit is not None:  # what it was refined at before is the warm-up's
+            views = min(views, int(REFINE_UNTIL * clock.visit) - clock.taken)
         every = max(self.config.refine_every or clock.usual, views, 1)
         if clock.refined is None:
             return clock.reached(every)
