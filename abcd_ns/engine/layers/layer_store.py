@@ -29,9 +29,14 @@ class Kept:
     """Frozen Gaussians inside the window."""
 
     @property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of each of its tensors."""
+        return (self.layers.nbytes, *(() if self.interleaved is None else (self.interleaved.planes.nbytes,)))
+
+    @property
     def nbytes(self) -> int:
         """Its size."""
-        return self.layers.nbytes + (0 if self.interleaved is None else self.interleaved.planes.nbytes)
+        return sum(self.sizes)
 
     def moved(self, move: Callable[[Tensor], Tensor]) -> "Kept":
         """The same somewhere else."""
@@ -84,12 +89,18 @@ class LayerStore:
         """Keep what was drawn for a view, which has nothing here yet, if there is room."""
         if kept.nbytes <= self._device_room:
             self._device_room -= kept.nbytes
-        elif kept.nbytes <= self._ram_room:
-            self._ram_room -= kept.nbytes
+        elif (needed := self._in_ram(kept)) <= self._ram_room:
+            self._ram_room -= needed
             kept = kept.moved(_to_ram)
         else:
             return
         self._kept[view] = kept
+
+    def _in_ram(self, kept: Kept) -> int:
+        """Bytes that it takes there: torch pins memory in powers of two, and gives none of it back."""
+        if self._device.type != "cuda":
+            return kept.nbytes
+        return sum(1 << (size - 1).bit_length() for size in kept.sizes if size)
 
     def get(self, view: int) -> Kept | None:
         """What is kept of a view, on the device."""

@@ -54,6 +54,15 @@ def test_what_has_no_room_is_not_kept(interleaved):
     assert store.get(3) is not None
 
 
+def test_pinned_memory_counts_in_powers_of_two_as_it_is_given():
+    one = kept(interleaved=Splats(torch.rand(11, 3)))  # 560 and 132 bytes
+    for ram_bytes, fit in ((1024 + 256 - 1, 0), (1024 + 256, 1), (2 * (1024 + 256), 2)):
+        store = LayerStore(torch.device("cuda"), 0, ram_bytes)
+        for view in range(3):
+            store.put(view, one)
+        assert store.nbytes == fit * one.nbytes
+
+
 def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start):
     results, drawn = [], []
     for room in (1 << 30, 60_000, 0):
