@@ -46,7 +46,7 @@ class Recipe:
     """Gaussians over a twentieth of a picture wide are split when their block grows, see `WIDE_ANGLE`."""
     fast_start: bool = True
     """Learning rates are larger while a block was trained on few views, see `param_swap.rates_of_young`, and
-    those of a scene in one block fall at the end of the run, see `schedule.settling`."""
+    fall at the end of the run, see `schedule.settling`."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ SHORTER = 4
 """Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
 others have made of themselves meanwhile."""
 SETTLES, SETTLED = 0.6, 0.1
-"""From this share of a run on the learning rates of a scene in one block fall, to this share of them."""
+"""From this share of a run on learning rates fall, to this share of them."""
 FROZEN_COST, WINDOW_COST = 0.3, 0.4
 """Of drawing a Gaussian into a layer, and of finding its block's window; a training step draws one for 1."""
 
@@ -195,7 +195,7 @@ def exponential_decay(progress: float, initial: float, final: float) -> float:
 
 
 def settling(progress: float) -> float:
-    """A scene in one block: the share of its learning rates that is left, see SETTLES."""
+    """The share of learning rates that is left, see SETTLES; a first visit, perhaps the only one, has all."""
     return exponential_decay((progress - SETTLES) / (1 - SETTLES), 1.0, SETTLED)
 
 

@@ -72,7 +72,7 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next."""
         run = self.run
         decay = exponential_decay(run.share, 1.0, run.config.means_lr_decay)
-        settles = run.active.sole and run.config.recipe.fast_start
+        settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
         damping = run.health.damping * (settling(run.progress) if settles else 1.0)
         self._pace.set(self.batch, self.live.clocks.adam_views, decay, damping)
         return self.steps.next_batch()

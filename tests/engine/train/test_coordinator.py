@@ -411,3 +411,19 @@ def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(tmp_path, vie
         expected = {block} if sweep % LOOK_AGAIN else {0, 1, 2, 3}
         assert {visit.block for visit in began if visit.sweep == sweep} == expected
         coordinator.state.health.clear()
+
+
+def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(tmp_path, views, photos, start):
+    still = DensityConfig(strategy="off")
+    options = {"steps": 55, "density": still, "visit_steps": 5, "fast_start": True}
+    coordinator = make_coordinator(tmp_path, start, views, blocks=7, **options)
+    began, rates = listen(coordinator, VisitBegan), dict[int, set[float]]()
+    while not coordinator.finished:
+        train(coordinator, photos, steps=1)
+        rates.setdefault(began[-1].visit, set()).add(coordinator.optimizers["quats"].param_groups[0]["lr"])
+    first, second = [rates[visit.visit] for visit in began[:7]], [rates[visit.visit] for visit in began[7:]]
+    assert sorted(visit.block for visit in began[:7]) == list(range(7))
+    # As large as they ever are, though the first sweep goes on when three fifths of the run are done.
+    (whole,) = set.union(*first)
+    assert max(set.union(*second)) < whole
+    assert min(second[-1]) < 0.2 * whole
