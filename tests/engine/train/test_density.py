@@ -292,23 +292,6 @@ def test_blocks_refine_after_fewer_steps_than_what_is_trained_at_once(tmp_path, 
     assert usual == {(1, False): {100}, (4, True): {100}, (4, False): {30}}
 
 
-def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(tmp_path, views, photos, start):
-    density = DensityConfig(
-        refine_start=0.0, refine_stop=0.01, refine_every=1, densify_grad_thresh=1e-9, price=0
-    )
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=2, steps=60, scaffold=40, visit_steps=8, density=density
-    )
-    counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        active, live = coordinator.state.active, coordinator.visit.live
-        if active is not None and not active.is_whole:
-            counts[live.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(live))
-    assert [len(found) for found in counts[True].values()] == [2, 2]  # before it grew, and after
-    assert [len(found) for found in counts[False].values()] == [1, 1]
-
-
 @pytest.mark.parametrize(("given", "usual", "due"), [(0, 100, 100), (0, 30, 30), (7, 100, 7)])
 def test_steps_between_refinements_are_those_given_or_the_usual(given, usual, due):
     control = DensityControl(DensityConfig(refine_every=given))

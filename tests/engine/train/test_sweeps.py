@@ -1,0 +1,61 @@
+"""Which blocks a sweep visits, how blocks grow in the first, and how rates fall at the end."""
+
+from abcd_ns.engine.events import SweepEnded, VisitBegan
+from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.planner import LOOK_AGAIN
+from abcd_ns.engine.train.training_loop import train, train_step
+from tests.reference.scenes import listen, make_coordinator
+
+
+def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(tmp_path, views, photos, start):
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=4, steps=10_000, density=DensityConfig(strategy="off")
+    )
+    ended, began = listen(coordinator, SweepEnded), listen(coordinator, VisitBegan)
+    while not ended:
+        train(coordinator, photos, steps=1)
+    for block in range(4):
+        for other in {0, 1, 2, 3} - {block}:
+            coordinator.state.health[other] = BlockHealth(hidden=True)
+        before = len(ended)
+        while len(ended) == before:
+            train(coordinator, photos, steps=1)
+        sweep = ended[-1].sweep
+        assert sweep == before
+        expected = {block} if sweep % LOOK_AGAIN else {0, 1, 2, 3}
+        assert {visit.block for visit in began if visit.sweep == sweep} == expected
+        coordinator.state.health.clear()
+
+
+def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(tmp_path, views, photos, start):
+    still = DensityConfig(strategy="off")
+    options = {"steps": 55, "density": still, "visit_steps": 5, "fast_start": True}
+    coordinator = make_coordinator(tmp_path, start, views, blocks=7, **options)
+    began, rates = listen(coordinator, VisitBegan), dict[int, set[float]]()
+    while not coordinator.finished:
+        train(coordinator, photos, steps=1)
+        rates.setdefault(began[-1].visit, set()).add(coordinator.optimizers["quats"].param_groups[0]["lr"])
+    first, second = [rates[visit.visit] for visit in began[:7]], [rates[visit.visit] for visit in began[7:]]
+    assert sorted(visit.block for visit in began[:7]) == list(range(7))
+    # As large as they ever are, though the first sweep goes on when three fifths of the run are done.
+    (whole,) = set.union(*first)
+    assert max(set.union(*second)) < whole
+    assert min(second[-1]) < 0.2 * whole
+
+
+def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(tmp_path, views, photos, start):
+    density = DensityConfig(
+        refine_start=0.0, refine_stop=0.01, refine_every=1, densify_grad_thresh=1e-9, price=0
+    )
+    coordinator = make_coordinator(
+        tmp_path, start, views, blocks=2, steps=60, scaffold=40, visit_steps=8, density=density
+    )
+    counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        active, live = coordinator.state.active, coordinator.visit.live
+        if active is not None and not active.is_whole:
+            counts[live.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(live))
+    assert [len(found) for found in counts[True].values()] == [2, 2]  # before it grew, and after
+    assert [len(found) for found in counts[False].values()] == [1, 1]
