@@ -21,7 +21,7 @@ from torch.profiler import ProfilerActivity
 
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
-from abcd_ns.engine.render import Rasterizer, make_rasterizer
+from abcd_ns.engine.render import Rasterizer, loss, make_rasterizer
 from abcd_ns.engine.render.loss import psnrs
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -85,6 +85,7 @@ def begin(
 ) -> Coordinator:
     """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    loss.warm_up(device)
     start = gaussians_from_points(capture.points.float(), capture.colors)
     tree = build_kd(start.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
@@ -144,12 +145,12 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> int
     with clock.stage("render"):
         rendered = coordinator.render(batch)
     with clock.stage("loss"):
-        loss = coordinator.loss(batch, rendered.pictures, photos)
+        value = coordinator.loss(batch, rendered.pictures, photos)
     with clock.stage("backward"):
         for optimizer in coordinator.optimizers.values():
             optimizer.zero_grad(set_to_none=True)
-        if loss.requires_grad:
-            loss.backward()
+        if value.requires_grad:
+            value.backward()
     with clock.stage("optimizers"):
         for optimizer in coordinator.optimizers.values():
             optimizer.step()

@@ -123,8 +123,10 @@ def test_graph_is_freed_without_a_backward_pass(rasterizer, scene, device):
     if device.type != "cuda":
         pytest.skip("only CUDA says how much memory is held")
 
+    seen = view()  # cameras are kept on the device
+
     def draw():
-        return rasterizer(as_leaves(scene(2000)), view(), sh_degree=3, crop=CROPS[1], absgrad=True)
+        return rasterizer(as_leaves(scene(2000)), seen, sh_degree=3, crop=CROPS[1], absgrad=True)
 
     draw()
     torch.cuda.synchronize()
@@ -200,6 +202,6 @@ def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(ras
         found, expected = (getattr(cut, name).transmittance for cut in cuts)
         assert (found - expected).abs().mean() < 1e-4, name
         assert bool((expected < 0.99).any()), name
-    # Which Gaussians have a fragment in the window may differ where one has a single faint one.
+    # gsplat lists a Gaussian in every tile of its box. One whose only fragment is faint may be in either.
     found, expected = (set(cut.members.tolist()) for cut in cuts)
-    assert len(found ^ expected) <= 0.02 * len(frozen)
+    assert len(expected - found) <= 0.02 * len(frozen)

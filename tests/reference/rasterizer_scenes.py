@@ -63,7 +63,7 @@ def gradients(draw: Callable[[Gaussians], object], gaussians: Gaussians) -> tupl
     """(stacked image, gradients by name) of a random weighting of all outputs of `draw`."""
     leaves = as_leaves(gaussians)
     image = stacked(draw(leaves))
-    (image * probe(*image.shape[:2], dtype=image.dtype)).sum().backward()
+    (image * probe(*image.shape[:2], dtype=image.dtype).to(image.device)).sum().backward()
     grads = {name: getattr(leaves, name).grad for name in PARAM_NAMES}
     return image.detach(), {
         n: torch.zeros_like(getattr(leaves, n)) if g is None else g for n, g in grads.items()

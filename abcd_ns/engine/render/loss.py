@@ -1,6 +1,7 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -10,6 +11,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW, photometric_sums
+
+WARM_UP_SIZE = 427, 641
+"""Rows and columns, of which the compiler takes the first picture's for a hint: large, so that it splits sums
+over many cores, and in no simple ratio, which it would take for a rule."""
 
 
 class _Photometric(torch.autograd.Function):
@@ -64,8 +69,8 @@ def photometric_loss(
 def warm_up(device: torch.device | str) -> None:
     """Do now, before a clock runs, what the first loss on an accelerator would do: compile."""
     if torch.device(device).type != "cpu":
-        picture = torch.zeros(2 * SSIM_WINDOW, 2 * SSIM_WINDOW, 3, device=device, requires_grad=True)
-        options = {"full_pixels": 4 * SSIM_WINDOW**2, "full_windows": ssim_windows(*picture.shape[:2])}
+        picture = torch.zeros(*WARM_UP_SIZE, 3, device=device, requires_grad=True)
+        options = {"full_pixels": math.prod(WARM_UP_SIZE), "full_windows": ssim_windows(*WARM_UP_SIZE)}
         photometric_loss(picture, torch.ones_like(picture), **options).backward()
 
 

@@ -3,12 +3,17 @@
 import copy
 import dataclasses
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
+import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
 from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModel
+from torchmetrics.image import lpip
 
 from abcd_ns import methods
 from abcd_ns.data.dataset import AbcdDataset
@@ -24,6 +29,22 @@ ENDLESS = 10**9
 """Steps of a run that its seconds end."""
 
 _REGISTERED = {name: getattr(methods, name.replace("-", "_")) for name in METHODS if name != "splatfacto"}
+
+
+class _NoLpips(torch.nn.Module):
+    """In the place of a measure whose weights, 233 MiB, nerfstudio would fetch from the network."""
+
+    def __init__(self, **_options: Any) -> None:
+        super().__init__()
+
+
+class Splatfacto(SplatfactoModel):
+    """Splatfacto, of which only pictures are asked: they are scored as all others are."""
+
+    def populate_modules(self) -> None:
+        """As splatfacto's, without LPIPS."""
+        with mock.patch.object(lpip, "LearnedPerceptualImagePatchSimilarity", _NoLpips):
+            super().populate_modules()
 
 
 class SplatfactoData(FullImageDatamanager[AbcdDataset]):
@@ -103,6 +124,7 @@ def _splatfacto(job: Job) -> TrainerConfig:
         dataparser=_parser(job),
         cache_images_type="uint8",
     )
+    config.pipeline.model._target = Splatfacto
     if not job.settings.densify:
         config.pipeline.model.stop_split_at = 0
     return config

@@ -75,12 +75,6 @@ class Training:
             TrainingCallback([location.AFTER_TRAIN_ITERATION], end_step),
         ]
 
-    def warm_up(self) -> None:
-        """Compile what will be drawn with, before the clock runs."""
-        if self.coordinator is None:
-            return
-        self.pipeline.model.draws_with().warm_up()
-
     @property
     def progress(self) -> float:
         """The share of the run that is done."""

@@ -68,9 +68,7 @@ def set_up(job: Job, out: Path) -> Training:
     trainer = config.setup(local_rank=0, world_size=1)
     config.save_config()
     trainer.setup()
-    training = Training(trainer, job.settings)
-    training.warm_up()
-    return training
+    return Training(trainer, job.settings)
 
 
 def seed_everything(seed: int) -> None:

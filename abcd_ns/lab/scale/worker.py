@@ -1,5 +1,6 @@
 """One measurement in a process of its own: `python -m abcd_ns.lab.scale.worker JOB.json`."""
 
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import torch
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import nothing_live
-from abcd_ns.engine.render import make_rasterizer
+from abcd_ns.engine.render import loss, make_rasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
@@ -72,6 +73,7 @@ def run(job: LandJob, folder: Path) -> Run:
         torch.cuda.set_per_process_memory_fraction(min(share, 1.0), torch.cuda.current_device())
     rasterizer = make_rasterizer("auto", device)
     rasterizer.warm_up()
+    loss.warm_up(device)
     base, began = peak_rss_bytes(), time.perf_counter()
     land, whole = Land(job.tiles, job.settings.gaussians, seed=job.seed), job.method == WHOLE
     store = make_store(land, whole, folder / STORE)
@@ -171,7 +173,8 @@ class _Watch:
                 self.first_step = self.first_step or time.perf_counter()
                 if event.visit != self._visit:
                     self._visit, self.psnr = event.visit, []
-                self.psnr.append(event.psnr)
+                if math.isfinite(event.psnr):  # told a step late, so not of a visit's first
+                    self.psnr.append(event.psnr)
             case VisitEnded():
                 self.visits.append(event)
                 print(f"visit {len(self.visits)}: {event.seconds:.1f} s", flush=True)
