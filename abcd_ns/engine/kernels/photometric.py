@@ -6,9 +6,6 @@ taken as one long row of pixels, as loops that end with each row spend much of t
 """
 
 import math
-import warnings
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -22,23 +19,22 @@ REACH = SSIM_WINDOW - 1
 """Pixels by which the window makes an image smaller."""
 SSIM_SIGMA = 1.5
 """Standard deviation of SSIM's Gaussian window, pixels."""
-_C1, _C2 = 0.01**2, 0.03**2
+C1, C2 = 0.01**2, 0.03**2
 _BELL = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SSIM_SIGMA**2)) for k in range(SSIM_WINDOW)]
-_TAPS = [tap / sum(_BELL) for tap in _BELL]
-Step = Callable[..., tuple[Tensor, ...]]
+TAPS = [tap / sum(_BELL) for tap in _BELL]
 
 
 def slide_rows(pixels: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n-10"]]:
     """SSIM's window slid over all rows of images as if they were one; void across row ends."""
     count = pixels.shape[0] - REACH
-    return (sum(tap * pixels[k : k + count] for k, tap in enumerate(_TAPS)),)
+    return (sum(tap * pixels[k : k + count] for k, tap in enumerate(TAPS)),)
 
 
 def _slide_columns(images: Float[Tensor, "c h w"]) -> Float[Tensor, "c n"]:
     """SSIM's window slid along columns, where it lies wholly inside; the rows that remain in one."""
     width, count = images.shape[2], (images.shape[1] - REACH) * images.shape[2]
     flat = images.flatten(1)
-    return sum(tap * flat[:, k * width : k * width + count] for k, tap in enumerate(_TAPS))
+    return sum(tap * flat[:, k * width : k * width + count] for k, tap in enumerate(TAPS))
 
 
 def dissimilarity(
@@ -54,8 +50,8 @@ def dissimilarity(
         inside: 1 for windows that lie within the image, 0 for those that cross a row's end.
     """
     m_x, m_y, m_xx, m_yy, m_xy = _slide_columns(rows).split(3)
-    a1, a2 = 2 * m_x * m_y + _C1, 2 * (m_xy - m_x * m_y) + _C2
-    b1, b2 = m_x * m_x + m_y * m_y + _C1, (m_xx - m_x * m_x) + (m_yy - m_y * m_y) + _C2
+    a1, a2 = 2 * m_x * m_y + C1, 2 * (m_xy - m_x * m_y) + C2
+    b1, b2 = m_x * m_x + m_y * m_y + C1, (m_xx - m_x * m_x) + (m_yy - m_y * m_y) + C2
     similarity = a1 * a2 / (b1 * b2)
     by_xy, by_xx = 2 * a1 / (b1 * b2), -similarity / b2
     by_x = 2 * m_y * a2 / (b1 * b2) - 2 * m_x * similarity / b1 - m_y * by_xy - 2 * m_x * by_xx
@@ -89,29 +85,6 @@ COMBINE = Kernel("combine", combine, ("9 h+10 w", "3 h w", "3 h w", "2"))
 PHOTOMETRIC_KERNELS = (SLIDE_ROWS, DISSIMILARITY, COMBINE)
 
 
-class Compiled:
-    """A function that torch.compile makes a few kernels of when it is first called, for all sizes; where that
-    fails, the function as it is."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
-        self._run: Callable[..., Any] | None = None
-
-    def __call__(self, *tensors: Tensor) -> Any:
-        if self._run is None:
-            self._run = torch.compile(self._function, dynamic=True)
-        try:
-            return self._run(*tensors)
-        except torch.OutOfMemoryError:
-            raise
-        except (RuntimeError, ImportError, OSError) as error:
-            if self._run is self._function:
-                raise
-            warnings.warn(f"The loss runs uncompiled, so steps take longer: {error}", stacklevel=2)
-            self._run = self._function
-            return self._function(*tensors)
-
-
 def photometric_sums(
     rendered: Float[Tensor, "3 h w"], photo: Float[Tensor, "3 h w"], weights: Float[Tensor, "2"]
 ) -> tuple[Float[Tensor, "2"], Float[Tensor, "3 h w"]]:
@@ -119,30 +92,15 @@ def photometric_sums(
 
     Images are at least as large as the window.
     """
-    steps = _ON_CUDA if rendered.device.type == "cuda" else PHOTOMETRIC_KERNELS
-    return _sums(rendered, photo, weights, *steps)
-
-
-_ON_CUDA = (Compiled(slide_rows), Compiled(dissimilarity), Compiled(combine))
-
-
-def _sums(
-    rendered: Float[Tensor, "3 h w"],
-    photo: Float[Tensor, "3 h w"],
-    weights: Float[Tensor, "2"],
-    slide_rows: Step,
-    dissimilarity: Step,
-    combine: Step,
-) -> tuple[Float[Tensor, "2"], Float[Tensor, "3 h w"]]:
     _, height, width = rendered.shape
     moments = (rendered, photo, rendered * rendered, photo * photo, rendered * photo)
-    (rows,) = slide_rows(torch.cat([*map(torch.flatten, moments), rendered.new_zeros(REACH)]))
+    (rows,) = SLIDE_ROWS(torch.cat([*map(torch.flatten, moments), rendered.new_zeros(REACH)]))
     inside = rendered.new_zeros((height - REACH, width))
     inside[:, : width - REACH] = 1.0
-    unlike, by_moment = dissimilarity(rows.view(15, height, width), inside)
+    unlike, by_moment = DISSIMILARITY(rows.view(15, height, width), inside)
     # The way back. Columns that were void are 0 and keep rows apart, rows of zeros keep images apart.
     spread = rendered.new_zeros(REACH + 9 * (height + REACH) * width)
     spread[REACH:].view(9, -1, width)[:, REACH:height].copy_(by_moment)
-    (rows,) = slide_rows(spread)
-    difference, gradient = combine(rows.view(9, -1, width), rendered, photo, weights)
+    (rows,) = SLIDE_ROWS(spread)
+    difference, gradient = COMBINE(rows.view(9, -1, width), rendered, photo, weights)
     return torch.stack((difference, unlike)), gradient

@@ -1,7 +1,6 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
 import functools
-import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -12,26 +11,37 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW, photometric_sums
 
-WARM_UP_SIZE = 427, 641
-"""Rows and columns, of which the compiler takes the first picture's for a hint: large, so that it splits sums
-over many cores, and in no simple ratio, which it would take for a rule."""
+try:
+    from abcd_ns.engine.render.cuda.photometric import photometric as fused
+except ImportError:  # Triton comes with torch for Linux
+    fused = None
 
 
 class _Photometric(torch.autograd.Function):
-    """`weights` . `photometric_sums`, which finds the gradient in the same go."""
+    """The weighed sum of both losses, which finds its gradient in the same go."""
 
     @staticmethod
     def forward(
-        ctx: Any, rendered: Float[Tensor, "3 h w"], photo: Float[Tensor, "3 h w"], weights: Float[Tensor, "2"]
+        ctx: Any,
+        rendered: Float[Tensor, "h w 3"],
+        photo: Float[Tensor, "h w 3"],
+        by_pixel: float,
+        by_window: float,
     ) -> Float[Tensor, ""]:
-        sums, gradient = photometric_sums(rendered, photo, weights)
+        if fused is not None and rendered.is_cuda and rendered.dtype == torch.float32:
+            loss, gradient = fused(rendered, photo, by_pixel, by_window)
+        else:
+            weights = _pair(by_pixel, by_window, rendered.dtype, rendered.device)
+            planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
+            sums, gradient = photometric_sums(*planes, weights)
+            loss, gradient = (sums * weights).sum(), gradient.permute(1, 2, 0)
         ctx.save_for_backward(gradient)
-        return (sums * weights).sum()
+        return loss
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Float[Tensor, ""]) -> tuple[Float[Tensor, "3 h w"], None, None]:
-        return grad * ctx.saved_tensors[0], None, None
+    def backward(ctx: Any, grad: Float[Tensor, ""]) -> tuple[Float[Tensor, "h w 3"] | None, ...]:
+        return grad * ctx.saved_tensors[0], None, None, None
 
 
 def photometric_loss(
@@ -60,17 +70,15 @@ def photometric_loss(
     if not has_windows:
         return by_pixel * _by_pixels(rendered, photo, pixel_loss)
     in_kernel = by_pixel if pixel_loss == "l1" else 0.0
-    weights = _pair(in_kernel, ssim_lambda / (3 * full_windows), rendered.dtype, rendered.device)
-    planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
-    loss = _Photometric.apply(*planes, weights)
+    loss = _Photometric.apply(rendered, photo, in_kernel, ssim_lambda / (3 * full_windows))
     return loss if pixel_loss == "l1" else loss + by_pixel * _by_pixels(rendered, photo, pixel_loss)
 
 
 def warm_up(device: torch.device | str) -> None:
     """Do now, before a clock runs, what the first loss on an accelerator would do: compile."""
     if torch.device(device).type != "cpu":
-        picture = torch.zeros(*WARM_UP_SIZE, 3, device=device, requires_grad=True)
-        options = {"full_pixels": math.prod(WARM_UP_SIZE), "full_windows": ssim_windows(*WARM_UP_SIZE)}
+        picture = torch.zeros(2 * SSIM_WINDOW, 3 * SSIM_WINDOW, 3, device=device, requires_grad=True)
+        options = {"full_pixels": 6 * SSIM_WINDOW**2, "full_windows": ssim_windows(*picture.shape[:2])}
         photometric_loss(picture, torch.ones_like(picture), **options).backward()
 
 
