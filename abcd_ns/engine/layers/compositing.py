@@ -24,7 +24,7 @@ def empty_layer(height: int, width: int, device: torch.device | str = "cpu", dty
 
 def over(front: Layer, behind: Layer) -> Layer:
     """One layer that looks like `front` drawn over `behind`: (C1 + T1 C2, T1 T2)."""
-    color = front.color + front.transmittance[..., None] * behind.color
+    color = torch.addcmul(front.color, front.transmittance[..., None], behind.color)
     return Layer(color, front.transmittance * behind.transmittance)
 
 
@@ -52,7 +52,7 @@ def composite(
     layer: Layer, background: Float[Tensor, "3"] | Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w 3"]:
     """The picture of a layer on a background, linear colour: C + T bg."""
-    return layer.color + layer.transmittance[..., None] * background
+    return torch.addcmul(layer.color, layer.transmittance[..., None], background)
 
 
 def sandwich(

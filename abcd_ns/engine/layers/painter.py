@@ -191,7 +191,8 @@ class Painter:
             else:
                 cut = next(cuts)
                 # What reaches in from another unit is inside that one's.
-                own = cut.inside[torch.where(cut.members < loaded.own)[0]]
+                others = loaded.own < len(loaded.gaussians)
+                own = cut.inside[torch.where(cut.members < loaded.own)[0]] if others else cut.inside
                 yield FrozenLayers(cut.front, cut.back, own)
 
     def _cut_shot(self, unit: int, seen: Seen) -> CutShot:

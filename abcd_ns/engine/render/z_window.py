@@ -60,13 +60,14 @@ class ZWindow:
 
 @torch.no_grad()
 def showing(
-    grid: TileGrid,
+    pixels: Int[Tensor, "c t"],
     tile: Int[Tensor, "q"],
     z: Float[Tensor, "q"],
     weight: Float[Tensor, "q"],
     visible: float,
-) -> ZWindow:
-    """The range of camera z, in each tile, in which a set of Gaussians shows: the window of a visit.
+) -> Float[Tensor, "2 c t"]:
+    """The ranges of camera z, in each tile of c crops, in which a set of Gaussians shows: near and far of a
+    visit's windows.
 
     Frozen fragments in front of this range and behind it can be drawn once for a visit; those in it have to
     be sorted in with the Gaussians that are trained. So the range must hold every fragment that matters, and
@@ -74,17 +75,19 @@ def showing(
     what reaches out of the cell, and holds much empty space.
 
     Args:
-        tile, z, weight: of each pair of a Gaussian and a tile, sorted by tile and then by z; the weight is
-            the sum of alpha T over the tile's pixels.
+        pixels: of its crop in each tile; 0 for one that a crop does not have.
+        tile, z, weight: of each pair of a Gaussian and a tile, which are numbered through from crop to crop,
+            sorted by tile and then by z; the weight is the sum of alpha T over the tile's pixels.
         visible: what the fragments in front of the range, and those behind it, weigh less than, together and
             as a mean over the tile; 0 takes all.
 
     Returns:
-        A window that holds all else. Where there is nothing it is empty, and lies in the midst of what
+        Windows that hold all else. Where there is nothing they are empty, and lie in the midst of what
         the crop shows.
     """
-    ends = torch.searchsorted(tile, torch.arange(grid.tiles, device=tile.device), right=True)
-    share = weight.double() / grid.pixels(tile.device).index_select(0, tile)
+    crops, tiles = pixels.shape
+    ends = torch.searchsorted(tile, torch.arange(crops * tiles, device=tile.device), right=True)
+    share = weight.double() / pixels.flatten().clamp_min(1).index_select(0, tile)
     so_far, mass = _from_zero(share), _from_zero(share * z)
     starts = torch.cat((ends.new_zeros(1), ends[:-1]))
     before, after = so_far[starts], so_far[ends]
@@ -92,20 +95,22 @@ def showing(
     head = so_far[1:] - before.index_select(0, tile)
     tail = after.index_select(0, tile) - so_far[:-1]
     every = visible <= 0
-    near = _extreme(grid, tile, torch.where((head >= visible) | every, z, math.inf), "amin")
-    far = _extreme(grid, tile, torch.where((tail >= visible) | every, z, -math.inf), "amax")
+    near = _extreme(ends, tile, torch.where((head >= visible) | every, z, math.inf), "amin")
+    far = _extreme(ends, tile, torch.where((tail >= visible) | every, z, -math.inf), "amax")
     near, far, empty = torch.minimum(near, far), torch.maximum(near, far), near.isinf()
     # Half open: the next number after the last depth.
     far = torch.nextafter(far, torch.full_like(far, math.inf))
 
-    held = after - before
-    midst = torch.where(held > 0, (mass[ends] - mass[starts]) / held, mass[-1] / so_far[-1])
-    midst = midst.nan_to_num(0.0).to(z)
-    return ZWindow(grid, torch.where(empty, midst, near), torch.where(empty, midst, far))
+    held, of_z = ((sums[ends] - sums[starts]).view(crops, tiles) for sums in (so_far, mass))
+    midst = torch.where(held > 0, of_z / held, of_z.sum(1, keepdim=True) / held.sum(1, keepdim=True))
+    midst = midst.nan_to_num(0.0).to(z).flatten()
+    return torch.where(empty, midst, torch.stack((near, far))).view(2, crops, tiles)
 
 
-def _extreme(grid: TileGrid, tile: Int[Tensor, "q"], z: Float[Tensor, "q"], which: str) -> Float[Tensor, "t"]:
-    start = z.new_full((grid.tiles,), math.inf if which == "amin" else -math.inf)
+def _extreme(
+    like: Int[Tensor, "t"], tile: Int[Tensor, "q"], z: Float[Tensor, "q"], which: str
+) -> Float[Tensor, "t"]:
+    start = z.new_full(like.shape, math.inf if which == "amin" else -math.inf)
     return start.scatter_reduce(0, tile, z, which)
 
 

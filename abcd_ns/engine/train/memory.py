@@ -14,6 +14,7 @@ import torch
 from abcd_ns.engine.layers.painter import LEAST_PASS
 from abcd_ns.engine.layers.visit_layers import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
+from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
@@ -80,13 +81,13 @@ class DeviceNeeds:
     @property
     def drawing_bytes(self) -> int:
         """Of whole views while F and B are drawn, which is before the first step: layers while they are
-        folded, a view that is being drawn, and the least pass of frozen Gaussians. A larger pass takes no
+        folded, views that are being drawn, and the least pass of frozen Gaussians. A larger pass takes no
         more than gradients and refining of a block of half its size do, which have not begun."""
         if self.levels == 0:
             return 0
         parts = max(PARTS_BYTES, self.levels * BYTES_PER_PIXEL * self.pixels)
-        frozen = LEAST_PASS * (self.parameter_bytes + projected_bytes(self.primitive))
-        return parts + self.pixels * DRAWN_FLOATS * FLOAT + frozen
+        frozen = LEAST_PASS * self.parameter_bytes + DEVICE_SPLATS * projected_bytes(self.primitive)
+        return parts + max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT + frozen
 
     @property
     def fixed_bytes(self) -> int:

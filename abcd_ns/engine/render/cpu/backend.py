@@ -3,7 +3,7 @@
 import itertools
 import weakref
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,6 +18,7 @@ from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree, pack, project_packed
 from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
+from abcd_ns.engine.render.together import Item, runs
 from abcd_ns.engine.render.z_window import ZWindow, showing
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
@@ -146,7 +147,7 @@ class TorchRasterizer(Rasterizer):
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each view is projected and binned once, and a few are drawn in one pass."""
-        for few in _a_few(shots, [shot.crop for shot in shots], gaussians):
+        for few in _a_few(shots, [(shot.view, shot.crop) for shot in shots], gaussians):
             yield from self._cut_together(gaussians, few, sh_degree, antialiased)
 
     def _cut_together(
@@ -174,7 +175,7 @@ class TorchRasterizer(Rasterizer):
         antialiased: bool = False,
     ) -> Iterator[ZWindow]:
         """See Rasterizer.depth_windows. A few views are drawn in one pass."""
-        for few in _a_few(seen, [crop for _, crop in seen], gaussians):
+        for few in _a_few(seen, seen, gaussians):
             yield from self._windows_together(gaussians, few, visible, antialiased)
 
     def _windows_together(
@@ -196,7 +197,8 @@ class TorchRasterizer(Rasterizer):
             if grid != drawn_in:
                 held, again = grid.holding(drawn_in, held).sort(stable=True)
                 of_pairs = tuple(values[again] for values in of_pairs)
-            found.append(showing(grid, held, *of_pairs, visible))
+            near, far = showing(grid.pixels(held.device)[None], held, *of_pairs, visible).flatten(1)
+            found.append(ZWindow(grid, near, far))
         return found
 
     @torch.no_grad()
@@ -257,20 +259,10 @@ class TorchRasterizer(Rasterizer):
         return Job(candidates.lists(self.chunk), planes.shape[1], self.kernels, absgrad_target)
 
 
-Item = TypeVar("Item")
-
-
-def _a_few(items: Sequence[Item], crops: Sequence[Crop], gaussians: Gaussians) -> Iterator[list[Item]]:
-    """The items, with a crop each, in runs that are drawn in one pass."""
-    few, pixels = list[Item](), 0
-    for item, crop in zip(items, crops, strict=True):
-        pixels += crop.pixels
-        if few and (pixels > PIXELS_AT_ONCE or (len(few) + 1) * len(gaussians) > SPLATS_AT_ONCE):
-            yield few
-            few, pixels = [], crop.pixels
-        few.append(item)
-    if few:
-        yield few
+def _a_few(
+    items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: Gaussians
+) -> Iterator[list[Item]]:
+    return runs(items, seen, len(gaussians), pixels=PIXELS_AT_ONCE, splats=SPLATS_AT_ONCE)
 
 
 def _without_depths(planes: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:

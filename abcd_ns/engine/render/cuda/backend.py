@@ -21,7 +21,8 @@ from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_s
 from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree
-from abcd_ns.engine.render.z_window import ZWindow, showing
+from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, Item, runs
+from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 SURVEY_BYTES = 256 << 20
@@ -49,9 +50,7 @@ class GsplatRasterizer(Rasterizer):
     ) -> Splats:
         """See Rasterizer.project."""
         check_degree(gaussians, sh_degree)
-        if len(gaussians) == 0:
-            return Splats(gaussians.means.new_zeros((self.primitive.rows, 0)))
-        return project(self._kind, gaussians, [view], self._cameras, sh_degree, antialiased).splats(0)
+        return self._seen(gaussians, [view], sh_degree, antialiased).splats(0)
 
     @torch.no_grad()
     def extents(self, gaussians: Gaussians, views: Sequence[View]) -> Float[Tensor, "v 4"]:
@@ -96,13 +95,18 @@ class GsplatRasterizer(Rasterizer):
     def cuts(
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
-        """See Rasterizer.cuts. Each is projected and sorted once."""
-        for shot in shots:
-            splats = self.project(gaussians, shot.view, sh_degree=sh_degree, antialiased=antialiased)
-            drawing = self._drawing_of(splats, shot.crop, windowed=True)
-            members = drawing.members(drawing.inside([shot.inside]))
-            layers = (drawing.only(drawing.inside([window])).layer() for window in (shot.front, shot.back))
-            yield Cut(*layers, splats[members], members)
+        """See Rasterizer.cuts. Each view is projected and sorted once, and a few are drawn in one pass."""
+        check_degree(gaussians, sh_degree)
+        for few in _a_few(shots, [(shot.view, shot.crop) for shot in shots], gaussians):
+            views, crops = [shot.view for shot in few], [shot.crop for shot in few]
+            seen = self._seen(gaussians, views, sh_degree, antialiased)
+            drawing = Drawing.of(self._kind, Packed.of(seen), crops, self._cameras, windowed=True)
+            members = drawing.members(drawing.inside([shot.inside for shot in few]))
+            fronts, backs = ([shot.front for shot in few], [shot.back for shot in few])
+            layers = (drawing.only(drawing.inside(windows)).layers() for windows in (fronts, backs))
+            for k, parts in enumerate(zip(*layers, members, strict=True)):
+                front, back, which = parts
+                yield Cut(front, back, seen.splats(k, which), which)
 
     @torch.no_grad()
     def depth_windows(
@@ -114,13 +118,18 @@ class GsplatRasterizer(Rasterizer):
         antialiased: bool = False,
     ) -> Iterator[ZWindow]:
         """See Rasterizer.depth_windows."""
-        for view, crop in seen:
-            drawing = self._drawing_of(self.project(gaussians, view, antialiased=antialiased), crop)
-            yield showing(drawing.sheet.grids[0], drawing.tile, drawing.z, drawing.weights(), visible)
+        for few in _a_few(seen, seen, gaussians):
+            views, crops = zip(*few, strict=True)
+            projected = self._seen(gaussians, views, 0, antialiased)
+            drawing = Drawing.of(self._kind, Packed.of(projected), crops, self._cameras)
+            yield from drawing.windows(visible)
 
-    def _drawing_of(self, splats: Splats, crop: Crop, windowed: bool = False) -> Drawing:
-        packed = Packed.of_splats([(0, splats)])
-        return Drawing.of(self._kind, packed, [crop], self._cameras, windowed=windowed)
+    def _seen(
+        self, gaussians: Gaussians, views: Sequence[View], sh_degree: int, antialiased: bool
+    ) -> Projected:
+        if len(gaussians) == 0:
+            return Projected.nothing(len(views), self.primitive.rows, gaussians.means)
+        return project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased)
 
     def _draw_alike(
         self,
@@ -158,6 +167,12 @@ class GsplatRasterizer(Rasterizer):
             Raster(features[..., :3], transmittance, features[..., 3], info)
             for features, transmittance in drawing.draw(absgrad)
         ]
+
+
+def _a_few(
+    items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: Gaussians
+) -> Iterator[list[Item]]:
+    return runs(items, seen, len(gaussians), pixels=DEVICE_PIXELS, splats=DEVICE_SPLATS)
 
 
 Seen = TypeVar("Seen", Projected, Packed)

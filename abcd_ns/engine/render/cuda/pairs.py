@@ -19,7 +19,7 @@ from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.render.z_window import ZWindow, showing
 from abcd_ns.engine.types import Crop, Layer
 
 TILE = 16
@@ -132,6 +132,14 @@ class Sheet:
             each[: grid.rows, : grid.cols].fill_(True)
         return drawn
 
+    def pixels(self, device: torch.device) -> Int64[Tensor, "c t"]:
+        """How many of its crop's each tile holds."""
+        _, rows, cols = self.shape
+        beyond = ((0, cols - grid.cols, 0, rows - grid.rows) for grid in self.grids)
+        counts = (grid.pixels(device).view(grid.rows, grid.cols) for grid in self.grids)
+        padded = [F.pad(own, more) for own, more in zip(counts, beyond, strict=True)]
+        return torch.stack(padded).flatten(1)
+
     def spread(self, windows: Sequence[ZWindow | None], like: Tensor) -> Float[Tensor, "2 tiles"]:
         """(near, far) of each camera's window; the same numbers twice, so nothing, where it has no tile."""
         spread = []
@@ -223,11 +231,16 @@ class Drawing:
         owners = self.owners.new_zeros(count + 1).scatter_(0, place, self.owners)
         return replace(self, keys=keys[:count], owners=owners[:count])
 
-    def members(self, keep: Bool[Tensor, "q"]) -> Int64[Tensor, "k"]:
-        """Which splats have any of these pairs; one wait."""
+    def members(self, keep: Bool[Tensor, "q"]) -> list[Int64[Tensor, "_k"]]:
+        """Of each camera, which as many splats as any other has, those that have any of these pairs; one
+        wait."""
         held = keep.new_zeros(len(self.splats) + 1)
         held.index_fill_(0, torch.where(keep, self.owners, len(self.splats)).long(), True)
-        return held[:-1].nonzero()[:, 0]
+        of_cameras = held[:-1].view(len(self.sheet.crops), -1)
+        # In order, those that are held first: so the host learns how many there are in a single copy.
+        ids = of_cameras.byte().sort(dim=1, descending=True, stable=True).indices
+        counts = of_cameras.sum(1).tolist()
+        return [own[:count] for own, count in zip(ids, counts, strict=True)]
 
     def draw(self, absgrad: bool = False) -> list[tuple[Float[Tensor, "h w 4"], Float[Tensor, "h w"]]]:
         """(features, transmittance) of each crop."""
@@ -241,13 +254,22 @@ class Drawing:
             for feature, alpha, part in zip(features.unbind(), alphas.unbind(), parts, strict=True)
         ]
 
-    def layer(self) -> Layer:
-        """What the only crop looks like."""
-        ((features, transmittance),) = self.draw()
-        return Layer(features[..., :3], transmittance)
+    def layers(self) -> list[Layer]:
+        """What each crop looks like."""
+        return [Layer(features[..., :3], transmittance) for features, transmittance in self.draw()]
+
+    def windows(self, visible: float) -> list[ZWindow]:
+        """Where the splats show in each crop; see z_window.showing."""
+        _, rows, cols = self.sheet.shape
+        near, far = showing(self.sheet.pixels(self.keys.device), self.tile, self.z, self.weights(), visible)
+        found = []
+        for k, grid in enumerate(self.sheet.grids):
+            sides = (side[k].view(rows, cols)[: grid.rows, : grid.cols].flatten() for side in (near, far))
+            found.append(ZWindow(grid, *sides))
+        return found
 
     def weights(self) -> Float[Tensor, "q"]:
-        """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels in the only crop.
+        """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels in its crop.
 
         Each pair is drawn as if it were a Gaussian of its own: the gradient of the picture's sum by its
         colour, of which one channel will do, is its weight.
@@ -261,7 +283,8 @@ class Drawing:
         each = torch.arange(count, device=dark.device, dtype=self.owners.dtype)
         with torch.enable_grad():
             picture, _ = self._rasterize(means2d, shapes, dark, opacities, each)
-            (found,) = torch.autograd.grad(picture[0][self._parts()[0]].sum(), dark)
+            shown = [one[part].sum() for one, part in zip(picture, self._parts(), strict=True)]
+            (found,) = torch.autograd.grad(torch.stack(shown).sum(), dark)
         return found[:, 0]
 
     def _rasterize(

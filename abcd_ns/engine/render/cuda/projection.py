@@ -95,18 +95,23 @@ class Projected:
     centers: Float[Tensor, "c n 2"]
     """Where their middles are; by whose gradient they grow."""
 
-    def splats(self, camera: int) -> Splats:
-        """As one of the cameras sees them."""
-        rows = (
-            self.means2d[camera].T,
-            self.depths[camera, None],
-            self.shapes[camera].T,
-            self.opacities[camera, None],
-            self.features[camera, :, :3].T,
-            self.radii.new_zeros((3, self.radii.shape[1])),  # bounds, as the CPU has them
-            self.radii[camera, None],
+    @staticmethod
+    def nothing(cameras: int, rows: int, like: Tensor) -> "Projected":
+        """No Gaussian, of which Splats would have so many rows."""
+        centers, features, shapes = (like.new_zeros((cameras, 0, k)) for k in (2, 4, rows - 11))
+        depths = features[..., 3]
+        return Projected(depths.int(), centers, depths, shapes, depths, features, centers)
+
+    def splats(self, camera: int, which: Int[Tensor, "k"] | None = None) -> Splats:
+        """As one of the cameras sees them, or these of them."""
+        values = (self.means2d, self.depths, self.shapes, self.opacities, self.features[..., :3], self.radii)
+        of_one = (
+            value[camera] if which is None else value[camera].index_select(0, which) for value in values
         )
-        return Splats(torch.cat([row.to(self.depths) for row in rows]))
+        each = (value if value.dim() == 2 else value[:, None] for value in of_one)
+        *rows, radii = (value.to(self.depths).T for value in each)
+        bounds = radii.new_zeros((3, radii.shape[1]))  # as the CPU has them
+        return Splats(torch.cat((*rows, bounds, radii)))
 
 
 def place_on_screen(

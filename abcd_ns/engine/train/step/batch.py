@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.compositing import sandwich
+from abcd_ns.engine.layers.compositing import composite, sandwich
 from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
@@ -77,7 +77,7 @@ class Sample:
             light: the photo's transform, see `lit`.
         """
         if self.layers is None:
-            rgb = raster.color + raster.transmittance[..., None] * self.background
+            rgb = composite(raster.layer, self.background)
         else:
             rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
         return (rgb if light is None else lit(rgb, light, self.crop, self.view)).clamp(0, 1)
