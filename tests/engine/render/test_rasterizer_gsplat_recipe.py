@@ -251,6 +251,39 @@ def test_the_depth_window_is_that_of_the_torch_backend(backend, crop, visible):
     torch.testing.assert_close(found.far, expected.far)
 
 
+SEVERAL = [
+    (VIEW, VIEW.full),
+    (moved(VIEW, 0.2), Crop(19, 5, 30, 31)),
+    (moved(VIEW, -0.1), Crop(60, 40, 10, 5)),
+]
+
+
+def test_depth_windows_of_several_views_are_those_of_each(backend):
+    gaussians = random_gaussians(60)
+    together = list(backend.depth_windows(gaussians, SEVERAL, visible=0.1))
+    for window, (view, crop) in zip(together, SEVERAL, strict=True):
+        alone = backend.depth_window(gaussians, view, crop=crop, visible=0.1)
+        assert window.grid == alone.grid
+        torch.testing.assert_close((window.near, window.far), (alone.near, alone.far))
+
+
+def test_cuts_of_several_views_are_those_of_each(backend):
+    gaussians, shots = random_gaussians(60), []
+    for view, crop in SEVERAL:
+        window = window_for(crop)
+        every = ZWindow.everything(window.grid, "cpu", torch.float64)
+        shots.append(CutShot(view, crop, every.before(window), window, every.behind(window)))
+    for cut, shot in zip(backend.cuts(gaussians, shots, sh_degree=1), shots, strict=True):
+        (alone,) = backend.cuts(gaussians, [shot], sh_degree=1)
+        assert torch.equal(cut.members, alone.members)
+        for layer in ("front", "back"):
+            found, expected = getattr(cut, layer), getattr(alone, layer)
+            torch.testing.assert_close(found.color, expected.color)
+            torch.testing.assert_close(found.transmittance, expected.transmittance)
+        # Rows that gsplat leaves as they were are not drawn.
+        torch.testing.assert_close(cut.inside.planes[:-4], alone.inside.planes[:-4])
+
+
 def test_the_depth_window_of_no_gaussians_is_empty(backend):
     nobody = Gaussians.empty(1, dtype=torch.float64)
     window = backend.depth_window(nobody, VIEW, crop=Crop(16, 0, 32, 20), visible=0.06)
