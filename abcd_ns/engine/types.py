@@ -1,6 +1,6 @@
 """The values that the engine passes around: Gaussians, views, crops and layers."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
@@ -152,6 +152,12 @@ class View:
     def to(self, *args, **kwargs) -> "View":
         """As Tensor.to, for both matrices."""
         return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
+
+
+def centers_of(views: Iterable[View]) -> Float[Tensor, "v 3"]:
+    """Of cameras in world space, float64 on the CPU; see View.center."""
+    poses = torch.stack([view.viewmat.detach() for view in views]).double().cpu()
+    return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
 
 
 @dataclass(frozen=True)

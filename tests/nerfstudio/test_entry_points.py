@@ -90,7 +90,8 @@ def test_what_is_imported_is_declared():
     lines = re.compile(r"^\s*(?:from|import) (\w+)", re.MULTILINE)
     names = {name for path in PACKAGE_FILES for name in lines.findall(path.read_text())}
     installed = packages_distributions()
-    names &= set(installed) - {"abcd_ns"} - set(sys.stdlib_module_names)
+    # torch brings Triton where it runs; elsewhere it is not missed.
+    names &= set(installed) - {"abcd_ns", "triton"} - set(sys.stdlib_module_names)
     assert len(names) > 15
     project = PYPROJECT["project"]
     extras = [names for extra, names in project["optional-dependencies"].items() if extra != "dev"]

@@ -40,7 +40,7 @@ def train_plain(
         density.before_backward((raster.info,))
         seed = random.Random(f"background {config.seed} {taken} 0").getrandbits(62)
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed))
-        picture = (raster.color + raster.transmittance[..., None] * background).clamp(0, 1)
+        picture = torch.addcmul(raster.color, raster.transmittance[..., None], background).clamp(0, 1)
         loss = photometric_loss(
             picture,
             photos.images[row],

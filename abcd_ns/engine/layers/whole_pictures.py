@@ -87,17 +87,23 @@ class WholePictures:
         ]
 
     def backward(
-        self, views: Sequence[View], gradient: Callable[[View, WholePicture], Float[Tensor, "h w 3"]]
+        self,
+        views: Sequence[View],
+        gradient: Callable[[View, WholePicture], Float[Tensor, "h w 3"]],
+        after: Callable[[], None] = lambda: None,
     ) -> None:
         """Leave the gradient of a loss, added up over views, in what of views and of the scene are leaves.
 
         Args:
+            views: no more than have room, see `groups`.
             gradient: gives dL/dC of a view's picture.
+            after: called when a unit's fragments in a view have left theirs; those of other units are others.
         """
         if len(self._units) == 1:
             loaded = self._load(self._units[0], views)
             for view in views:
                 self._backward_through_one(loaded, view, gradient)
+                after()
             return
         parts = self._draw(views)
         pulls = []
@@ -108,14 +114,15 @@ class WholePictures:
             loaded = self._load(unit, views)
             for view, own, pull in zip(views, parts, pulls, strict=True):
                 self._differentiate(unit, loaded, view, own, pull)
+                after()
 
     def _backward_through_one(self, loaded: Loaded, view: View, gradient: Callable) -> None:
-        """As `backward`, for a view, where one unit is all: it is drawn once. Its graph ends here."""
+        """As `backward`, for a view, where one unit is all: it is drawn once."""
         (unit,) = self._units
         raster = self._raster(unit, loaded, view) if loaded.shows_in(view) else None
         pull = gradient(view, self._picture(view, [] if raster is None else [_part(unit, raster)]))
         if raster is not None:
-            raster.color.backward(pull)
+            raster.color.backward(pull, retain_graph=True)  # views share what leads to the loaded Gaussians
 
     def _load(self, unit: int, views: Sequence[View]) -> Loaded:
         return self._painter.load(unit, seen_by=self._painter.frusta((still(v), v.full) for v in views))
@@ -164,7 +171,8 @@ class WholePictures:
         by_color = front.transmittance[..., None] * pull
         behind = composite(back, pull.new_zeros(3))
         outputs = (raster.color, raster.transmittance)
-        torch.autograd.backward(outputs, (by_color, (by_color * behind).sum(dim=-1)))
+        pulls = (by_color, (by_color * behind).sum(dim=-1))
+        torch.autograd.backward(outputs, pulls, retain_graph=True)  # views share what leads to `loaded`
 
 
 def _part(unit: int, raster: Raster) -> _Part:

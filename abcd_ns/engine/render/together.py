@@ -6,7 +6,7 @@ from typing import TypeVar
 from abcd_ns.engine.types import Crop, View
 
 Item = TypeVar("Item")
-DEVICE_PIXELS, DEVICE_SPLATS = 1 << 20, 400_000
+DEVICE_PIXELS, DEVICE_SPLATS = 1 << 21, 400_000
 """Of the views that an accelerator draws together, at most, unless a single view has more."""
 
 

@@ -16,7 +16,7 @@ from abcd_ns.engine.space.visibility import (
     widest_slant,
     world_size,
 )
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import Crop, Gaussians, View, centers_of
 
 BOUNDS_SLANT = 3.0
 """The largest `widest_slant` that bounds allow for: fields of view up to about 140 degrees."""
@@ -98,7 +98,7 @@ class Optics:
     """
 
     def __init__(self, views: Sequence[View], slack: float) -> None:
-        centers = torch.stack([view.center.double().cpu() for view in views])
+        centers = centers_of(views)
         self._middle = centers.mean(dim=0)
         self._spread = float((centers - self._middle).norm(dim=1).max())
         self._widest = min(views, key=lambda view: float(view.K.diagonal()[:2].min()))

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.transfer import upload
-from abcd_ns.engine.types import Gaussians, Layer, View
+from abcd_ns.engine.types import Gaussians, Layer, View, centers_of
 
 SHOWS = 1 / 255
 """Rasterizers skip a Gaussian wherever its alpha is below this: with less opacity it is never drawn."""
@@ -24,6 +24,8 @@ WIDE_ANGLE = 0.05
 whatever their gradients: what lies before and behind such a one cannot be sorted from everywhere."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
+DISTANCES_AT_ONCE = 1 << 24
+"""Between Gaussians and cameras."""
 RISE = 0.1
 """A visit is undone if the loss of its views rose by more than this share ..."""
 SURE = 3.0
@@ -51,10 +53,13 @@ def wider_than(
         scales: logarithms of standard deviations.
     """
     views = tuple(views)
-    centers = upload(torch.stack([view.center.to(means.dtype) for view in views]), means.device)
+    near = torch.tensor([[view.near] for view in views], dtype=torch.float64)
+    cameras = upload(torch.cat((centers_of(views), near), dim=1).to(means.dtype), means.device)
     nearest = means.new_full((len(means),), math.inf)
-    for center, view in zip(centers, views, strict=True):
-        nearest = torch.minimum(nearest, (means - center).norm(dim=1).clamp_min(view.near))
+    for few in cameras.split(max(DISTANCES_AT_ONCE // max(len(means), 1), 1)):
+        # Not by a matrix product, which loses what is near to a camera.
+        distances = torch.cdist(means, few[:, :3], compute_mode="donot_use_mm_for_euclid_dist")
+        nearest = torch.minimum(nearest, torch.maximum(distances, few[:, 3]).amin(dim=1))
     allowed = (angle * nearest).log()[:, None]
     return scales > allowed, allowed
 

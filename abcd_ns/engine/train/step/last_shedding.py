@@ -60,7 +60,7 @@ class _Probe:
         return replace(found, opacities=self._leaves[block])
 
     def take_note(self) -> None:
-        """A view has been drawn backward."""
+        """A view has been drawn backward, or what a unit shows in it: a pixel has each Gaussian in one."""
         for block, logits in self._leaves.items():
             if logits.grad is None:
                 continue
@@ -134,9 +134,8 @@ class LastShedding:
             signs = upload(drawn(picture.color.shape), run.device).to(picture.color)
             return signs * counts / square.clamp_min(LEAST_ERROR * picture.color.numel()).sqrt()
 
-        for view in chosen:
-            pictures.backward([view], gradient)
-            probe.take_note()
+        for group in pictures.groups(chosen):
+            pictures.backward(group, gradient, probe.take_note)
         nowhere = 0.0 if len(chosen) == len(views) else torch.inf
         worth = [PER_NEPER / len(chosen) * probe.worth(block) for block in blocks]
         return [torch.where(of_block > 0, of_block, nowhere) for of_block in worth]
