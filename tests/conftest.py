@@ -15,10 +15,8 @@ from jaxtyping import config as checks
 from jaxtyping import install_import_hook
 
 # Shapes and dtypes in these packages' signatures are checked when they are called. The hook only works on
-# modules that are not imported yet, hence here and not in a fixture. On CUDA the loss is compiled, and the
-# compiler would trace the checks.
-if not torch.cuda.is_available():
-    install_import_hook(["abcd_ns.engine", "abcd_ns.peers"], "beartype.beartype")
+# modules that are not imported yet, hence here and not in a fixture.
+install_import_hook(["abcd_ns.engine", "abcd_ns.peers"], "beartype.beartype")
 
 # The same sums in the same order on any machine, and room for other processes; those that tests start, too.
 torch.set_num_threads(1)

@@ -1,7 +1,8 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
 import functools
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -13,9 +14,32 @@ from torch.autograd.function import once_differentiable
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW, photometric_sums
 
 try:
-    from abcd_ns.engine.render.cuda.photometric import photometric as fused
+    from abcd_ns.engine.render.cuda.photometric import photometric
 except ImportError:  # Triton comes with torch for Linux
-    fused = None
+    photometric = None
+
+
+class Fused:
+    """CUDA's kernels, until they turn out not to compile here."""
+
+    def __init__(self, function: Callable[..., Any] | None) -> None:
+        self._function = function
+
+    def __call__(self, rendered: Tensor, photo: Tensor, *weights: float) -> tuple[Tensor, Tensor] | None:
+        """The loss and its gradient; None where it has to be found otherwise."""
+        if self._function is None or not rendered.is_cuda or rendered.dtype != torch.float32:
+            return None
+        try:
+            return self._function(rendered, photo, *weights)
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, ImportError, OSError) as error:
+            warnings.warn(f"The loss runs uncompiled, so steps take longer: {error}", stacklevel=2)
+            self._function = None
+            return None
+
+
+fused = Fused(photometric)
 
 
 class _Photometric(torch.autograd.Function):
@@ -29,13 +53,13 @@ class _Photometric(torch.autograd.Function):
         by_pixel: float,
         by_window: float,
     ) -> Float[Tensor, ""]:
-        if fused is not None and rendered.is_cuda and rendered.dtype == torch.float32:
-            loss, gradient = fused(rendered, photo, by_pixel, by_window)
-        else:
+        found = fused(rendered, photo, by_pixel, by_window)
+        if found is None:
             weights = _pair(by_pixel, by_window, rendered.dtype, rendered.device)
             planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
             sums, gradient = photometric_sums(*planes, weights)
-            loss, gradient = (sums * weights).sum(), gradient.permute(1, 2, 0)
+            found = (sums * weights).sum(), gradient.permute(1, 2, 0)
+        loss, gradient = found
         ctx.save_for_backward(gradient)
         return loss
 

@@ -1,9 +1,9 @@
-"""Which views are drawn in one pass, where each drawn alone would cost more in calls than in work."""
+"""What is drawn in one pass, where each view drawn alone would cost more in calls than in work."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import TypeVar
 
-from abcd_ns.engine.types import Crop, View
+from abcd_ns.engine.types import Crop
 
 Item = TypeVar("Item")
 DEVICE_PIXELS, DEVICE_SPLATS = 1 << 21, 400_000
@@ -11,23 +11,28 @@ DEVICE_PIXELS, DEVICE_SPLATS = 1 << 21, 400_000
 
 
 def runs(
-    items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: int, *, pixels: int, splats: int
+    items: Sequence[Item],
+    crops: Sequence[Crop],
+    gaussians: int,
+    pixels: int,
+    splats: int,
+    kinds: Sequence[Hashable] | None = None,
 ) -> Iterator[list[Item]]:
-    """The items, each what a view sees, in runs of neighbours whose images are of one size and near plane.
+    """The items, a crop each, in runs of neighbours of one kind.
 
     Args:
-        gaussians: that each of them draws.
+        gaussians: that are drawn in each crop.
         pixels, splats: most of a run of more than one.
+        kinds: of each item; None if they are all alike.
     """
     run: list[Item] = []
     drawn, kind = 0, None
-    for item, (view, crop) in zip(items, seen, strict=True):
+    for item, crop, own in zip(items, crops, kinds or [None] * len(items), strict=True):
         drawn += crop.pixels
-        alike = kind == (view.width, view.height, view.near)
-        if run and (not alike or drawn > pixels or (len(run) + 1) * gaussians > splats):
+        if run and (own != kind or drawn > pixels or (len(run) + 1) * gaussians > splats):
             yield run
             run, drawn = [], crop.pixels
-        kind = (view.width, view.height, view.near)
+        kind = own
         run.append(item)
     if run:
         yield run

@@ -3,23 +3,15 @@
 import copy
 import dataclasses
 from pathlib import Path
-from typing import Any
-from unittest import mock
 
-import torch
-from nerfstudio.data.datamanagers.full_images_datamanager import (
-    FullImageDatamanager,
-    FullImageDatamanagerConfig,
-)
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModel
-from torchmetrics.image import lpip
 
 from abcd_ns import methods
-from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import HELD_OUT_EVERY, METHODS, Job
 from abcd_ns.lab.runs.options import change_options
+from abcd_ns.lab.runs.splatfacto import Splatfacto, SplatfactoData
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.options import mirror
@@ -29,26 +21,6 @@ ENDLESS = 10**9
 """Steps of a run that its seconds end."""
 
 _REGISTERED = {name: getattr(methods, name.replace("-", "_")) for name in METHODS if name != "splatfacto"}
-
-
-class _NoLpips(torch.nn.Module):
-    """In the place of a measure whose weights, 233 MiB, nerfstudio would fetch from the network."""
-
-    def __init__(self, **_options: Any) -> None:
-        super().__init__()
-
-
-class Splatfacto(SplatfactoModel):
-    """Splatfacto, of which only pictures are asked: they are scored as all others are."""
-
-    def populate_modules(self) -> None:
-        """As splatfacto's, without LPIPS."""
-        with mock.patch.object(lpip, "LearnedPerceptualImagePatchSimilarity", _NoLpips):
-            super().populate_modules()
-
-
-class SplatfactoData(FullImageDatamanager[AbcdDataset]):
-    """Splatfacto's own datamanager on the very photos and cameras that ABCD reads."""
 
 
 def trainer_config(job: Job, out: Path) -> TrainerConfig:

@@ -18,7 +18,7 @@ from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree, pack, project_packed
 from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
-from abcd_ns.engine.render.together import Item, runs
+from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.render.z_window import ZWindow, showing
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
@@ -147,7 +147,8 @@ class TorchRasterizer(Rasterizer):
         self, gaussians: Gaussians, shots: Sequence[CutShot], *, sh_degree: int, antialiased: bool = False
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each view is projected and binned once, and a few are drawn in one pass."""
-        for few in _a_few(shots, [(shot.view, shot.crop) for shot in shots], gaussians):
+        crops = [shot.crop for shot in shots]
+        for few in runs(shots, crops, len(gaussians), PIXELS_AT_ONCE, SPLATS_AT_ONCE):
             yield from self._cut_together(gaussians, few, sh_degree, antialiased)
 
     def _cut_together(
@@ -175,7 +176,8 @@ class TorchRasterizer(Rasterizer):
         antialiased: bool = False,
     ) -> Iterator[ZWindow]:
         """See Rasterizer.depth_windows. A few views are drawn in one pass."""
-        for few in _a_few(seen, seen, gaussians):
+        crops = [crop for _, crop in seen]
+        for few in runs(seen, crops, len(gaussians), PIXELS_AT_ONCE, SPLATS_AT_ONCE):
             yield from self._windows_together(gaussians, few, visible, antialiased)
 
     def _windows_together(
@@ -257,12 +259,6 @@ class TorchRasterizer(Rasterizer):
         self, candidates: Candidates, planes: Float[Tensor, "r n"], absgrad_target: Tensor | None = None
     ) -> Job:
         return Job(candidates.lists(self.chunk), planes.shape[1], self.kernels, absgrad_target)
-
-
-def _a_few(
-    items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: Gaussians
-) -> Iterator[list[Item]]:
-    return runs(items, seen, len(gaussians), pixels=PIXELS_AT_ONCE, splats=SPLATS_AT_ONCE)
 
 
 def _without_depths(planes: Float[Tensor, "r n"]) -> Float[Tensor, "r n"]:

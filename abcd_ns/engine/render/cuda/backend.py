@@ -102,10 +102,9 @@ class GsplatRasterizer(Rasterizer):
             seen = self._seen(gaussians, views, sh_degree, antialiased)
             drawing = Drawing.of(self._kind, Packed.of(seen), crops, self._cameras, windowed=True)
             members = drawing.members(drawing.inside([shot.inside for shot in few]))
-            fronts, backs = ([shot.front for shot in few], [shot.back for shot in few])
+            fronts, backs = [shot.front for shot in few], [shot.back for shot in few]
             layers = (drawing.only(drawing.inside(windows)).layers() for windows in (fronts, backs))
-            for k, parts in enumerate(zip(*layers, members, strict=True)):
-                front, back, which = parts
+            for k, (front, back, which) in enumerate(zip(*layers, members, strict=True)):
                 yield Cut(front, back, seen.splats(k, which), which)
 
     @torch.no_grad()
@@ -172,7 +171,9 @@ class GsplatRasterizer(Rasterizer):
 def _a_few(
     items: Sequence[Item], seen: Sequence[tuple[View, Crop]], gaussians: Gaussians
 ) -> Iterator[list[Item]]:
-    return runs(items, seen, len(gaussians), pixels=DEVICE_PIXELS, splats=DEVICE_SPLATS)
+    kinds = [(view.width, view.height, view.near) for view, _ in seen]
+    crops = [crop for _, crop in seen]
+    return runs(items, crops, len(gaussians), DEVICE_PIXELS, DEVICE_SPLATS, kinds)
 
 
 Seen = TypeVar("Seen", Projected, Packed)

@@ -12,7 +12,7 @@ from functools import cached_property
 import torch
 import torch.nn.functional as F
 from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Int, Int64, Shaped
 from torch import Tensor
 
 from abcd_ns.engine.render.cuda.kinds import Kind
@@ -134,11 +134,7 @@ class Sheet:
 
     def pixels(self, device: torch.device) -> Int64[Tensor, "c t"]:
         """How many of its crop's each tile holds."""
-        _, rows, cols = self.shape
-        beyond = ((0, cols - grid.cols, 0, rows - grid.rows) for grid in self.grids)
-        counts = (grid.pixels(device).view(grid.rows, grid.cols) for grid in self.grids)
-        padded = [F.pad(own, more) for own, more in zip(counts, beyond, strict=True)]
-        return torch.stack(padded).flatten(1)
+        return torch.stack([self._padded(grid.pixels(device), grid) for grid in self.grids])
 
     def spread(self, windows: Sequence[ZWindow | None], like: Tensor) -> Float[Tensor, "2 tiles"]:
         """(near, far) of each camera's window; the same numbers twice, so nothing, where it has no tile."""
@@ -146,9 +142,13 @@ class Sheet:
         for grid, window in zip(self.grids, windows, strict=True):
             window = window or ZWindow.everything(grid, like.device, like.dtype)
             window = window.on(grid)
-            beyond = (0, self.shape[2] - grid.cols, 0, self.shape[1] - grid.rows)
-            spread.append(F.pad(torch.stack((window.near, window.far)).view(2, grid.rows, grid.cols), beyond))
+            spread.append(self._padded(torch.stack((window.near, window.far)), grid))
         return torch.stack(spread, dim=1).view(2, -1)
+
+    def _padded(self, values: Shaped[Tensor, "*v t"], grid: TileGrid) -> Shaped[Tensor, "*v tiles"]:
+        """Values by tile of a grid, by tile of the sheet; 0 where the grid has none."""
+        beyond = (0, self.shape[2] - grid.cols, 0, self.shape[1] - grid.rows)
+        return F.pad(values.unflatten(-1, (grid.rows, grid.cols)), beyond).flatten(-2)
 
 
 @dataclass(frozen=True)
@@ -232,8 +232,7 @@ class Drawing:
         return replace(self, keys=keys[:count], owners=owners[:count])
 
     def members(self, keep: Bool[Tensor, "q"]) -> list[Int64[Tensor, "_k"]]:
-        """Of each camera, which as many splats as any other has, those that have any of these pairs; one
-        wait."""
+        """Of each camera the splats that have any of these pairs; one wait. All have as many splats."""
         held = keep.new_zeros(len(self.splats) + 1)
         held.index_fill_(0, torch.where(keep, self.owners, len(self.splats)).long(), True)
         of_cameras = held[:-1].view(len(self.sheet.crops), -1)

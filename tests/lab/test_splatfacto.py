@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from nerfstudio.data.scene_box import SceneBox
 
-from abcd_ns.lab.runs.configs import Splatfacto
+from abcd_ns.lab.runs.splatfacto import Splatfacto
 
 
 def test_it_is_made_without_fetching_weights(monkeypatch):

@@ -1,0 +1,31 @@
+"""Splatfacto as a peer: on the photos and cameras that ABCD reads, without what its own scores alone need."""
+
+from typing import Any
+from unittest import mock
+
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from nerfstudio.models.splatfacto import SplatfactoModel
+from torchmetrics.image import lpip
+
+from abcd_ns.data.dataset import AbcdDataset
+
+
+class _NoLpips(torch.nn.Module):
+    """In the place of a measure whose weights, 233 MiB, nerfstudio would fetch from the network."""
+
+    def __init__(self, **_options: Any) -> None:
+        super().__init__()
+
+
+class Splatfacto(SplatfactoModel):
+    """Splatfacto, of which only pictures are asked: they are scored as all others are."""
+
+    def populate_modules(self) -> None:
+        """As splatfacto's, without LPIPS."""
+        with mock.patch.object(lpip, "LearnedPerceptualImagePatchSimilarity", _NoLpips):
+            super().populate_modules()
+
+
+class SplatfactoData(FullImageDatamanager[AbcdDataset]):
+    """Splatfacto's own datamanager on the very photos and cameras that ABCD reads."""

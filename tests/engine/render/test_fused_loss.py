@@ -1,0 +1,41 @@
+"""CUDA's kernels of the loss where they turn out not to compile: on a GPU, which is not here."""
+
+import warnings
+
+import pytest
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from abcd_ns.engine.render.loss import Fused
+
+with FakeTensorMode():
+    ON_CUDA, DOUBLE = (torch.empty(4, device="cuda", dtype=dtype) for dtype in (torch.float32, torch.float64))
+
+
+def failing(error):
+    def fail(*_):
+        raise error
+
+    return Fused(fail)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no compiler"), ImportError("triton"), OSError("no room")])
+def test_where_they_do_not_it_is_said_once(error):
+    fused = failing(error)
+    with pytest.warns(UserWarning, match=f"The loss runs uncompiled.*{error}"):
+        assert fused(ON_CUDA, ON_CUDA, 0.5, 0.5) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fused(ON_CUDA, ON_CUDA, 0.5, 0.5) is None
+
+
+def test_a_full_memory_is_not_taken_for_that():
+    with pytest.raises(torch.OutOfMemoryError):
+        failing(torch.OutOfMemoryError())(ON_CUDA, ON_CUDA, 0.5, 0.5)
+
+
+def test_they_are_for_single_floats_on_cuda():
+    fused = Fused(lambda rendered, photo, *_: (rendered, photo))
+    assert fused(ON_CUDA, ON_CUDA, 0.5, 0.25) is not None
+    assert fused(torch.zeros(4), torch.zeros(4), 0.5, 0.5) is None
+    assert fused(DOUBLE, DOUBLE, 0.5, 0.5) is None
