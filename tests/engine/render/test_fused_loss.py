@@ -4,12 +4,19 @@ import warnings
 
 import pytest
 import torch
-from torch._subclasses.fake_tensor import FakeTensorMode
 
 from abcd_ns.engine.render.loss import Fused
 
-with FakeTensorMode():
-    ON_CUDA, DOUBLE = (torch.empty(4, device="cuda", dtype=dtype) for dtype in (torch.float32, torch.float64))
+
+class Elsewhere(torch.Tensor):
+    """Says that it is on CUDA."""
+
+    is_cuda = True
+
+
+ON_CUDA, DOUBLE = (
+    torch.zeros(4, dtype=kind).as_subclass(Elsewhere) for kind in (torch.float32, torch.float64)
+)
 
 
 def failing(error):
