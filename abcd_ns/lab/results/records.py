@@ -9,7 +9,6 @@ import difflib
 import json
 import math
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -58,9 +57,7 @@ def encode(record: Any) -> dict[str, Any]:
         ValueError: a number is NaN or infinite; the message names the field.
     """
     data = dataclasses.asdict(record)
-    for path, value in _leaves(data, ""):
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"{path} is {value}, which JSON cannot hold")
+    _check_finite(data, "")
     return data
 
 
@@ -129,17 +126,12 @@ def read_record(path: Path, cls: type[R], schema: int) -> R:
     return decode(cls, data, str(path))
 
 
-def _leaves(data: Any, path: str) -> Iterator[tuple[str, Any]]:
-    items = (
-        data.items()
-        if isinstance(data, dict)
-        else enumerate(data)
-        if isinstance(data, (list, tuple))
-        else None
-    )
-    if items is None:
-        yield path, data
-        return
-    for key, value in items:
-        step = f"[{key}]" if isinstance(key, int) else f".{key}" if path else str(key)
-        yield from _leaves(value, path + step)
+def _check_finite(data: Any, path: str) -> None:
+    if isinstance(data, float) and not math.isfinite(data):
+        raise ValueError(f"{path} is {data}, which JSON cannot hold")
+    if isinstance(data, dict):
+        for key, value in data.items():
+            _check_finite(value, f"{path}.{key}" if path else str(key))
+    elif isinstance(data, (list, tuple)):
+        for number, value in enumerate(data):
+            _check_finite(value, f"{path}[{number}]")
