@@ -5,7 +5,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Union
 
@@ -85,8 +85,21 @@ def set_options(config: Any, values: Mapping[str, bool | int | float | str | Non
 
 
 def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
-    """The type of every option that can be written as one word, by its dotted name."""
-    return dict(_options(config, prefix))
+    """The type of every option that can be written as one word, by its dotted name.
+
+    Args:
+        prefix: begins every name.
+    """
+    hints, found = typing.get_type_hints(type(config)), {}
+    for field in dataclasses.fields(config):
+        value, name = getattr(config, field.name), prefix + field.name
+        if field.name.startswith("_"):
+            continue
+        if dataclasses.is_dataclass(value):
+            found |= option_names(value, f"{name}.")
+        elif _is_a_word(hints[field.name]):
+            found[name] = hints[field.name]
+    return found
 
 
 def value_of(config: Any, path: str) -> Any:
@@ -137,18 +150,6 @@ def _leads_somewhere(config: Any, path: str) -> bool:
             return False
         config = getattr(config, step)
     return True
-
-
-def _options(config: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    hints = typing.get_type_hints(type(config))
-    for field in dataclasses.fields(config):
-        value, name = getattr(config, field.name), prefix + field.name
-        if field.name.startswith("_"):
-            continue
-        if dataclasses.is_dataclass(value):
-            yield from _options(value, f"{name}.")
-        elif _is_a_word(hints[field.name]):
-            yield name, hints[field.name]
 
 
 def _alternatives(hint: Any) -> tuple[Any, ...]:
