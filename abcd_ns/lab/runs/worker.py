@@ -19,20 +19,10 @@ from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.job import Job
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.evaluate import (
-    draw_held_out,
-    mean,
-    ordering_gap,
-    score,
-    squared_gap,
-)
+from abcd_ns.lab.runs.evaluate import draw_held_out, mean, ordering_gap, score, squared_gap
 from abcd_ns.lab.runs.training import Training
 from abcd_ns.lab.runs.work import memory_of_run, work
-from abcd_ns.machine import (
-    describe_versions,
-    disk_bytes,
-    without_home,
-)
+from abcd_ns.machine import describe_versions, disk_bytes, without_home
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
@@ -52,7 +42,31 @@ def run(job: Job, folder: Path) -> Run:
     total = time.time() - psutil.Process().create_time() - training.seconds_of_looks
     memory = memory_of_run()
     scores, gaps = score_held_out(training, job, folder / "pictures")
-    return _record(job, training, total, scores, gaps, folder, memory)
+    names = ("psnr", "ssim", "lpips", "psnr_merged", "ssim_merged")
+    means = {name: mean([getattr(view, name) for view in scores]) for name in names}
+    gap, note = ordering_gap(gaps, training.blocks)
+    end = CurvePoint(training.stopwatch.seconds, training.steps, means["psnr_merged"], training.gaussians)
+    return Run(
+        method=job.method,
+        scene=job.settings.scene,
+        seed=job.seed,
+        blocks=training.blocks,
+        steps=training.steps,
+        train_seconds=end.seconds,
+        total_seconds=total,
+        **means,
+        lpips_reason=without_home(lpips_missing() or "") or None,
+        ordering_gap_db=gap,
+        ordering_gap_note=note,
+        gaussians=training.gaussians,
+        parameters=training.parameters,
+        **memory,
+        store_bytes=disk_bytes(folder / "abcd" / STORE),
+        layer_seconds=training.layer_seconds,
+        curve=(*training.points, end),
+        views=tuple(scores),
+        versions=describe_versions(),
+    )
 
 
 def set_up(job: Job, out: Path) -> Training:
@@ -95,45 +109,6 @@ def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[V
 def save_png(path: Path, picture: Tensor) -> None:
     """Write a picture, float [h, w, 3] in 0..1, with 8 bits a channel."""
     Image.fromarray((picture * 255).round().byte().cpu().numpy()).save(path)
-
-
-def _record(
-    job: Job,
-    training: Training,
-    total: float,
-    scores: list[ViewScore],
-    gaps: list[float],
-    folder: Path,
-    memory: dict[str, int | str | None],
-) -> Run:
-    def mean_of(name: str) -> float | None:
-        return mean([getattr(view, name) for view in scores])
-
-    names = ("psnr", "ssim", "lpips", "psnr_merged", "ssim_merged")
-    means = {name: mean_of(name) for name in names}
-    gap, note = ordering_gap(gaps, training.blocks)
-    end = CurvePoint(training.stopwatch.seconds, training.steps, means["psnr_merged"], training.gaussians)
-    return Run(
-        method=job.method,
-        scene=job.settings.scene,
-        seed=job.seed,
-        blocks=training.blocks,
-        steps=training.steps,
-        train_seconds=end.seconds,
-        total_seconds=total,
-        **means,
-        lpips_reason=without_home(lpips_missing() or "") or None,
-        ordering_gap_db=gap,
-        ordering_gap_note=note,
-        gaussians=training.gaussians,
-        parameters=training.parameters,
-        **memory,
-        store_bytes=disk_bytes(folder / "abcd" / STORE),
-        layer_seconds=training.layer_seconds,
-        curve=(*training.points, end),
-        views=tuple(scores),
-        versions=describe_versions(),
-    )
 
 
 if __name__ == "__main__":
