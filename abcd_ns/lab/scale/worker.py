@@ -75,14 +75,14 @@ def run(job: LandJob, folder: Path) -> Run:
     rasterizer.warm_up()
     loss.warm_up(device)
     base, began = peak_rss_bytes(), time.perf_counter()
-    land, whole = Land(job.tiles, job.settings.gaussians, seed=job.seed), job.method == WHOLE
-    store = make_store(land, whole, folder / STORE)
+    land = Land(job.tiles, job.settings.gaussians, seed=job.seed)
+    scene = make_scene(job, land, folder / STORE)
     made = time.perf_counter()
-    coordinator = _coordinator(job, land, store, rasterizer, device)
+    coordinator = _coordinator(job, land, scene, rasterizer, device)
     watch = _Watch(coordinator)
     cameras = {view.index: view for view in land.cameras()}
     # The visit to a single block lasts as long as the run.
-    wanted = WHOLE_STEPS if job.tiles == 1 or whole else None
+    wanted = WHOLE_STEPS if scene.tree.num_blocks == 1 else None
     while len(watch.visits) < job.settings.visits if wanted is None else coordinator.state.step < wanted:
         train_step(coordinator, lambda view, crop: land.crop(cameras[view], crop))
     memory = memory_of_run()
@@ -99,7 +99,7 @@ def run(job: LandJob, folder: Path) -> Run:
         method=job.method,
         scene="land",
         seed=job.seed,
-        blocks=coordinator.scene.tree.num_blocks,
+        blocks=scene.tree.num_blocks,
         steps=coordinator.state.step,
         train_seconds=time.perf_counter() - made,
         total_seconds=time.time() - psutil.Process().create_time(),
@@ -118,24 +118,22 @@ def run(job: LandJob, folder: Path) -> Run:
     )
 
 
-def make_store(land: Land, whole: bool, folder: Path) -> ParameterStore:
+def make_scene(job: LandJob, land: Land, folder: Path) -> StoredScene:
     """The land at rest: tile by tile, or all tiles as one block, which takes the RAM that it takes."""
+    whole = job.method == WHOLE
+    tree = build_kd(torch.zeros(0, 3), 1) if whole else land.tree()
+    store = ParameterStore.create(folder, {"tree": tree.to_json()})
     if whole:
-        tree = build_kd(torch.zeros(0, 3), 1)
-        store = ParameterStore.create(folder, {"tree": tree.to_json()})
         everything = Gaussians.cat([land.make_tile(tile) for tile in range(land.tiles)])
         store.commit({0: BlockState.fresh(everything).packed()})
-        return store
-    tree = land.tree()
-    store = ParameterStore.create(folder, {"tree": tree.to_json()})
-    for block, tile in enumerate(land.tile_of(tree)):
-        store.commit({block: BlockState.fresh(land.make_tile(tile)).packed()})
-        print(f"tile {block + 1}/{land.tiles}", flush=True)
-    return store
+    else:
+        for block, tile in enumerate(land.tile_of(tree)):
+            store.commit({block: BlockState.fresh(land.make_tile(tile)).packed()})
+            print(f"tile {block + 1}/{land.tiles}", flush=True)
+    return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
 
 
-def _coordinator(job: LandJob, land: Land, store: ParameterStore, rasterizer, device) -> Coordinator:
-    tree = build_kd(torch.zeros(0, 3), 1) if job.method == WHOLE else land.tree()
+def _coordinator(job: LandJob, land: Land, scene: StoredScene, rasterizer, device) -> Coordinator:
     config = TrainingConfig(
         recipe=Recipe(sh_ramp=0.0),
         # As large blocks have it. Small ones may draw more at once, for speed, which small lands do not have.
@@ -148,7 +146,7 @@ def _coordinator(job: LandJob, land: Land, store: ParameterStore, rasterizer, de
     run = TrainingRun(
         config,
         Budget(steps=10**9),
-        StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes),
+        scene,
         land.cameras(),
         rasterizer,
         *nothing_live(3, device),
