@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from abcd_ns.lab.results.run import Run
-from abcd_ns.lab.results.style import STYLE
+from abcd_ns.lab.results.style import in_style
 
 ERROR_GAIN = 4
 """By how much errors are amplified; 1 / ERROR_GAIN is the largest that can be told from larger ones."""
@@ -40,6 +39,7 @@ def psnr_of(picture: PictureArray, photo: PictureArray) -> float:
     return float("inf") if squared == 0 else float(-10 * np.log10(squared))
 
 
+@in_style
 def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], title: str, path: Path) -> None:
     """Write one figure: photo and pictures above, errors below, on one scale with its legend.
 
@@ -52,24 +52,23 @@ def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], titl
     single = len(pictures) == 1
     rows, columns = (1, 3) if single else (2, 1 + len(pictures))
     size = (COLUMN_INCHES * columns, rows * (COLUMN_INCHES * height / width + 0.25) + 0.25)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(size[0] + 0.8 * single, size[1]), layout="constrained")
-        grid = figure.subplots(rows, columns, squeeze=False)
-        figure.suptitle(title, fontsize=9)
-        _show(grid[0, 0], photo, "photo")
-        for column, (name, picture) in enumerate(pictures.items(), start=1):
-            _show(grid[0, column], picture, f"{name}  {psnr_of(picture, photo):.2f} dB")
-            below = grid[0, 2] if single else grid[1, column]
-            error = _show_error(below, error_map(picture, photo), name)
-        if single:
-            _add_scale(figure.colorbar(error, ax=grid[0, 2], extend="max", fraction=0.05, pad=0.02))
-        else:
-            grid[1, 0].axis("off")
-            inset = grid[1, 0].inset_axes((0.08, 0.52, 0.84, 0.09))
-            bar = figure.colorbar(error, cax=inset, orientation="horizontal", extend="max")
-            _add_scale(bar, "\n(mean of R, G, B; share of full scale)")
-        # No less than a dot per pixel, so that nothing that is shown is lost.
-        figure.savefig(path, dpi=min(max(200.0, 1.1 * width / COLUMN_INCHES), 400.0))
+    figure = Figure(figsize=(size[0] + 0.8 * single, size[1]), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    figure.suptitle(title, fontsize=9)
+    _show(grid[0, 0], photo, "photo")
+    for column, (name, picture) in enumerate(pictures.items(), start=1):
+        _show(grid[0, column], picture, f"{name}  {psnr_of(picture, photo):.2f} dB")
+        below = grid[0, 2] if single else grid[1, column]
+        error = _show_error(below, error_map(picture, photo), name)
+    if single:
+        _add_scale(figure.colorbar(error, ax=grid[0, 2], extend="max", fraction=0.05, pad=0.02))
+    else:
+        grid[1, 0].axis("off")
+        inset = grid[1, 0].inset_axes((0.08, 0.52, 0.84, 0.09))
+        bar = figure.colorbar(error, cax=inset, orientation="horizontal", extend="max")
+        _add_scale(bar, "\n(mean of R, G, B; share of full scale)")
+    # No less than a dot per pixel, so that nothing that is shown is lost.
+    figure.savefig(path, dpi=min(max(200.0, 1.1 * width / COLUMN_INCHES), 400.0))
 
 
 def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
