@@ -68,6 +68,15 @@ def find_default(results: Results) -> Arm | None:
     return next((arm for arm in results.arms if arm.variant == "default"), None)
 
 
+def find_differences(results: Results) -> list[tuple[Arm, Difference]]:
+    """Every other arm against the default; those that share no seed with it are left out."""
+    default = find_default(results)
+    if default is None:
+        return []
+    found = ((arm, find_difference(arm, default)) for arm in results.arms if arm is not default)
+    return [(arm, difference) for arm, difference in found if difference is not None]
+
+
 def findings_of(results: Results) -> tuple[str, ...]:
     """What the experiment says, a sentence each."""
     find = {
@@ -95,8 +104,7 @@ def _of_options(results: Results) -> tuple[str, ...]:
     default = find_default(results)
     if default is None:
         return ("There is nothing to compare with: the default's runs failed.",)
-    found = [(arm, find_difference(arm, default)) for arm in results.arms if arm is not default]
-    known = [(arm, difference.mean) for arm, difference in found if difference is not None]
+    known = [(arm, difference.mean) for arm, difference in find_differences(results)]
     if not known:
         return ()
     best, worst = (pick(known, key=lambda pair: pair[1]) for pick in (max, min))

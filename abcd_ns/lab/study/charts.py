@@ -10,12 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from abcd_ns.lab.results.findings import (
-    GOAL_DB,
-    find_default,
-    find_difference,
-    find_gap,
-)
+from abcd_ns.lab.results.findings import GOAL_DB, find_default, find_differences, find_gap
 from abcd_ns.lab.results.frontier import AS_IT_IS, LIMIT, MCMC, PRICE, curves, way_of
 from abcd_ns.lab.results.results import Arm, Results
 from abcd_ns.lab.results.run import Run
@@ -169,10 +164,7 @@ def _mark_stop(axes: Axes, arm: Arm) -> None:
 
 def _draw_options(results: Results) -> Figure | None:
     default = find_default(results)
-    if default is None:
-        return None
-    found = [(arm, find_difference(arm, default)) for arm in results.arms if arm is not default]
-    rows = sorted(((a, d) for a, d in found if d is not None), key=lambda pair: pair[1].mean)
+    rows = sorted(find_differences(results), key=lambda pair: pair[1].mean)
     if not rows:
         return None
     lines = max(len(arm.variant.split()) for arm, _ in rows)
