@@ -40,6 +40,11 @@ class Settings:
         return path.parent.name if path.suffix == ".json" else path.name
 
     @property
+    def budget(self) -> str:
+        """Of a run, in words."""
+        return f"{self.steps:,} steps" if self.seconds is None else f"{self.seconds:g} s"
+
+    @property
     def moments(self) -> tuple[float, ...]:
         """Shares of the run, up to 1, at which held-out views are drawn; denser where quality rises fast."""
         return tuple((k / self.evals) ** 2 for k in range(1, self.evals + 1))

@@ -101,8 +101,7 @@ def _draw_comparison(part: str, results: Results, out: Path) -> list[Path]:
         line = [(point.seconds, point.psnr) for point in run.curve]
         curves.plot(*zip(*line, strict=True), color=colors[name], marker=MARKERS[run.method], markersize=4)
         ends[name] = line[-1]
-    budget = f"{settings.steps:,} steps" if settings.seconds is None else f"{settings.seconds:g} s"
-    curves.set_title(f"{settings.scene}, {budget} a run", loc="left")
+    curves.set_title(f"{settings.scene}, {settings.budget} a run", loc="left")
     curves.set(xlabel="training time (s)", ylabel="held-out PSNR (dB)", xlim=(0, None))
     lay_grid(curves)
     label_ends(curves, ends, 1.04 * max(seconds for seconds, _ in ends.values()), colors)

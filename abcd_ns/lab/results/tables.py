@@ -148,7 +148,7 @@ def notes(results: Results) -> list[str]:
 
 def _protocol(results: Results) -> str:
     s = results.settings
-    budget = f"{s.steps:,} steps" if s.seconds is None else f"{s.seconds:g} s of training"
+    budget = s.budget if s.seconds is None else f"{s.budget} of training"
     seeds = ("seed " if len(results.seeds) == 1 else "seeds ") + ", ".join(map(str, results.seeds))
     conditions = [f"{budget} a run", seeds]
     if results.kind != "comparison" and len(results.methods) == 1:

@@ -208,7 +208,7 @@ def _title(results: Results, method: str | None = None) -> str:
     parts = [s.scene, f"1/{s.downscale} size", *([method] if method else [])]
     if results.kind != "study of blocks" and set(results.methods) != {"abcd-monolithic"}:
         parts.append(f"{s.blocks} blocks")
-    parts.append(f"{s.steps:,} steps" if s.seconds is None else f"{s.seconds:g} s")
+    parts.append(s.budget)
     if results.means_of:
         parts.append(results.means_of)
     return ", ".join(parts)

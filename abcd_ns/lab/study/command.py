@@ -208,11 +208,10 @@ def study(wanted: Annotated[Study, tyro.conf.arg(name="")]) -> int:
 def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     """Do all runs of the plan and write what came of them; exit code 1 if a run failed."""
     count, settings = len(plan.jobs), plan.settings
-    text = f"{count} runs of {settings.steps or 0:,} steps."
+    text = f"{count} runs of {settings.budget}"
     if settings.seconds is not None:
-        minutes = count * settings.seconds / 60
-        text = f"{count} runs of {settings.seconds:g} s: {minutes:.0f} min of training and some of start-up."
-    console.print(text, highlight=False)
+        text += f": {count * settings.seconds / 60:.0f} min of training and some of start-up"
+    console.print(f"{text}.", highlight=False)
     return experiment.carry_out(plan, console, draw_study, overwrite)
 
 
