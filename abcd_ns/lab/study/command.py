@@ -47,7 +47,7 @@ class Conditions:
     def _planned(
         self,
         study: str,
-        methods: Sequence[str],
+        method: str,
         variants: Sequence[Variant],
         varied: Sequence[Any],
         *,
@@ -63,8 +63,8 @@ class Conditions:
         given = {name: getattr(self, name) for name in names}
         given |= {"blocks": blocks, "max_gaussians": max_gaussians, "densify": True, "pictures": 0}
         settings = make_settings(**given)
-        jobs = tuple(Job(m, seed, settings, v) for seed in self.seeds for m in methods for v in variants)
-        line = ["abcd", "study", study, "--data", settings.scene, *varied]
+        jobs = tuple(Job(method, seed, settings, v) for seed in self.seeds for v in variants)
+        line = ["abcd", "study", study, "--data", settings.scene, "--method", method, *varied]
         line += [*settings.words(study != "blocks"), "--seeds", *self.seeds, "--out", self.out.name]
         for job in jobs:
             check_options(job)
@@ -92,9 +92,10 @@ class BlocksStudy(Conditions):
             UserError: an option cannot be used.
         """
         check_numbers("--blocks", self.blocks, 1, several=True)
-        varied = ["--method", self.method, "--blocks", *sorted(self.blocks)]
-        variants = [_one(BLOCKS, number) for number in sorted(self.blocks)]
-        return self._planned("blocks", [self.method], variants, varied, max_gaussians=self.max_gaussians)
+        numbers = sorted(self.blocks)
+        variants = [_one(BLOCKS, number) for number in numbers]
+        varied = ["--blocks", *numbers]
+        return self._planned("blocks", self.method, variants, varied, max_gaussians=self.max_gaussians)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,12 +124,11 @@ class GaussiansStudy(Conditions):
         prices, limits = sorted(set(self.prices)), sorted(self.max_gaussians)
         if prices and prices[0] < 0:
             raise UserError(f"--prices {prices[0]:g}: a price is 0 or more, in pixels.")
-        varied = ["--method", self.method, "--prices", *(f"{price:g}" for price in prices)]
-        varied += ["--max-gaussians", *limits]
+        varied = ["--prices", *(f"{price:g}" for price in prices), "--max-gaussians", *limits]
         variants = [AS_IT_IS, *(_one(PRICE, f"{price:g}") for price in prices)]
         variants += [_one(LIMIT, limit) for limit in limits]
         variants += [Variant((Change(STRATEGY, "mcmc"), Change(LIMIT, str(limit)))) for limit in limits]
-        return self._planned("gaussians", [self.method], variants, varied, blocks=self.blocks)
+        return self._planned("gaussians", self.method, variants, varied, blocks=self.blocks)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,8 +171,8 @@ class OptionsStudy(Conditions):
                 shows = "its difference shows how well a run repeats itself."
                 notes.append(f"{variant.name} is the default: {shows}")
         given = {"blocks": self.blocks, "max_gaussians": self.max_gaussians, "notes": notes}
-        varied = ["--method", self.method, "--vary", *(variant.name for variant in variants)]
-        return self._planned("options", [self.method], [AS_IT_IS, *variants], varied, **given)
+        varied = ["--vary", *(variant.name for variant in variants)]
+        return self._planned("options", self.method, [AS_IT_IS, *variants], varied, **given)
 
 
 Study = (
