@@ -13,6 +13,8 @@ LOWEST = {"downscale": 1, "blocks": 1, "steps": 1, "evals": 1, "max_gaussians": 
 """The least that a number may be, by option; 1 for those that are not here."""
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 """A switch."""
+Number = Annotated[int, tyro.conf.arg(metavar="N")]
+Numbers = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")]
 
 
 def words(metavar: str, *aliases: str) -> Any:

@@ -13,25 +13,24 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Change, Plan, Variant
 from abcd_ns.lab.results.results import LeftOut
 from abcd_ns.lab.results.run import Failure, Run
+from abcd_ns.lab.results.tables import MIB
 from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.runs.checks import Flag, check_ranges
+from abcd_ns.lab.runs.checks import Flag, Number, Numbers, check_ranges
 from abcd_ns.lab.scale.charts import draw_scale
 from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings
 
-MIB = 2**20
 BYTES_PER_GAUSSIAN = 3 * 59 * 4
 """On disk: parameters and two moments in float32."""
 OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")
 """How torch and CUDA say it, in the last line of a log."""
 MONOLITHIC_LIMIT = 4_000_000
 """Gaussians; larger scenes are not tried as one block unless asked for."""
-Number = Annotated[int, tyro.conf.arg(metavar="N")]
 Megabytes = Annotated[int, tyro.conf.arg(metavar="MB")]
 
 
 def scale(
     out: Annotated[Path, tyro.conf.arg(metavar="PATH")],
-    blocks: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (2, 4, 8, 16, 32, 64),
+    blocks: Numbers = (2, 4, 8, 16, 32, 64),
     gaussians: Number = 20_000,
     visits: Number = 3,
     ram_budget_mb: Megabytes = 16,

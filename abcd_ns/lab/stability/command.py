@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as TimeLeft
@@ -17,7 +16,7 @@ from rich.progress import TimeRemainingColumn as TimeLeft
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.findings import findings_of, headline
 from abcd_ns.lab.results.results import Curve, Outcome
-from abcd_ns.lab.runs.checks import Flag, check_ranges, words
+from abcd_ns.lab.runs.checks import Flag, Number, check_ranges, words
 from abcd_ns.lab.runs.experiment import new_results, print_paths, write_report
 from abcd_ns.lab.runs.runner import claim
 from abcd_ns.lab.stability.charts import draw_curves
@@ -48,10 +47,10 @@ def stability(
     *,
     out: Path,
     data: Annotated[Path | None, words("DIR")] = None,
-    downscale: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
+    downscale: Number = 1,
     only: Annotated[tuple[str, ...], words("A1 A3 ...")] = (),
     quick: Flag = False,
-    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
+    seed: Number = 0,
     overwrite: Flag = False,
 ) -> int:
     """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.

@@ -12,15 +12,13 @@ from rich.console import Console
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import AS_IT_IS, Change, Job, Plan, Variant
 from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.runs.checks import Flag, check_numbers, make_settings, words
+from abcd_ns.lab.runs.checks import Flag, Number, Numbers, check_numbers, make_settings, words
 from abcd_ns.lab.study.charts import draw_study
 
 AbcdMethod = Literal["abcd", "abcd-ablated", "abcd-monolithic", "abcd-partition", "abcd-exact"]
 BLOCKS, LIMIT = "blocks", "training.density.max_gaussians"
 PRICE, STRATEGY = "training.density.price", "training.density.strategy"
 """The options that the first two studies vary."""
-Number = Annotated[int, tyro.conf.arg(metavar="N")]
-Numbers = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")]
 
 
 @dataclass(frozen=True, kw_only=True)
