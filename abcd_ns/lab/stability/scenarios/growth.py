@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import torch
 
-from abcd_ns.engine.events import VisitUndone
+from abcd_ns.engine.events import Event, VisitUndone
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import (
     REFINE_EVERY_BLOCK,
@@ -71,16 +71,13 @@ def resets(lab: Lab) -> Finding:
     for name, heal in (("abcd", True), ("abcd, not healing", False)):
         options = {"budget": lab.views_drawn(600), "blocks": 3, "warmup": 0.0, "density": density}
         coordinator = lab.coordinator(stage.start(), stage.views, heal=heal, **options)
-        undone: list[VisitUndone] = []
-
-        def listen(event, undone=undone) -> None:
-            undone += [event] * isinstance(event, VisitUndone)
-
-        coordinator.announce.subscribe(listen)
+        events: list[Event] = []
+        coordinator.announce.subscribe(events.append)
         errors = objectives(lab, stage, coordinator)
+        undone = sum(isinstance(event, VisitUndone) for event in events)
         worst = max(after / before - 1 for before, after in pairwise(errors))
-        numbers |= {f"worst rise {name}": worst, f"undone {name}": len(undone), f"end {name}": errors[-1]}
-        said[name] = f"worst visit {worst:+.0%} error, {len(undone)} of {len(errors) - 1} visits undone"
+        numbers |= {f"worst rise {name}": worst, f"undone {name}": undone, f"end {name}": errors[-1]}
+        said[name] = f"worst visit {worst:+.0%} error, {undone} of {len(errors) - 1} visits undone"
     return Finding(numbers["worst rise abcd"] <= ALLOWED_RISE, said, numbers)
 
 
