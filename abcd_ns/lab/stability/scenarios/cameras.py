@@ -79,7 +79,7 @@ def odd_places(lab: Lab) -> Finding:
 )
 def odd_sizes(lab: Lab) -> Finding:
     """A18: pictures of 1 to 6,767 pixels in one run; lenses with no and with absurd distortion."""
-    views = [replace(camera_of(v.index, size), index=v.index) for v, size in zip(ring(6), SIZES, strict=True)]
+    views = [camera_of(index, size) for index, size in enumerate(SIZES)]
     stage = make_stage(TABLE, views, ring(2, turn=0.5), points=200)
     trained = lab.train(stage, budget=lab.views_drawn(120), blocks=4, density=DensityConfig(refine_start=0.0))
     sound = trained.coordinator.finished and not bool(unsound(trained.gaussians).any())
