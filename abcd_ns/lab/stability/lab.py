@@ -39,12 +39,11 @@ from abcd_ns.nerfstudio.metrics import corrected_psnr
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
+PAIR: tuple[Method, ...] = ("abcd", "abcd-monolithic")
 SH_DEGREE = 1
 """Nothing in these worlds shines."""
 STILL = DensityConfig(strategy="off")
 """The number of Gaussians stays."""
-
-
 LIMITED = DensityConfig(max_gaussians=1000)
 """As many Gaussians for every method, and few, for time."""
 BUDGET = 600
@@ -140,7 +139,7 @@ class Lab:
         tick: Callable[[], None] = lambda: None,
     ) -> None:
         self.quick, self.seed, self.tick = quick, seed, tick
-        self._scores: dict[str, float] = {}
+        self._scores: dict[tuple[str, Method], float] = {}
         self.rasterizer = TorchRasterizer(compile)
         self._folder = folder
 
@@ -202,7 +201,17 @@ class Lab:
         events: list[Event] = []
         coordinator.announce.subscribe(events.append)
         counts = self.finish(coordinator, stage)
-        return Trained(coordinator, self.score(coordinator, stage.held_out, stage.truth), events, counts)
+        return Trained(coordinator, self.score(coordinator, stage), events, counts)
+
+    def train_limited(self, stage: Stage, method: Method, **options) -> Trained:
+        """Train under the conditions of comparisons: on few views and with few Gaussians, as many of both for
+        every method.
+
+        Args:
+            options: of `coordinator`; they go before these.
+        """
+        usual = {"budget": self.views_drawn(BUDGET), "density": LIMITED}
+        return self.train(stage, method, **{**usual, **options})
 
     def compared(self, stage: Stage, method: Method, name: str | None = None, **options) -> float:
         """Held-out PSNR under the conditions of comparisons, dB.
@@ -210,15 +219,11 @@ class Lab:
         Args:
             name: of the stage; its score is kept, and not found anew where nothing else is said.
         """
-        key = f"{name} {method}"
-        is_known = name is not None and not options
-        if is_known and key in self._scores:
-            return self._scores[key]
-        usual = {"budget": self.views_drawn(BUDGET), "density": LIMITED}
-        found = self.train(stage, method, **{**usual, **options}).psnr
-        if is_known:
-            self._scores[key] = found
-        return found
+        if name is None or options:
+            return self.train_limited(stage, method, **options).psnr
+        if (name, method) not in self._scores:
+            self._scores[name, method] = self.train_limited(stage, method).psnr
+        return self._scores[name, method]
 
     def finish(self, coordinator: Coordinator, stage: Stage, steps: int | None = None) -> list[int]:
         """Train on until the budget is used up, or for `steps`; the number of Gaussians after each step."""
@@ -235,10 +240,10 @@ class Lab:
         degree = gaussians.sh_degree
         return [self.rasterizer(gaussians, view, sh_degree=degree).color.clamp(0, 1) for view in views]
 
-    def score(self, coordinator: Coordinator, views: list[View], photos: list[Tensor]) -> float:
-        """Mean PSNR of merged pictures, dB."""
-        drawn = self.pictures(merged(coordinator), views)
-        return sum(float(psnr(a, b)) for a, b in zip(drawn, photos, strict=True)) / len(views)
+    def score(self, coordinator: Coordinator, stage: Stage) -> float:
+        """Mean PSNR of merged pictures of the held-out views, dB."""
+        drawn = self.pictures(merged(coordinator), stage.held_out)
+        return sum(float(psnr(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
 
     def corrected(self, stage: Stage, method: Method, **options) -> float:
         """As `compared`, each picture warped to its photo's colours before it is scored.
@@ -246,9 +251,8 @@ class Lab:
         Args:
             options: of `coordinator`.
         """
-        usual = {"budget": self.views_drawn(BUDGET), "density": LIMITED}
-        trained = self.train(stage, method, **{**usual, **options})
-        drawn = self.pictures(merged(trained.coordinator), stage.held_out)
+        trained = self.train_limited(stage, method, **options)
+        drawn = self.pictures(trained.gaussians, stage.held_out)
         return sum(corrected_psnr(a, b) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
 
     def error(self, coordinator: Coordinator, stage: Stage) -> float:
@@ -282,3 +286,8 @@ def merged(coordinator: Coordinator) -> Gaussians:
     """All blocks in one list, in the order of the blocks, without a graph."""
     scene = coordinator.scene
     return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)]).detach()
+
+
+def block_at(tree: BlockTree, *place: float) -> int:
+    """The block that holds a place (x, y, z)."""
+    return int(tree.assign(torch.tensor([place])))

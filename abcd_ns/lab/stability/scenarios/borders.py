@@ -12,7 +12,7 @@ from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.health.health_rules import SHOWS
 from abcd_ns.engine.types import View
-from abcd_ns.lab.stability.lab import BUDGET, LIMITED, METHODS, Lab, Stage, Trained, make_stage
+from abcd_ns.lab.stability.lab import METHODS, PAIR, Lab, Stage, Trained, block_at, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.world.world import Surfaces, Wall, World, camera
 
@@ -70,7 +70,7 @@ def seams(lab: Lab) -> Finding:
     bands = [border_band(FLOOR, tree, view) for view in held_out]
     numbers, said = {}, {}
     for method in METHODS:
-        trained = lab.train(stage, method, budget=lab.views_drawn(BUDGET), tree=tree, density=LIMITED)
+        trained = lab.train_limited(stage, method, tree=tree)
         ratio = band_ratio(lab, trained, bands, stage)
         numbers |= {f"ratio {method}": ratio, f"psnr {method}": trained.psnr}
         said[method] = f"{ratio:.2f} of the interior's error at borders, {trained.psnr:.2f} dB"
@@ -82,7 +82,7 @@ def seams(lab: Lab) -> Finding:
 
 def alpha_in_air(lab: Lab, trained: Trained, tree: BlockTree, views: list[View]) -> Float[Tensor, ""]:
     """Mean alpha over the pictures of what is drawn in the cell of air."""
-    cell, gaussians = tree.cell(int(tree.assign(torch.zeros(1, 3)))), trained.gaussians
+    cell, gaussians = tree.cell(block_at(tree, 0.0, 0.0, 0.0)), trained.gaussians
     alphas = []
     for view in views:
         window = ray_interval(cell, view, lab.rasterizer.window_grid(view.full))
@@ -112,11 +112,10 @@ def floaters(lab: Lab) -> Finding:
     points = torch.cat([stage.points, low + (high - low) * draw])
     stage = replace(stage, points=points, colors=torch.cat([stage.colors, torch.full((FLOATERS, 3), 128.0)]))
     tree = build_kd(torch.zeros(0, 3), 1).split(0, 1, AIR[0]).split(1, 1, AIR[1])
-    right = int(tree.assign(torch.tensor([[0.0, 0.6, 0.0]])))
-    tree = tree.split(right, 0, 0.0)
+    tree = tree.split(block_at(tree, 0.0, 0.6, 0.0), 0, 0.0)
     numbers, said = {}, {}
-    for method in ("abcd", "abcd-monolithic"):
-        trained = lab.train(stage, method, budget=lab.views_drawn(BUDGET), tree=tree, density=LIMITED)
+    for method in PAIR:
+        trained = lab.train_limited(stage, method, tree=tree)
         alpha = float(alpha_in_air(lab, trained, tree, held_out))
         gaussians = trained.gaussians
         inside = (gaussians.means[:, 1] > AIR[0]) & (gaussians.means[:, 1] < AIR[1])

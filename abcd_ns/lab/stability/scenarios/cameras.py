@@ -13,7 +13,7 @@ from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health.health_rules import unsound
-from abcd_ns.lab.stability.lab import Lab, make_stage
+from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.scenarios.emptiness import equal
 from abcd_ns.lab.world.world import TABLE, camera, ring
@@ -120,7 +120,7 @@ def repeated(lab: Lab) -> Finding:
     """A20: the same run twice, and with another number of threads."""
     stage, threads, same = make_stage(views=ring(8), points=300), torch.get_num_threads(), {}
     options = {"budget": lab.views_drawn(90), "blocks": 4, "density": DensityConfig(refine_start=0.0)}
-    for method in ("abcd", "abcd-monolithic"):
+    for method in PAIR:
         results = []
         try:
             for count in (1, 1, 2, 3):

@@ -11,7 +11,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.initialize import random_points
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.types import View
-from abcd_ns.lab.stability.lab import BUDGET, METHODS, Lab, Method, Stage, make_stage
+from abcd_ns.lab.stability.lab import BUDGET, METHODS, PAIR, Lab, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.world.world import TABLE, Ball, Surfaces
 
@@ -57,9 +57,6 @@ def with_gains(stage: Stage, gains: tuple[float, ...] = GAINS) -> Stage:
     chosen = {index: gains[k % len(gains)] for k, index in enumerate(stage.photos)}
     photos = {index: (chosen[index] * photo).clamp(0, 1) for index, photo in stage.photos.items()}
     return replace(stage, photos=photos)
-
-
-PAIR: tuple[Method, ...] = ("abcd", "abcd-monolithic")
 
 
 def lost(lab: Lab, cases: dict[str, Stage]) -> Finding:

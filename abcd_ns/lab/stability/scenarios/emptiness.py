@@ -11,7 +11,7 @@ from abcd_ns.engine.train.health_record import standing
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.lab.stability.lab import STILL, Lab, Stage, make_stage, merged
+from abcd_ns.lab.stability.lab import STILL, Lab, Stage, block_at, make_stage, merged
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.world.world import TABLE, Ball, Surfaces, camera, ring
 
@@ -38,7 +38,7 @@ def nobody_left(lab: Lab) -> Finding:
     away = camera((0.0, 0.0, 3.0), (0.0, 0.01, 9.0), 12)
     stage = make_stage(world, [*ring(12), away], points=300)
     tree = build_kd(stage.start().means, 3)
-    tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]]))), 2, 8.0)
+    tree = tree.split(block_at(tree, 0.0, 0.0, 9.0), 2, 8.0)
     coordinator = lab.coordinator(
         stage.start(),
         stage.views,
@@ -48,12 +48,12 @@ def nobody_left(lab: Lab) -> Finding:
         recipe=Recipe(visit_steps=VISIT),
         batch=4,
     )
-    empty = int(tree.assign(torch.tensor([[0.0, 0.0, 9.0]])))
+    empty = block_at(tree, 0.0, 0.0, 9.0)
     lab.finish(coordinator, stage, steps=VISIT)
     kept, emptied = _prune_a_visit(coordinator, stage)
     passed = kept and coordinator.scene.count(emptied) == 0 and coordinator.scene.count(empty) == 0
     lab.finish(coordinator, stage)
-    score = lab.score(coordinator, stage.held_out, stage.truth)
+    score = lab.score(coordinator, stage)
     passed &= coordinator.finished and bool(torch.isfinite(torch.tensor(score)))
     passed &= len(merged(coordinator)) > 0
     said = {"abcd": f"block {emptied + 1} lost all its Gaussians, others bit-equal: {kept}; the run ended"}
@@ -89,7 +89,7 @@ def few_cameras() -> tuple[Stage, BlockTree]:
         stage = replace(stage, points=points, colors=torch.cat([stage.colors, torch.full((40, 3), 128.0)]))
     tree = build_kd(torch.zeros(0, 3), 1)
     for depth in (-10.0, -25.0, -35.0):  # the part below a cut keeps its number: name the parts from below
-        tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, depth]]))), 2, depth)
+        tree = tree.split(block_at(tree, 0.0, 0.0, depth), 2, depth)
     return stage, tree
 
 
@@ -103,7 +103,7 @@ def observed(lab: Lab) -> Finding:
     """A9: train, and ask each block how it stands."""
     stage, tree = few_cameras()
     start = stage.start()
-    at = {count: int(tree.assign(torch.tensor([[0.0, 0.0, depth]]))) for depth, count in CLUSTERS}
+    at = {count: block_at(tree, 0.0, 0.0, depth) for depth, count in CLUSTERS}
     unseen = start[tree.assign(start.means) == at[0]]
     options = {"budget": lab.views_drawn(280), "tree": tree, "warmup": 0.0}
     coordinator = lab.coordinator(start, stage.views, **options)

@@ -56,7 +56,7 @@ def train_stale(lab: Lab, stage: Stage, every: int, *, damping: float = 1.0) -> 
         kind=partial(stale_coordinator, every=every, damping=damping),
     )
     rising = share_rising(objectives(lab, stage, coordinator))
-    return rising, lab.score(coordinator, stage.held_out, stage.truth)
+    return rising, lab.score(coordinator, stage)
 
 
 @scenario(

@@ -15,7 +15,7 @@ from abcd_ns.engine.train.density.control import (
 )
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.schedule import DEFAULT_BATCH, passes_of_sweep, views_per_visit
-from abcd_ns.lab.stability.lab import Lab, make_stage
+from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.scenarios.freshness import objectives
 from abcd_ns.lab.world.world import ring
@@ -41,7 +41,7 @@ def noise(lab: Lab) -> Finding:
     draw = {"generator": torch.Generator().manual_seed(5)}
     photos = {index: torch.rand(photo.shape, **draw) for index, photo in stage.photos.items()}
     density = DensityConfig(max_gaussians=CAP, refine_start=0.0, refine_stop=1.0, densify_grad_thresh=1e-5)
-    for method in ("abcd", "abcd-monolithic"):
+    for method in PAIR:
         options = {"budget": lab.views_drawn(300), "blocks": 4, "density": density}
         trained = lab.train(replace(stage, photos=photos), method, **options)
         most = max(trained.counts)

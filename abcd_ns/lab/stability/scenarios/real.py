@@ -7,20 +7,11 @@ import torch
 
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.lab.stability.lab import Lab, Stage
+from abcd_ns.lab.stability.lab import BUDGET, PAIR, Lab, Stage
 from abcd_ns.lab.stability.outcome import Finding, Scenario, against_one_block, db
-from abcd_ns.lab.stability.scenarios.captures import (
-    GAINS,
-    PAIR,
-    SHIFT,
-    TURN_DEGREES,
-    with_gains,
-    with_noisy_poses,
-)
+from abcd_ns.lab.stability.scenarios.captures import GAINS, SHIFT, TURN_DEGREES, with_gains, with_noisy_poses
 from abcd_ns.lab.stability.scenarios.sizes import surveyed
 
-BUDGET = 600
-"""Views drawn in a run."""
 SPARSE = 8
 THOUSANDS = 3000
 """Photos of a capture that shows everything over and over."""

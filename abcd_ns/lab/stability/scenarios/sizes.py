@@ -17,13 +17,12 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE, SHOWS
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.lab.stability.lab import STILL, Lab, Stage, Trained, make_stage
+from abcd_ns.lab.stability.lab import BLOCKS, PAIR, STILL, Lab, Stage, Trained, block_at, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.world.world import ring
 
 SIGMAS = (1.0, 3.0, 10.0)
 """Of the giants that are put in, in extents of their cell."""
-BLOCKS = 4
 GAP_DB = 40.0
 OFFSETS = (0.0, 5e5, 5e6)
 """Metres; coordinates of national grids."""
@@ -114,8 +113,8 @@ def transparent(lab: Lab) -> Finding:
     faint = replace(start, opacities=start.opacities - 4.0 * (torch.arange(len(start)) % 3 == 0)[:, None])
     tree = build_kd(start.means, BLOCKS)
     for k in range(EMPTY_CELLS):
-        tree = tree.split(int(tree.assign(torch.tensor([[0.0, 0.0, 50.0 + k]]))), 2, 50.5 + k)
-    for method in ("abcd", "abcd-monolithic"):
+        tree = tree.split(block_at(tree, 0.0, 0.0, 50.0 + k), 2, 50.5 + k)
+    for method in PAIR:
         options = {
             "budget": lab.views_drawn(320),
             "tree": tree,

@@ -21,14 +21,7 @@ from abcd_ns.engine.train.health_record import standing
 from abcd_ns.engine.train.planner import NothingSeenError
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from abcd_ns.lab.stability.lab import (
-    SH_DEGREE,
-    STILL,
-    Lab,
-    Trained,
-    make_stage,
-    merged,
-)
+from abcd_ns.lab.stability.lab import PAIR, SH_DEGREE, STILL, Lab, Trained, make_stage, merged
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.world.world import TABLE, Ball, Surfaces, ring
 
@@ -80,7 +73,7 @@ def nan_gradients(lab: Lab) -> Finding:
     """A1: train twice, once with NaN in some gradients of every step."""
     stage, said, numbers, passed = make_stage(views=ring(12), points=400), {}, {}, True
     budget = lab.views_drawn(200)
-    for method in ("abcd", "abcd-monolithic"):
+    for method in PAIR:
         options = {"budget": budget, "blocks": 4, "density": STILL}
         clean = lab.train(stage, method, **options)
         live = nothing_live(SH_DEGREE)
