@@ -103,8 +103,8 @@ class Day:
         process = self._watch(words, lambda: kill_at is not None and self.step() >= kill_at)
         if process.exit_code == -signal.SIGKILL:
             process.killed_at_step = self.step()
-        begun = [line["step"] for line in self.log() if line["kind"] == "training"]
-        process.first_step = begun[-1] if begun else None
+        begun = self.log("training")
+        process.first_step = begun[-1]["step"] if begun else None
         return process
 
     def evaluate(self) -> dict[str, Any]:
@@ -114,12 +114,13 @@ class Day:
         self._watch(words, lambda: False)
         return json.loads(path.read_text())["results"] if path.exists() else {}
 
-    def log(self) -> list[dict[str, Any]]:
-        """The run's log so far."""
+    def log(self, kind: str | None = None) -> list[dict[str, Any]]:
+        """The run's log so far, or those lines of it that are of a kind."""
         path = self.run / "abcd" / "log.jsonl"
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
         # The last one may be half written.
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+        found = (json.loads(line) for line in lines if line.endswith("\n"))
+        return [line for line in found if kind in (None, line["kind"])]
 
     def step(self) -> int:
         """The last one that the log tells of."""
@@ -174,11 +175,6 @@ def draw(processes: list[Process], limit: float, out: Path) -> None:
     save(figure, out, "day")
 
 
-def blocks_over_time(log: list[dict[str, Any]]) -> list[int]:
-    """The number of blocks whenever training began or went on."""
-    return [line["blocks"] for line in log if line["kind"] == "training"]
-
-
 def main(args: Args) -> int:
     """Live the day; 1 if it was not a good one."""
     if args.out.exists():
@@ -191,14 +187,14 @@ def main(args: Args) -> int:
         day.train(int(edge + chance.random() * 0.5 * args.steps / args.kills))
     last = day.train(None)
     scores = day.evaluate()
-    ended = [line for line in day.log() if line["kind"] == "end"]
+    ended = day.log("end")
     peak = max(process.peak for process in day.processes)
     found = {
         "args": vars(args) | {"data": args.data.name, "out": args.out.name},
         "machine": asdict(describe_machine()),
         "versions": asdict(describe_versions()),
         "date": date.today().isoformat(),
-        "blocks": blocks_over_time(day.log()),
+        "blocks": [line["blocks"] for line in day.log("training")],
         "gaussians": ended[-1]["gaussians"] if ended else None,
         "steps": day.step(),
         "scores": scores,
