@@ -67,11 +67,6 @@ class Args:
     """Of the runs."""
 
 
-def read(data: Path, downscale: int) -> Stage:
-    """The capture in RAM, with all its points."""
-    return read_stage(data, downscale, most_points=None)
-
-
 def begin(
     capture: Stage,
     blocks: int,
@@ -186,7 +181,7 @@ def profile(coordinator: Coordinator, photo: PhotoReader, steps: int, top: int =
 
 def main(args: Args) -> None:
     """Run both and print the table."""
-    capture = read(args.data, args.downscale)
+    capture = read_stage(args.data, args.downscale)
     with tempfile.TemporaryDirectory() as folder:
         one = run(capture, 1, args, Path(folder) / "one")
         several = run(capture, args.blocks, args, Path(folder) / "several")

@@ -32,8 +32,9 @@ from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage, merged
+from abcd_ns.lab.stability.scenarios.real import read_stage
 from benchmarks.runs import Asked, write_runs
-from benchmarks.visit import begin, read
+from benchmarks.visit import begin
 
 COUNTED = 10
 """Fragments are counted in one of so many steps."""
@@ -136,7 +137,7 @@ def train(coordinator: Coordinator, capture: Stage, rasterizer: TorchRasterizer,
 
 def main(args: Args) -> None:
     """Run all pairs, print the table, write the file."""
-    capture, rows = read(args.data, args.downscale), []
+    capture, rows = read_stage(args.data, args.downscale), []
     TorchRasterizer().warm_up()
     for k, seed in enumerate(args.seeds):
         for side in args.sides if k % 2 == 0 else args.sides[::-1]:  # the machine's speed drifts

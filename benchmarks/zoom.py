@@ -20,8 +20,9 @@ from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage, merged
+from abcd_ns.lab.stability.scenarios.real import read_stage
 from benchmarks.runs import Asked, write_runs
-from benchmarks.visit import begin, read
+from benchmarks.visit import begin
 
 
 @dataclass(kw_only=True)
@@ -70,7 +71,7 @@ def score(gaussians: Gaussians, capture: Stage, rasterizer: TorchRasterizer, ant
 
 def main(args: Args) -> None:
     """Run all pairs, print the table, write the file."""
-    captures = {size: read(args.data, size) for size in {args.downscale, *args.drawn}}
+    captures = {size: read_stage(args.data, size) for size in {args.downscale, *args.drawn}}
     rows = []
     table = [["antialiased", "seed", "Gaussians", *(f"1/{size}" for size in args.drawn)]]
     for seed in args.seeds:

@@ -28,6 +28,7 @@ from abcd_ns.lab.results.tables import MIB
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.scale import command as scale
 from abcd_ns.lab.scale.worker import LandSettings
+from abcd_ns.lab.stability.scenarios.real import read_stage
 from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio.run import STATE
 from benchmarks import visit
@@ -153,7 +154,7 @@ def visits(task: Task) -> Iterator[Found]:
     """Where a visit's time goes, by stage and by kernel."""
     size = task.size
     args = visit.Args(Path(task.data), seconds=size.visit_seconds, seed=task.seed)
-    capture = visit.read(args.data, args.downscale)
+    capture = read_stage(args.data, args.downscale)
     found: Found = {"scene": args.data.name, "seconds": args.seconds, "by_blocks": []}
     for blocks in size.visit_blocks:
         rows: list[Found] = []

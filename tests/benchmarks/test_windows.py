@@ -10,7 +10,7 @@ from benchmarks.windows import Args, main
 
 def test_a_pair_of_runs_is_made_for_each_seed(tmp_path, capsys, monkeypatch):
     stage, out = make_stage(views=ring(4), held_out=ring(2, turn=0.3), points=60), tmp_path / "out.json"
-    monkeypatch.setattr(windows, "read", lambda *_: stage)
+    monkeypatch.setattr(windows, "read_stage", lambda *_: stage)
     main(Args(data=tmp_path / "scene", blocks=2, steps=24, seeds=(0,), out=out))
     found = json.loads(out.read_text())
     assert [(row["side"], row["seed"]) for row in found["runs"]] == [(4, 0), (16, 0)]

@@ -14,7 +14,7 @@ def test_runs_of_either_kind_are_scored_at_every_size(tmp_path, capsys, monkeypa
         size = 96 // downscale, 72 // downscale
         return make_stage(views=ring(4, size=size), held_out=ring(2, turn=0.3, size=size), points=60)
 
-    monkeypatch.setattr(zoom, "read", read)
+    monkeypatch.setattr(zoom, "read_stage", read)
     out = tmp_path / "out.json"
     main(Args(data=tmp_path / "scene", downscale=2, drawn=(4, 2), blocks=2, steps=16, out=out))
     found = json.loads(out.read_text())

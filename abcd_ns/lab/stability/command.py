@@ -33,7 +33,7 @@ from abcd_ns.lab.stability.scenarios import (
     sizes,
     values,
 )
-from abcd_ns.lab.stability.scenarios.real import read_stage, real_scenarios
+from abcd_ns.lab.stability.scenarios.real import MOST_POINTS, read_stage, real_scenarios
 from abcd_ns.machine import describe_machine
 
 KIND = "stability report"
@@ -78,7 +78,7 @@ def stability(
     claim(out, KIND, {"scenarios": asked}, overwrite)
     console, known = Console(), dict(SCENARIOS)
     if data is not None:
-        stage = read_stage(data, downscale)
+        stage = read_stage(data, downscale, MOST_POINTS)
         known |= {scenario.id: scenario for scenario in real_scenarios(stage, data.resolve().name)}
     chosen = choose(only, known)
     wanted = () if only or quick else studies()

@@ -17,10 +17,10 @@ THOUSANDS = 3000
 """Photos of a capture that shows everything over and over."""
 OFFSET = 5e6
 MOST_POINTS = 4000
-"""More points than this are thinned out, for time."""
+"""More points than this are thinned out in scenarios, for time."""
 
 
-def read_stage(data: Path, downscale: int, most_points: int | None = MOST_POINTS) -> Stage:
+def read_stage(data: Path, downscale: int, most_points: int | None = None) -> Stage:
     """A capture as `ns-train abcd --data` reads it; every 8th view held out. All photos are kept in RAM;
     masks and alpha channels are left aside.
 
