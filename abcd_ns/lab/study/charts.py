@@ -35,6 +35,8 @@ CHANCE = 0.25
 """How far the axis of differences reaches at least, dB: what chance does must not fill the chart."""
 COLUMN_POINTS = (40, 80, 140)
 """Where the numbers beside the bars end, from the axis."""
+HALO = {"zorder": 5, "path_effects": [withStroke(linewidth=2.5, foreground="white")]}
+"""Of what is written over lines."""
 Value = Callable[[Run], float]
 
 
@@ -104,10 +106,7 @@ def _draw_gap(axes: Axes, arms: Sequence[Arm]) -> None:
     for arm, word, above in ((gap.best, "best", 9), (gap.worst, "worst", -16)):
         shift, side = (-4, "left") if arm is left else (4, "right") if arm is right else (0, "center")
         at, color = (arm.value, arm.psnr), COLORS[arm.method]
-        label = write_beside(
-            axes, f"{word} {arm.psnr:.2f}", at, (shift, above), ha=side, color=color, zorder=5
-        )
-        label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+        write_beside(axes, f"{word} {arm.psnr:.2f}", at, (shift, above), ha=side, color=color, **HALO)
 
 
 def _draw_line(axes: Axes, arms: Sequence[Arm], value: Value, **look) -> Line2D:
@@ -155,8 +154,7 @@ def _mark_stop(axes: Axes, arm: Arm) -> None:
     color, at = WAYS[PRICE][0], (arm.gaussians, arm.psnr)
     axes.plot(*at, "*", markersize=15, color=color, markeredgecolor="white", zorder=4)
     text = f"{short(arm.gaussians)}, {arm.psnr:.2f} dB"
-    label = write_beside(axes, text, at, (-6, 9), ha="right", color=color, zorder=5)
-    label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+    write_beside(axes, text, at, (-6, 9), ha="right", color=color, **HALO)
 
 
 # -- options -----------------------------------------------------------------------------------------
