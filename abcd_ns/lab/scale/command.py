@@ -84,15 +84,8 @@ def make_plan(
         for method, counts in sizes
         for count in counts
     )
-    words = [
-        "abcd scale --blocks",
-        *by_blocks,
-        "--gaussians",
-        settings.gaussians,
-        "--visits",
-        settings.visits,
-    ]
-    words += ["--ram-budget-mb", settings.ram_budget_bytes // MIB]
+    words = ["abcd scale --blocks", *by_blocks, "--gaussians", settings.gaussians]
+    words += ["--visits", settings.visits, "--ram-budget-mb", settings.ram_budget_bytes // MIB]
     words += ["--monolithic-limit", max(whole, default=0) * settings.gaussians, "--seed", seed]
     limit = settings.device_limit_bytes // MIB
     words += ["--device-limit-mb", limit] if limit else []
