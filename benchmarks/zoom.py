@@ -16,7 +16,7 @@ import tyro
 
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
-from abcd_ns.engine.train.training_loop import train_step
+from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage, merged
@@ -51,8 +51,7 @@ def run(captures: dict[int, Stage], antialiased: bool, seed: int, args: Args) ->
     with tempfile.TemporaryDirectory() as folder:
         options = {"steps": args.steps, "seed": seed, "antialiased": antialiased}
         coordinator = begin(capture, args.blocks, Path(folder), rasterizer=rasterizer, **options)
-        while not coordinator.finished:
-            train_step(coordinator, capture)
+        train(coordinator, capture)
         gaussians = merged(coordinator)
         coordinator.close()
     scores = {size: score(gaussians, captures[size], rasterizer, antialiased) for size in args.drawn}
