@@ -15,8 +15,6 @@ from typing import Any
 
 import torch
 import tyro
-from jaxtyping import Float
-from torch import Tensor
 from torch.profiler import ProfilerActivity
 
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
@@ -31,7 +29,6 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
-from abcd_ns.engine.train.step.batch import Sample
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage
@@ -127,16 +124,13 @@ def run(
     return views, spent
 
 
-def _shown(sample: Sample, photo: PhotoReader) -> Float[Tensor, "h w 3"]:
-    return sample.reduced(photo(sample.view.index, sample.source))
-
-
 def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> int:
     """training_loop.train_step with a clock; the number of views."""
     with clock.stage("plan and attach"):
         batch = coordinator.next_batch()
     with clock.stage("photos"):
-        photos = [_shown(sample, photo).to(coordinator.device) for sample in batch.samples]
+        read = (sample.reduced(photo(sample.view.index, sample.source)) for sample in batch.samples)
+        photos = [pixels.to(coordinator.device) for pixels in read]
     with clock.stage("render"):
         rendered = coordinator.render(batch)
     with clock.stage("loss"):
