@@ -7,10 +7,13 @@ with 1 the run is that of one process. Visits are trained one after the other, i
 thread, so that neither the machine nor how busy it is has a part in the result. Runs of ns-train's trainer.
 """
 
+import tempfile
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from statistics import fmean
 
+import torch
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
@@ -19,7 +22,7 @@ from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio import pipeline
 from abcd_ns.nerfstudio.workers import make_worker, setup_of
-from benchmarks.runs import Asked, runs_of, trainer_alone
+from benchmarks.runs import Asked, config_of, runs_of
 from tests.cluster.in_process import InProcessWorkers
 
 
@@ -65,9 +68,13 @@ def run(args: Args, at_once: int, seed: int) -> Row:
             out -= 1
             row.visits += 1
 
-    with trainer_alone(
-        args.data, seed=seed, workers=2, **args.of_all_runs
-    ) as trainer:  # any number but 1 dispatches
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        options = {"seed": seed, "workers": 2, **args.of_all_runs}  # any number but 1 dispatches
+        config = config_of(args.data, Path(folder), **options)
+        config.machine.device_type = "cpu"
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
         coordinator = trainer.pipeline.coordinator
         coordinator.announce.subscribe(hear)
         trainer.train()

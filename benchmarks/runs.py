@@ -4,7 +4,6 @@ import copy
 import json
 import multiprocessing
 import os
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
 from abcd_ns.machine import describe_machine, describe_versions
@@ -112,23 +111,6 @@ def config_of(
     config.steps_per_save = 0
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
     return config
-
-
-@contextmanager
-def trainer_alone(data: Path, **options: Any) -> Iterator[Trainer]:
-    """A trainer that is set up, on the CPU and by one thread: neither the machine nor how busy it is has a
-    part in what comes of it.
-
-    Args:
-        options: of `config_of`.
-    """
-    torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        config = config_of(data, Path(folder), **options)
-        config.machine.device_type = "cpu"
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        yield trainer
 
 
 class StageClock:
