@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 
 from abcd_ns.lab.results import frontier
-from abcd_ns.lab.results.results import Arm, Outcome, Results
+from abcd_ns.lab.results.results import Arm, Outcome, Results, find_default
 
 GOAL_DB = 0.5
 """Between the best and the worst number of blocks, no more than this: no cliff."""
@@ -61,11 +61,6 @@ def find_difference(arm: Arm, default: Arm) -> Difference | None:
     theirs = {run.seed: run.psnr_merged for run in default.runs}
     pairs = [run.psnr_merged - theirs[run.seed] for run in arm.runs if run.seed in theirs]
     return Difference(tuple(pairs)) if pairs else None
-
-
-def find_default(results: Results) -> Arm | None:
-    """The arm of the method as it is; None where its runs failed."""
-    return next((arm for arm in results.arms if arm.variant == "default"), None)
 
 
 def find_differences(results: Results) -> list[tuple[Arm, Difference]]:

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 
-from abcd_ns.lab.results.results import Arm, Results
+from abcd_ns.lab.results.results import Arm, Results, find_default
 
 NEAR_DB = 0.2
 """How far below the best a smaller number of Gaussians may be and still count as enough."""
@@ -63,7 +63,7 @@ def findings(results: Results) -> Iterator[str]:
     if not results.arms:
         return
     best, fewest = max(results.arms, key=lambda arm: arm.psnr), fewest_near_best(results.arms)
-    default = next((arm for arm in results.arms if way_of(arm) == AS_IT_IS), None)
+    default = find_default(results)
     if default is not None:
         count = f"{default.gaussians:,.0f} Gaussians"
         yield f"As it is, {default.method} comes to {count} and {default.psnr:.2f} dB."

@@ -134,3 +134,8 @@ class Results:
     def runs(self) -> tuple[Run, ...]:
         """Of all arms."""
         return tuple(run for arm in self.arms for run in arm.runs)
+
+
+def find_default(results: Results) -> Arm | None:
+    """The arm of the method as it is; None where its runs failed."""
+    return next((arm for arm in results.arms if arm.variant == "default"), None)

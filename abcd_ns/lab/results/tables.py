@@ -13,9 +13,9 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from abcd_ns.lab.job import HELD_OUT_EVERY
-from abcd_ns.lab.results.findings import find_default, find_difference
+from abcd_ns.lab.results.findings import find_difference
 from abcd_ns.lab.results.frontier import label_of
-from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results
+from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results, find_default
 from abcd_ns.lab.results.run import Run
 from abcd_ns.machine import Machine
 

@@ -10,9 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from abcd_ns.lab.results.findings import GOAL_DB, find_default, find_differences, find_gap
-from abcd_ns.lab.results.frontier import AS_IT_IS, LIMIT, MCMC, PRICE, curves, way_of
-from abcd_ns.lab.results.results import Arm, Results
+from abcd_ns.lab.results.findings import GOAL_DB, find_differences, find_gap
+from abcd_ns.lab.results.frontier import LIMIT, MCMC, PRICE, curves
+from abcd_ns.lab.results.results import Arm, Results, find_default
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.style import (
     COLORS,
@@ -137,9 +137,8 @@ def _draw_gaussians(results: Results) -> Figure:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.margins(x=0.08, y=0.15)
-    for arm in results.arms:
-        if way_of(arm) == AS_IT_IS:
-            _mark_stop(axes, arm)
+    if (default := find_default(results)) is not None:
+        _mark_stop(axes, default)
     axes.yaxis.set_major_locator(MaxNLocator(7))
     axes.set_xlabel("Gaussians at the end")
     axes.set_ylabel("held-out PSNR (dB)")
