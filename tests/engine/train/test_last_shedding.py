@@ -117,6 +117,18 @@ def test_who_shows_in_no_view_goes_first(tmp_path, ring, pictured):
     assert float(whole_scene(coordinator).means[:, 2].max()) < 40
 
 
+def test_who_is_opaque_is_not_taken_for_one_that_does_not_show(tmp_path, ring, pictured, monkeypatch):
+    """Its alpha is at its limit wherever it is drawn: no gradient tells of its opacity."""
+    opaque, start = 10, scene()
+    start.means[:opaque] *= 0.5
+    start.scales[:opaque] = -0.7
+    start.opacities[:opaque] = 20.0
+    monkeypatch.setitem(globals(), "scene", lambda: start)
+    coordinator, told = completed(tmp_path, ring, pictured)
+    assert at_end(told).gone >= FAINT // 3
+    assert int((whole_scene(coordinator).opacities > 8).sum()) == opaque
+
+
 @pytest.mark.parametrize("density", [{"price": 0.0}, {"strategy": "off"}])
 def test_options_keep_everything(tmp_path, ring, pictured, density):
     coordinator, told = completed(tmp_path, ring, pictured, density=replace(STILL, **density))

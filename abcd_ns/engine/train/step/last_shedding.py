@@ -40,6 +40,8 @@ ROUNDS = 6
 """In the first so many are left out as should cost what may be; then twice that, or what halves the doubt."""
 PER_NEPER = 10 / math.log(10)
 """dB that the logarithm of a squared error is worth."""
+OPAQUE = math.log(0.99 / 0.01)
+"""Logit up to which opacities are drawn: where alpha is at its limit, 0.999, no gradient tells of them."""
 LEAST_ERROR = 1e-10
 """Mean squared difference below which a picture is its photo."""
 
@@ -56,7 +58,7 @@ class _Probe:
     def _with_leaf(self, block: int, gaussians: Gaussians) -> Gaussians:
         found = gaussians.to(self._device)
         if block not in self._leaves:
-            self._leaves[block] = found.opacities.detach().clone().requires_grad_()
+            self._leaves[block] = found.opacities.detach().clone().clamp_(max=OPAQUE).requires_grad_()
         return replace(found, opacities=self._leaves[block])
 
     def take_note(self) -> None:
