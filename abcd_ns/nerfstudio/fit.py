@@ -131,6 +131,12 @@ class Demand:
         """The same on smaller photos."""
         return replace(self, pixels=max(self.pixels // times**2, 1), factor=self.factor * times)
 
+    def needs(self, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
+        """What that takes with so many views in a step; see DeviceNeeds."""
+        training, keeps = self.training, not self.on_cpu
+        options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive, drawings_of(training))
+        return DeviceNeeds(self.pixels, batch, *options)
+
 
 def find_fit(budget: int, demand: Demand) -> Fit:
     """The fewest blocks whose visits stay within `budget` bytes, on as many views of a step as leave room.
@@ -152,9 +158,9 @@ def _fit(budget: int, demand: Demand) -> Fit | None:
     batch, crop = _views_and_crop(budget, demand)
     # A single block has no neighbours and draws one view a step, so it may be larger.
     sole_batch = views_per_step(demand.training.batch, 1)
-    sole = _needs(demand, sole_batch, crop, levels=0).block_limit(budget)
+    sole = demand.needs(sole_batch, crop, levels=0).block_limit(budget)
     limit, levels = 0, levels_of(2)
-    while (found := _needs(demand, batch, crop, levels).block_limit(budget)) >= LEAST_BLOCK:
+    while (found := demand.needs(batch, crop, levels).block_limit(budget)) >= LEAST_BLOCK:
         deepest = levels_of(_fewest(demand.gaussians, found, 0))
         if deepest <= levels:
             limit = found
@@ -169,22 +175,16 @@ def _fit(budget: int, demand: Demand) -> Fit | None:
 
 def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
     """As many views in a step, and as much of them, as leave room for Gaussians."""
-    training, left = demand.training, _needs(demand, 1, 0, levels_of(2)).left(budget)
+    training, left = demand.training, demand.needs(1, 0, levels_of(2)).left(budget)
     room = PICTURE_SHARE * left
     most = views_per_step(training.batch, 2, training.limits.batch_limit)
     views = [most] if training.batch else [most >> halved for halved in range(most.bit_length())]
     for batch in views:
-        if _needs(demand, batch, training.limits.crop_pixels, levels=0).step_bytes <= room:
+        if demand.needs(batch, training.limits.crop_pixels, levels=0).step_bytes <= room:
             return batch, training.limits.crop_pixels
     batch = views[-1]
     of_a_pixel = DeviceNeeds(1, batch, drawings=drawings_of(training)).step_bytes
     return batch, training.limits.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
-
-
-def _needs(demand: Demand, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
-    training, keeps = demand.training, not demand.on_cpu
-    options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive, drawings_of(training))
-    return DeviceNeeds(demand.pixels, batch, *options)
 
 
 def _fewest(gaussians: int, limit: int, sole: int) -> int:

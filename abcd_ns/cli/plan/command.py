@@ -30,7 +30,7 @@ from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.health_record import FEW_VIEWS
-from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, levels_of
+from abcd_ns.engine.train.memory import levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -149,9 +149,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     with console.status("Looking which view sees which block"):
         seen = views_of_blocks(tree, points, views)
     batch = views_per_step(training.batch, fit.blocks, training.limits.batch_limit)
-    options = (training.sh_degree, training.limits.crop_pixels, levels_of(fit.blocks), not on_cpu)
-    drawn = training.primitive, drawings_of(training)
-    needs = DeviceNeeds(pixels, batch, *options, *drawn)
+    needs = demand.needs(batch, training.limits.crop_pixels, levels_of(fit.blocks))
     fullest = owner == owner.bincount(minlength=fit.blocks).argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
