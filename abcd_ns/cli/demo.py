@@ -14,8 +14,8 @@ import matplotlib
 import tyro
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
 
+from abcd_ns.cli.terminal import print_facts, print_plain
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.pictures import PictureArray, draw_comparison, psnr_of, read_picture
@@ -159,7 +159,7 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
         "Gaussians for viewers": str(ply),
         "all about the run": str(page),
     }
-    _print_facts(facts, console)
+    print_facts(facts, console)
     _print_next(trained.config, console)
 
 
@@ -247,13 +247,6 @@ def _abcd(command: str) -> list[str]:
     return [sys.executable, "-m", "abcd_ns.cli.main", command]
 
 
-def _print_facts(facts: dict[str, str], console: Console) -> None:
-    table = Table.grid(padding=(0, 2))
-    for name, value in facts.items():
-        table.add_row(name, value)
-    console.print(table, highlight=False)
-
-
 def _print_next(config: Path, console: Console) -> None:
     scene = config.parents[4] / "scene"
     commands = {
@@ -266,4 +259,4 @@ def _print_next(config: Path, console: Console) -> None:
     }
     console.print("\nNext:", highlight=False)
     for command, what in commands.items():
-        console.print(f"  {command}\n      {what}", markup=False, highlight=False, soft_wrap=True)
+        print_plain(f"  {command}\n      {what}", console)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from rich.console import Console
 
+from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 
 Level = Literal["error", "warning", "note"]
@@ -62,7 +63,7 @@ def _print(finding: Finding, console: Console) -> None:
     if fix:
         lines += _wrap(fix, width, "    -> ", "       ")
     for line in lines:
-        console.print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
+        print_plain(line, console)
 
 
 def _wrap(text: str, width: int, first: str, then: str) -> list[str]:

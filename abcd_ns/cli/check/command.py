@@ -11,6 +11,7 @@ from abcd_ns.cli.check.summary import Summary, print_summary, summarize
 from abcd_ns.cli.check.survey import Survey, survey
 from abcd_ns.cli.findings import Finding, by_level, print_findings
 from abcd_ns.cli.json_option import check_json, write_report
+from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.errors import UserError
@@ -64,7 +65,7 @@ def check(*, data: Path, downscale: int | None = None, json: Path | None = None)
     if report.summary is not None:
         print_summary(report.summary, console)
     print_findings(report.findings, console)
-    console.print(_verdict(report), highlight=False, markup=False, emoji=False, soft_wrap=True)
+    print_plain(_verdict(report), console)
     write_report(json, report)
     return REFUSED if report.refused else 0
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from abcd_ns.cli.check.about_photos import photo_bytes
 from abcd_ns.cli.check.survey import Survey
 from abcd_ns.cli.check.words import few
+from abcd_ns.cli.terminal import print_facts
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.scene import Lens
@@ -76,13 +76,6 @@ def summarize(survey: Survey) -> Summary:
 
 def print_summary(summary: Summary, console: Console) -> None:
     """Two columns."""
-    table = Table.grid(padding=(0, 2))
-    for name, value in _rows(summary):
-        table.add_row(name, one_line(value))
-    console.print(table, highlight=False, markup=False, emoji=False)
-
-
-def _rows(summary: Summary) -> list[tuple[str, str]]:
     sizes = _counted({f"{size} px": n for size, n in summary.sizes.items()})
     lenses = _counted(summary.lenses)
     points = f"{summary.points:,}"
@@ -91,16 +84,17 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
     photos = _size(summary.photo_bytes)
     if summary.photo_bytes > summary.photo_budget_bytes:
         photos = f"{_size(summary.photo_budget_bytes)} of {photos}"
-    return [
-        ("model", summary.model),
-        ("photos", f"{summary.photos:,}, {few(sizes)}"),
-        ("lenses", few(lenses)),
-        ("views", f"{summary.train:,} to train on, {summary.held_out:,} held out"),
-        ("cameras", f"within {_box(summary.camera_extent)} model units"),
-        ("points", points),
-        ("near plane", f"{summary.near_plane_model:.3g} model units, {summary.near_plane:.3g} in training"),
-        ("RAM", f"{photos} of photos, {_size(summary.gaussian_bytes)} of Gaussians to begin with"),
-    ]
+    facts = {
+        "model": one_line(summary.model),
+        "photos": f"{summary.photos:,}, {few(sizes)}",
+        "lenses": few(lenses),
+        "views": f"{summary.train:,} to train on, {summary.held_out:,} held out",
+        "cameras": f"within {_box(summary.camera_extent)} model units",
+        "points": points,
+        "near plane": f"{summary.near_plane_model:.3g} model units, {summary.near_plane:.3g} in training",
+        "RAM": f"{photos} of photos, {_size(summary.gaussian_bytes)} of Gaussians to begin with",
+    }
+    print_facts(facts, console)
 
 
 def _in_words(lens: Lens) -> str:

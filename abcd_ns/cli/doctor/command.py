@@ -12,6 +12,7 @@ from abcd_ns.cli.doctor.hardware import Hardware
 from abcd_ns.cli.doctor.kernels import Kernels
 from abcd_ns.cli.findings import Finding, by_level, print_findings
 from abcd_ns.cli.json_option import check_json, write_report
+from abcd_ns.cli.terminal import print_plain
 
 SCHEMA = 1
 """Of the JSON file; changes with its fields."""
@@ -49,7 +50,7 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     report = diagnose(gather())
     console = Console()
     for line in _lines(report.facts, verbose):
-        console.print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
+        print_plain(line, console)
     shown = [finding for finding in report.findings if verbose or finding.level != "note"]
     print_findings(shown, console)
     ill = any(finding.level == "error" for finding in report.findings)

@@ -11,7 +11,6 @@ import torch
 import tyro
 from jaxtyping import Float
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from abcd_ns import methods
@@ -25,6 +24,7 @@ from abcd_ns.cli.plan.forecast import (
     time_steps,
     views_of_blocks,
 )
+from abcd_ns.cli.terminal import print_facts
 from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
@@ -247,10 +247,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
             rows[f"{what} by block"] = spread
         rows["a step on the points"] = f"{found.seconds_per_step:.3f} s"
         rows["limits"] = fit.in_words() if fit.sole else "none of a block's Gaussians, as --blocks is given"
-    table = Table.grid(padding=(0, 2))
-    for name, value in rows.items():
-        table.add_row(name, value)
-    console.print(table, highlight=False)
+    print_facts(rows, console)
     for line in found.warnings:
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
     if not (found.warnings or verbose):

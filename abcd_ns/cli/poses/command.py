@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bars
 
 from abcd_ns.cli.poses.mapping import Model, Order, Progress, Stage, Task, find_poses
+from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import Problems
 from abcd_ns.data.picture_files import SUFFIXES, check_complete, read_header
 from abcd_ns.errors import UserError
@@ -146,5 +147,5 @@ def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) 
         lines.append("That is fewer than half. Take photos between those that do not fit, or try --lens.")
     lines.append(f"Next: ns-train abcd --data {shlex.quote(str(data))}")
     for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        print_plain(line, console)
     return int(few)

@@ -12,6 +12,7 @@ from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
 from abcd_ns.cli.report.page import GENERATOR, render_page
 from abcd_ns.cli.report.plan import Plan, make_plan
 from abcd_ns.cli.report.run_folder import RunFolder, find_run, load_pipeline, open_run
+from abcd_ns.cli.terminal import print_plain
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.checks import check_ranges
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
@@ -62,9 +63,8 @@ def report(
     except OSError as error:
         raise UserError(f"{out} cannot be written: {error.strerror}.") from None
     for note in notes:
-        console.print(note, style="yellow", markup=False, highlight=False, soft_wrap=True)
-    size = f"{out.stat().st_size / 2**20:.1f} MiB"
-    console.print(f"{out} ({size})", markup=False, highlight=False, soft_wrap=True)
+        print_plain(note, console, "yellow")
+    print_plain(f"{out} ({out.stat().st_size / 2**20:.1f} MiB)", console)
     return 0
 
 
