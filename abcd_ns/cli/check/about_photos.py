@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
-from abcd_ns.cli.check.words import few, many
 from abcd_ns.cli.findings import Finding
+from abcd_ns.cli.words import few, many
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.prepare import DOWNSCALE, MAX_AUTO_SIDE
 

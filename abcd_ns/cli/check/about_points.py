@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
-from abcd_ns.cli.check.words import many
 from abcd_ns.cli.findings import Finding
+from abcd_ns.cli.words import many
 
 FEW = 500
 FAR_OFF = 100.0

@@ -13,6 +13,7 @@ from abcd_ns.cli.doctor.kernels import Kernels
 from abcd_ns.cli.findings import Finding, by_level, print_findings
 from abcd_ns.cli.json_option import check_json, write_report
 from abcd_ns.cli.terminal import print_plain
+from abcd_ns.cli.words import many
 
 SCHEMA = 1
 """Of the JSON file; changes with its fields."""
@@ -57,7 +58,7 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     verdict = "Training cannot work here yet: mend the errors." if ill else "Training can work here."
     if not verbose:
         left = len(report.findings) - len(shown)
-        notes = f" and {left} note{'s' * (left > 1)}" if left else ""
+        notes = f" and {many(left, 'note', 'notes')}" if left else ""
         verdict += f" All versions{notes}: abcd doctor --verbose"
     console.print(f"\n{verdict}", highlight=False)
     write_report(json, report)

@@ -25,6 +25,7 @@ from abcd_ns.cli.plan.forecast import (
     views_of_blocks,
 )
 from abcd_ns.cli.terminal import print_facts
+from abcd_ns.cli.words import many
 from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
@@ -222,11 +223,11 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     """A few lines and a table for people; `verbose` says where the figures come from."""
     fit = found.fit
     at_the_end = f", {fit.blocks_at_the_end} in the end" if fit.blocks_at_the_end > fit.blocks else ""
-    low, high = found.hours
+    (low, high), views = found.hours, many(found.batch, "view", "views")
     rows = {
         "blocks": f"{fit.blocks}{at_the_end}",
         "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
-        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {_count(found.batch, 'view')}",
+        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views}",
     }
     for title, shares, free in (
         ("device", found.device, fit.budget),
@@ -256,10 +257,6 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
 
 def _total(shares: tuple[Share, ...]) -> int:
     return sum(share.nbytes for share in shares)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number > 1)}"
 
 
 def _hours(hours: float) -> str:

@@ -6,6 +6,7 @@ from datetime import timedelta
 from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder
 from abcd_ns.cli.report.story import Story
+from abcd_ns.cli.words import many
 from abcd_ns.lab.results.tables import GIB, MIB, NOTHING
 
 FLOAT = 4
@@ -25,8 +26,9 @@ class Fact:
 def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
     """What a run came to, most important first."""
     story, limit = run.story, run.story.trainings[-1].limit
-    visits, sweeps = len(story.visits), len(story.sweeps)
-    rounds = f"{_count(visits, 'visit')}, {_count(sweeps, 'full sweep')}" if story.blocks > 1 else ""
+    visits = many(len(story.visits), "visit", "visits")
+    sweeps = many(len(story.sweeps), "full sweep", "full sweeps")
+    rounds = f"{visits}, {sweeps}" if story.visits and story.blocks > 1 else ""
     seconds = story.seconds * max(len(story.workers), 1)  # layers' are summed over workers
     share = story.layer_seconds / seconds if seconds else 0.0
     return [
@@ -34,7 +36,7 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
         Fact("Gaussians", f"{story.gaussians:,}", more="" if limit is None else f"limit {limit:,}"),
         *_shed_at_end(story),
         *_parameters(run),
-        Fact("blocks", f"{story.blocks:,}", more=rounds if visits else ""),
+        Fact("blocks", f"{story.blocks:,}", more=rounds),
         Fact("steps", f"{story.step:,}"),
         Fact(
             "training time",
@@ -50,7 +52,8 @@ def _shed_at_end(story: Story) -> list[Fact]:
     if (shed := story.shed_at_end) is None:
         return []
     share = shed.gone / max(shed.gone + shed.gaussians, 1)
-    cost = f"{share:.0%}, for {shed.before - shed.after:.2f} dB of {_count(shed.views, 'training view')}"
+    views = many(shed.views, "training view", "training views")
+    cost = f"{share:.0%}, for {shed.before - shed.after:.2f} dB of {views}"
     return [Fact("shed at the end", f"{shed.gone:,}", more=cost)]
 
 
@@ -105,10 +108,6 @@ def _memory(run: RunFolder) -> list[Fact]:
     if machine.gpu is not None:
         facts.append(Fact("peak GPU memory", f"{device / GIB:.2f}", "GiB", machine.gpu))
     return facts
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}" + ("" if number == 1 else "s")
 
 
 def _clock(seconds: float) -> str:
