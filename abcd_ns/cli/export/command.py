@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,8 +14,9 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
-from abcd_ns.cli.export.formats import ram_needed, rounding, scene_file, suffix_of
+from abcd_ns.cli.export.formats import PACKED, rounding, scene_file, suffix_of
 from abcd_ns.cli.export.glb import Z_TO_Y
+from abcd_ns.cli.export.packed import BYTES_AT_ONCE
 from abcd_ns.cli.export.shown import Box, Shown
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
@@ -64,19 +66,14 @@ def export(
     check_request(out, box)
     suffix = suffix_of(out, ".ply" if by_block else None)
     to = to_data(run) if frame == "data" else None
-    try:
-        with open_store(run / STATE / STORE) as store:
-            scene = Shown(store, to, box)
-            counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
-            if not sum(counts.values()):
-                raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
-            _tell_ram(suffix, max(counts.values()) if by_block else sum(counts.values()))
-            write = _write_parts if by_block else _write
-            written = write(scene, counts, out, suffix)
-    except StoreError as error:
-        raise UserError(f"{error} If the run is training, wait until it has ended.") from None
-    except OSError as error:
-        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
+    with stored(run, out) as store:
+        scene = Shown(store, to, box)
+        counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
+        if not sum(counts.values()):
+            raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
+        _tell_ram(suffix, max(counts.values()) if by_block else sum(counts.values()))
+        write = _write_parts if by_block else _write
+        written = write(scene, counts, out, suffix)
     _report(written, counts, scene, suffix)
     return 0
 
@@ -110,19 +107,29 @@ def to_data(run: Path) -> Frame:
         raise UserError(f"{path} cannot be read ({error}); use --frame nerfstudio.") from None
 
 
-def open_store(folder: Path) -> ParameterStore:
-    """The blocks of a run, to be read; UserError where there is none."""
+@contextmanager
+def stored(run: Path, out: Path) -> Iterator[ParameterStore]:
+    """The blocks of a run, to be read while `out` is written.
+
+    Raises:
+        UserError: there are none, they cannot be read, or `out` cannot be written.
+    """
+    folder = run / STATE / STORE
     if not folder.is_dir():
-        raise UserError(f"There is no run of ABCD in {folder.parent.parent}: it has no {folder}.")
-    return ParameterStore.open(folder, read_only=True)
+        raise UserError(f"There is no run of ABCD in {run}: it has no {folder}.")
+    try:
+        with ParameterStore.open(folder, read_only=True) as store:
+            yield store
+    except StoreError as error:
+        raise UserError(f"{error} If the run is training, wait until it has ended.") from None
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
 
 
 def _tell_ram(suffix: str, count: int) -> None:
-    needed = ram_needed(suffix, count)
-    if needed is not None:
-        print(
-            f"{suffix} is packed at once, in about {needed / 2**20:,.0f} MiB of RAM; .ply and .glb are not."
-        )
+    if suffix in PACKED:
+        needed = count * BYTES_AT_ONCE / 2**20
+        print(f"{suffix} is packed at once, in about {needed:,.0f} MiB of RAM; .ply and .glb are not.")
 
 
 def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:

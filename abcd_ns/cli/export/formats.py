@@ -10,7 +10,7 @@ from torch import Tensor
 
 from abcd_ns import __version__
 from abcd_ns.cli.export.glb import glb_file
-from abcd_ns.cli.export.packed import BYTES_AT_ONCE, check_installed, packed_file
+from abcd_ns.cli.export.packed import check_installed, packed_file
 from abcd_ns.cli.export.ply import ply_file
 from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.engine.types import Gaussians
@@ -39,11 +39,6 @@ def suffix_of(path: Path, missing: str | None = None) -> str:
     if found in PACKED:
         check_installed()
     return found
-
-
-def ram_needed(suffix: str, count: int) -> int | None:
-    """Bytes to write so many Gaussians; None where they are written part by part."""
-    return count * BYTES_AT_ONCE if suffix in PACKED else None
 
 
 def rounding(suffix: str, largest: float) -> float:

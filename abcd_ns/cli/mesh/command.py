@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import tyro
 
-from abcd_ns.cli.export.command import check_request, open_store, tell_rounding, to_data
+from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_data
 from abcd_ns.cli.export.formats import GENERATOR
 from abcd_ns.cli.export.shown import Box, check_trained
 from abcd_ns.cli.mesh.depth_maps import draw
@@ -22,7 +22,7 @@ from abcd_ns.engine.layers.surface import median_depth
 from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store import ParameterStore, StoreError
+from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
@@ -31,7 +31,6 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import FREE_SHARE, ram_budget, share_out
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
-from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.resuming import MadeFor
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.progress_bar import ProgressBar
@@ -82,15 +81,10 @@ def mesh(
     run = find_run(run)
     to = to_data(run) if frame == "data" else STAY
     wanted = Wanted(out, voxel and voxel / to.scale, box, to, depth == "median")
-    try:
-        with open_store(run / STATE / STORE) as store:
-            fused, side = _surface(_seen(store, pipeline_config(run, read_settings(run), data)), wanted)
+    with stored(run, out) as store:
+        fused, side = _surface(_seen(store, pipeline_config(run, read_settings(run), data)), wanted)
         with replacing(out) as partial:
             write_ply(partial, fused, GENERATOR)
-    except StoreError as error:
-        raise UserError(f"{error} If the run is training, wait until it has ended.") from None
-    except OSError as error:
-        raise UserError(f"{out} cannot be written: {error.strerror}.") from None
     size, (vertices, faces) = out.stat().st_size / 2**20, (len(fused.vertices), len(fused.faces))
     print(f"{out}: {vertices:,} vertices, {faces:,} faces, {size:.1f} MiB, voxels of {side:.3g}")
     tell_rounding(".ply", float(np.abs(fused.vertices).max()), float(np.ptp(fused.vertices, axis=0).max()))
