@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from abcd_ns import __version__
-from abcd_ns.cli.report.held_out import HeldOut, look_at_held_out
+from abcd_ns.cli.report.held_out import look_at_held_out
 from abcd_ns.cli.report.page import GENERATOR, render_page
 from abcd_ns.cli.report.plan import Plan, make_plan
 from abcd_ns.cli.report.run_folder import RunFolder, find_run, load_pipeline, open_run
@@ -19,6 +19,7 @@ from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 
 PAGE_FILE = "report.html"
 NO_PHOTOS = "Held-out views and their photos are shown if their folder is named: --data {}"
+UNDRAWN = "Held-out views could not be drawn. {}"
 
 
 def report(
@@ -54,8 +55,10 @@ def report(
     pipeline, notes = _load(found, data)
     held_out = None
     if pipeline is not None:
-        held_out, more = _look(pipeline, pictures, console)
-        notes += more
+        try:
+            held_out = look_at_held_out(pipeline, pictures, console)
+        except UserError as error:  # photos may go missing until they are read
+            notes.append(UNDRAWN.format(error))
     page = render_page(found, held_out, _plan(found, pipeline), notes)
     try:
         # A file's name may have bytes that are no text.
@@ -97,15 +100,7 @@ def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[
     try:
         return load_pipeline(run, run.checkpoint, data), notes
     except UserError as error:
-        return None, [*notes, f"Held-out views could not be drawn. {error}"]
-
-
-def _look(pipeline: AbcdPipeline, pictures: int, console: Console) -> tuple[HeldOut | None, list[str]]:
-    """The held-out views, or None and why not: photos may go missing until they are read."""
-    try:
-        return look_at_held_out(pipeline, pictures, console), []
-    except UserError as error:
-        return None, [f"Held-out views could not be drawn. {error}"]
+        return None, [*notes, UNDRAWN.format(error)]
 
 
 def _plan(run: RunFolder, pipeline: AbcdPipeline | None) -> Plan | None:

@@ -41,8 +41,6 @@ class Visit:
     done: bool
     """False where the log ends within the visit."""
     layer_seconds: float
-    views: int | None
-    """That see the block."""
     psnr: float | None
     """Of its later half, on training crops, dB."""
 
@@ -182,6 +180,5 @@ def _join(number: int, begun: VisitLine | None, over: VisitEndLine | None, now: 
         ended=over.seconds if over else now,
         done=over is not None,
         layer_seconds=over.layer_seconds if over else 0.0,
-        views=begun.views if begun else None,
         psnr=over.psnr if over else None,
     )

@@ -35,7 +35,7 @@ def test_a_visit_without_an_end_lasts_until_the_log_ends(tmp_path):
 def test_a_visit_whose_beginning_is_lost_began_as_long_ago_as_it_says(tmp_path):
     end = line("visit end", 60, 30.0, visit=7, visit_seconds=4.5)
     story = read_story(write_log(tmp_path / "log.jsonl", [line("training", 50, 27.0, **TRAINING), end]))
-    assert [(visit.number, visit.began, visit.views) for visit in story.visits] == [(7, 25.5, None)]
+    assert [(visit.number, visit.began) for visit in story.visits] == [(7, 25.5)]
 
 
 def test_a_log_cut_anywhere_is_read_up_to_its_last_whole_line(tmp_path):
