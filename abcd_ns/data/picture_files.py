@@ -6,7 +6,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from abcd_ns.data.input_errors import InputError
 
@@ -17,23 +17,16 @@ FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 """What is read, by content and not by name. Pillow knows more, some of which it gives to other programs."""
 _MODES = frozenset({"RGB", "RGBA", "L", "LA", "P", "1"})
 _ENDS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND\xaeB`\x82"}
-_ORIENTATION_TAG = 0x0112
 _PNG_BIT_DEPTH_BYTE = 24
-_TIFF_BITS_TAG = 258
 
 
 @dataclass(frozen=True)
 class Header:
     """What a picture file says of itself."""
 
-    width: int
-    height: int
+    size: tuple[int, int]
+    """(width, height) as stored: EXIF orientation is not applied, as COLMAP does not."""
     format: str
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) as stored: EXIF orientation is not applied, as COLMAP does not."""
-        return self.width, self.height
 
 
 def check_regular(path: Path) -> None:
@@ -78,7 +71,7 @@ def has_alpha(picture: Image.Image) -> bool:
 
 def orientation(picture: Image.Image) -> int:
     """EXIF orientation, 1 to 8; 1 is upright."""
-    return picture.getexif().get(_ORIENTATION_TAG, 1)
+    return picture.getexif().get(ExifTags.Base.Orientation, 1)
 
 
 def undecodable(path: Path, error: Exception) -> InputError:
@@ -102,7 +95,7 @@ def read_header(path: Path, check_kind: bool = True) -> Header:
             with open_picture(path) as picture:
                 if check_kind:
                     _check_kind(path, picture)
-                return Header(picture.width, picture.height, picture.format or "")
+                return Header(picture.size, picture.format or "")
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
         fix = "reduce the photo and make the model again" if check_kind else "reduce the mask"
         raise InputError(f"{path} has more than 89 Mpx; {fix}.") from None
@@ -128,7 +121,7 @@ def _check_kind(path: Path, picture: Image.Image) -> None:
         with path.open("rb") as file:
             deep = deep or file.read(_PNG_BIT_DEPTH_BYTE + 1)[_PNG_BIT_DEPTH_BYTE] == 16
     if picture.format == "TIFF":
-        deep = deep or max(picture.tag_v2.get(_TIFF_BITS_TAG, (8,))) > 8
+        deep = deep or max(picture.tag_v2.get(ExifTags.Base.BitsPerSample, (8,))) > 8
     if deep:
         raise InputError(f"{path} has more than 8 bits a channel; convert it to 8 bits.")
     if picture.mode not in _MODES:
