@@ -202,7 +202,7 @@ class AbcdPipeline(VanillaPipeline):
         self.datamanager.device_photo_bytes = int(PHOTO_SHARE * self._budget) if keeps_photos else 0
         self.model.draws_with().warm_up()
         loss.warm_up(self.device)
-        store, resumed = self._open_store(asked, views)
+        store, resumed = self._open_store(asked, views), asked.resumed_from is not None
         scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, self._ram.blocks)
         limits = replace(config.training.limits, **self._fitted(store, resumed))
         training = replace(config.training, limits=limits)
@@ -301,13 +301,13 @@ class AbcdPipeline(VanillaPipeline):
         self.model.near = views[0].near
         return views
 
-    def _open_store(self, asked: RunRequest, views: list[View]) -> tuple[ParameterStore, bool]:
+    def _open_store(self, asked: RunRequest, views: list[View]) -> ParameterStore:
         """The run's own store: a copy of the one it goes on from, or a new one."""
         training, photos = self.config.training, self.datamanager.train_dataset.image_filenames
         folder = asked.folder / STORE
         made_for = MadeFor.of(photos, views, training)
         if asked.resumed_from is not None:
-            return take_over(asked.resumed_from, folder, made_for), True
+            return take_over(asked.resumed_from, folder, made_for)
         everything = self.model.initial_gaussians(views, training.point_pixels)
         self._tell_of_points(len(everything))
         gaussians = thin_out(everything, training.density.limit, training.seed)
@@ -327,7 +327,7 @@ class AbcdPipeline(VanillaPipeline):
             store.commit(independent_at_rest(tree, gaussians))
         else:
             store.commit(blocks_at_rest(tree, gaussians, keep, training.seed))
-        return store, False
+        return store
 
     def _scaffold_size(self, gaussians: int, blocks: int, fitted: dict[str, int]) -> int | None:
         """Gaussians that the warm-up may have; None where there is no warm-up."""

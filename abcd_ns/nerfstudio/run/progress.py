@@ -68,8 +68,8 @@ class ProgressReport:
             case VisitEnded():
                 self._layer_seconds += event.layer_seconds
                 self._visit_seconds += event.seconds
-            case SweepEnded():
-                self._end_sweep(event)
+            case SweepEnded() if self._coordinator.scene.tree.num_blocks > 1:
+                self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
             case Shedding():
                 self._show(f"last shedding {event.done}/{event.total}")
             case ShedAtEnd() if event.gone:
@@ -129,10 +129,6 @@ class ProgressReport:
         steps = self._visit.steps if self._visit else 0
         endless = not 0 < steps < UNLIMITED or (self._visit is not None and self._visit.block is None)
         self._show(f"step {event.visit_step}" if endless else f"step {event.visit_step}/{steps}")
-
-    def _end_sweep(self, event: SweepEnded) -> None:
-        if self._coordinator.scene.tree.num_blocks > 1:
-            self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
 
     def _summary(self) -> str:
         quality = "-" if self._psnr is None else f"{self._psnr:.2f} dB on training crops"
