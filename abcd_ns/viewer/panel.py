@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from typing import Protocol
 
 import numpy as np
@@ -216,14 +216,11 @@ class AbcdPanel(ViewerControl):
     # -- what the user chooses -----------------------------------------------------------------------
 
     def _choose(self) -> None:
-        with self._lock():
+        with self.viewer.train_lock or nullcontext():
             self._model.choice.show, self._model.choice.block = self._controls.show, self._controls.block
             self._cameras_of = None
             self._update()
         self.viewer._trigger_rerender()
-
-    def _lock(self) -> AbstractContextManager:
-        return self.viewer.train_lock or nullcontext()
 
     def _chosen_block(self) -> int | None:
         visit = next(iter(self._history.under_way.values()), None)

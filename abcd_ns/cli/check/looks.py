@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -62,9 +61,5 @@ def copies(sources: Sequence[PhotoSource]) -> list[list[int]]:
     groups: dict[tuple[int, bytes], list[int]] = defaultdict(list)
     for length, rows in by_length.items():
         for row in rows if len(rows) > 1 else ():
-            groups[length, _digest(sources[row].path)].append(row)
+            groups[length, hashlib.blake2b(sources[row].path.read_bytes()).digest()].append(row)
     return [rows for rows in groups.values() if len(rows) > 1]
-
-
-def _digest(path: Path) -> bytes:
-    return hashlib.blake2b(path.read_bytes()).digest()

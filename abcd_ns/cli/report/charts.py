@@ -131,7 +131,10 @@ def draw_budgets(story: Story) -> Figure | None:
 @in_style
 def draw_block_quality(story: Story) -> Figure | None:
     """PSNR on training crops, by block, at the end of each visit."""
-    blocks = {block: _ends_of(story.of_block(block)) for block in range(story.blocks)}
+    blocks = {
+        block: [(visit.ended, visit.psnr) for visit in story.of_block(block) if visit.psnr is not None]
+        for block in range(story.blocks)
+    }
     known = {block: points for block, points in blocks.items() if points}
     if story.blocks < 2 or not known:
         return None
@@ -237,10 +240,6 @@ def _label_median(axes: Axes, story: Story, blocks: Sequence[Sequence[tuple[floa
     if points:
         end = _line(axes, points, STEPS, linewidth=1.8)
         _label(axes, story, {"median": end}, {"median": STEPS}, lambda name, psnr: f"{name}\n{psnr:.1f} dB")
-
-
-def _ends_of(visits: Sequence[Visit]) -> list[tuple[float, float]]:
-    return [(visit.ended, visit.psnr) for visit in visits if visit.psnr is not None]
 
 
 def visit_titles(story: Story) -> dict[str, str]:
