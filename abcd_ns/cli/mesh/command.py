@@ -82,7 +82,8 @@ def mesh(
     to = to_data(run) if frame == "data" else STAY
     wanted = Wanted(out, voxel and voxel / to.scale, box, to, depth == "median")
     with stored(run, out) as store:
-        fused, side = _surface(_seen(store, pipeline_config(run, read_settings(run), data)), wanted)
+        seen = _seen(store, pipeline_config(run, read_settings(run), data))
+        fused, side = _surface(*seen, wanted)
         with replacing(out) as partial:
             write_ply(partial, fused, GENERATOR)
     size, (vertices, faces) = out.stat().st_size / 2**20, (len(fused.vertices), len(fused.faces))
@@ -125,23 +126,15 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
         ) from None
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A scene, and the training views that see it."""
-
-    painter: Painter
-    settings: PaintSettings
-    views: list[View]
-
-
-def _surface(seen: Seen, wanted: Wanted) -> tuple[Piece, float]:
+def _surface(
+    painter: Painter, settings: PaintSettings, views: list[View], wanted: Wanted
+) -> tuple[Piece, float]:
     """The mesh in the frame that is asked for, and the side of its voxels there."""
     from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
 
-    views = seen.views
     with tempfile.TemporaryDirectory(prefix=".abcd-mesh-", dir=wanted.out.absolute().parent) as folder:
-        pictures = WholePictures(seen.painter, seen.settings)
-        median = partial(median_depth, seen.painter, settings=seen.settings) if wanted.median else None
+        pictures = WholePictures(painter, settings)
+        median = partial(median_depth, painter, settings=settings) if wanted.median else None
         with ProgressBar("drawing", len(views)) as bar:
             maps = draw(pictures, views, Path(folder), bar.advance, median)
         footprints = maps.footprints()
@@ -162,7 +155,7 @@ def _surface(seen: Seen, wanted: Wanted) -> tuple[Piece, float]:
     return replace(found, vertices=vertices), side * wanted.to.scale
 
 
-def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> Seen:
+def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[Painter, PaintSettings, list[View]]:
     """What draws the scene, and its training views. Where these were refined is of no account: the depth
     that they see is the scene's, wherever they stand."""
     check_trained(store)
@@ -184,5 +177,4 @@ def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> Seen:
         pass_gaussians=min(default_pass(scene), room),
         device=device,
     )
-    settings = PaintSettings(config.training.sh_degree, config.training.antialiased)
-    return Seen(painter, settings, views)
+    return painter, PaintSettings(config.training.sh_degree, config.training.antialiased), views
