@@ -122,4 +122,4 @@ def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
 def test_a_process_that_dies_is_an_error_and_not_a_wait(tmp_path):
     task = mapping.Task(tmp_path / "nowhere", ("a.png",), tmp_path, "OPENCV", True, "any")
     with pytest.raises(UserError):
-        mapping.find_poses(task, lambda _: None)
+        mapping.find_poses(task, lambda *_: None)

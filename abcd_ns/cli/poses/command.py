@@ -9,10 +9,16 @@ from typing import Annotated
 import pycolmap
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.progress import Progress as Bars
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
-from abcd_ns.cli.poses.mapping import Model, Order, Progress, Stage, Task, find_poses
+from abcd_ns.cli.poses.mapping import Model, Order, Stage, Task, find_poses
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import Problems
 from abcd_ns.data.picture_files import SUFFIXES, check_complete, read_header
@@ -115,18 +121,16 @@ def _check_lens(lens: str) -> None:
 
 def _with_bars(task: Task, console: Console) -> Model | None:
     columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn())
-    with Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bars:
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bars:
         shown = {stage: bars.add_task(words, total=None, start=False) for stage, words in WORDS.items()}
-        photos = len(task.names)
-        totals = {Stage.FEATURES: photos, Stage.MATCHES: task.pairs, Stage.POSES: photos}
 
-        def show(progress: Progress) -> None:
-            for stage in Stage:
-                if stage < progress.stage:  # it may have ended between two looks
-                    bars.update(shown[stage], total=totals[stage], completed=totals[stage])
-            bar = shown[progress.stage]
-            bars.start_task(bar)
-            bars.update(bar, total=progress.total, completed=progress.done)
+        def show(stage: Stage, done: int) -> None:
+            for earlier in Stage:
+                if earlier < stage:  # it may have ended between two looks
+                    total = task.total(earlier)
+                    bars.update(shown[earlier], total=total, completed=total)
+            bars.start_task(shown[stage])
+            bars.update(shown[stage], total=task.total(stage), completed=done)
 
         found = find_poses(task, show)
         bars.update(shown[Stage.POSES], completed=len(found.posed) if found else 0)

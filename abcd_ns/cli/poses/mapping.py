@@ -35,6 +35,10 @@ class Stage(IntEnum):
     POSES = 2
 
 
+TABLES = {Stage.FEATURES: "images", Stage.MATCHES: "matches"}
+"""Of the database: a row for all that a stage has done."""
+
+
 @dataclass(frozen=True)
 class Task:
     """What is to be posed."""
@@ -54,10 +58,11 @@ class Task:
     def database(self) -> Path:
         return self.work / "database.db"
 
-    @property
-    def pairs(self) -> int:
-        """Pairs of photos that are compared, about."""
+    def total(self, stage: Stage) -> int:
+        """What a stage goes through: photos, or the pairs of them that are compared, about."""
         n = len(self.names)
+        if stage != Stage.MATCHES:
+            return n
         return n * (n - 1) // 2 if self.order == "any" else n * OVERLAP
 
 
@@ -73,20 +78,11 @@ class Model:
     """Mean reprojection error, pixels."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """How far a stage is."""
-
-    stage: Stage
-    done: int
-    total: int
-
-
-def find_poses(task: Task, show: Callable[[Progress], None]) -> Model | None:
+def find_poses(task: Task, show: Callable[[Stage, int], None]) -> Model | None:
     """Features, matches and poses; None where no two photos fit together.
 
     Args:
-        show: is told several times a second how far it is.
+        show: is told several times a second what is being done, and how much of its total is.
 
     Raises:
         UserError: pycolmap raised, or its process died; the message is its own.
@@ -97,7 +93,8 @@ def find_poses(task: Task, show: Callable[[Progress], None]) -> Model | None:
     try:
         found = pool.submit(_work, task)
         while not wait([found], SECONDS_BETWEEN_LOOKS).done:
-            show(_progress(task, Stage(stage.value), posed.value))
+            now = Stage(stage.value)
+            show(now, posed.value if now == Stage.POSES else _rows(task.database, TABLES[now]))
         return found.result()
     except (RuntimeError, ValueError, IndexError, OSError) as error:
         raise UserError(f"pycolmap could not find poses: {first_line(error)}.") from error
@@ -107,16 +104,7 @@ def find_poses(task: Task, show: Callable[[Progress], None]) -> Model | None:
         pool.shutdown()
 
 
-def _progress(task: Task, stage: Stage, posed: int) -> Progress:
-    photos = len(task.names)
-    if stage == Stage.POSES:
-        return Progress(stage, posed, photos)
-    if stage == Stage.FEATURES:
-        return Progress(stage, _rows(task.database, "images"), photos)
-    return Progress(stage, _rows(task.database, "matches"), task.pairs)
-
-
-def _rows(database: Path, table: Literal["images", "matches"]) -> int:
+def _rows(database: Path, table: str) -> int:
     """Of a database that another process is writing; 0 where it cannot be read just now."""
     try:
         with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as reader:
