@@ -25,7 +25,7 @@ from abcd_ns.lab.runs.options import set_options
 from abcd_ns.nerfstudio.datamanager import OUR_READER, READERS
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
-from abcd_ns.nerfstudio.run import STORE
+from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Plain, Settings
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
@@ -76,7 +76,7 @@ def find_run(path: Path) -> Path:
         UserError: it is none; the message says what to give.
     """
     path = path.parent if path.name == "config.yml" else path
-    if not (path / "abcd" / SETTINGS_FILE).exists():
+    if not (path / STATE / SETTINGS_FILE).exists():
         raise UserError(f"{path} is no run with a log: {_hint(path)}")
     return path
 
@@ -88,14 +88,14 @@ def open_run(path: Path) -> RunFolder:
         UserError: something in the folder is missing, damaged or of another version.
     """
     settings = read_settings(path)
-    story = read_story(path / "abcd" / LOG_FILE)
+    story = read_story(path / STATE / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
-    return RunFolder(path, settings, story, checkpoint, *_read_store(path / "abcd" / STORE, checkpoint))
+    return RunFolder(path, settings, story, checkpoint, *_read_store(path / STATE / STORE, checkpoint))
 
 
 def read_settings(path: Path) -> Settings:
     """What a run was trained with; UserError where that cannot be read."""
-    return read_record(path / "abcd" / SETTINGS_FILE, Settings, SCHEMA)
+    return read_record(path / STATE / SETTINGS_FILE, Settings, SCHEMA)
 
 
 def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPipeline:
@@ -136,7 +136,7 @@ def _settings_file(run: Path, settings: Settings) -> str:
     """In words."""
     versions = settings.versions
     wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
-    return f"{run / 'abcd' / SETTINGS_FILE} (written by {wrote})"
+    return f"{run / STATE / SETTINGS_FILE} (written by {wrote})"
 
 
 def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
@@ -172,7 +172,7 @@ def _registered(method: str, reader: str) -> AbcdTrainerConfig:
 def _hint(path: Path) -> str:
     if not path.is_dir():
         return "there is no such folder."
-    below = sorted(path.glob(f"**/abcd/{SETTINGS_FILE}"), key=lambda found: found.stat().st_mtime)
+    below = sorted(path.glob(f"**/{STATE}/{SETTINGS_FILE}"), key=lambda found: found.stat().st_mtime)
     if below:
         return f"did you mean {below[-1].parent.parent}?"
     return "give a folder outputs/SCENE/METHOD/TIME that this version of `ns-train abcd` wrote."

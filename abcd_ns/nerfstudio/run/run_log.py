@@ -28,7 +28,7 @@ from abcd_ns.engine.events import (
 )
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
-from abcd_ns.machine import peak_rss_bytes
+from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import (
     KIND_OF,
     SCHEMA,
@@ -122,7 +122,6 @@ class RunLog:
 
     def close(self) -> None:
         """Training is over: say what it took."""
-        cuda = torch.cuda.is_available()
         self._sample()
         for worker in self._workers:
             self._note(
@@ -136,7 +135,7 @@ class RunLog:
             EndLine,
             gaussians=self._coordinator.count(),
             peak_rss_bytes=peak_rss_bytes(),
-            peak_device_bytes=torch.cuda.max_memory_allocated() if cuda else None,
+            peak_device_bytes=peak_device_bytes()[0],
         )
         self._flush()
 
@@ -165,13 +164,12 @@ class RunLog:
         self._flush()
 
     def _sample(self) -> None:
-        cuda = torch.cuda.is_available()
         self._note(
             SampleLine,
             psnr=_mean(self._psnrs),
             gaussians=self._coordinator.count(),
             rss_bytes=psutil.Process().memory_info().rss,
-            device_bytes=torch.cuda.memory_allocated() if cuda else None,
+            device_bytes=torch.cuda.memory_allocated() if torch.cuda.is_available() else None,
             held={meter.name: meter.used() for meter in self._meters},
         )
         self._psnrs, self._sampled = [], self._coordinator.stopwatch.seconds
