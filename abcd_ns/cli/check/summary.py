@@ -13,7 +13,7 @@ from abcd_ns.cli.words import few
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.scene import Lens
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.train.memory import parameter_bytes
 
 MIDDLE = (0.05, 0.95)
 """Quantiles between which the points' extent is taken: single wrong ones would decide it otherwise."""
@@ -55,7 +55,6 @@ def summarize(survey: Survey) -> Summary:
     sizes = Counter("{} x {}".format(*source.size) for source in survey.sources)
     lenses = Counter(_in_words(frame.lens) for frame in prepared.scene.frames)
     spread = np.diff(np.quantile(points, MIDDLE, axis=0), axis=0)[0] if len(points) else []
-    floats = sum(value.shape[1:].numel() for _, value in Gaussians.empty().items())
     return Summary(
         model=str(prepared.scene.model),
         photos=len(survey.names),
@@ -70,7 +69,7 @@ def summarize(survey: Survey) -> Summary:
         point_extent=tuple(map(float, spread)),
         photo_bytes=photo_bytes(survey),
         photo_budget_bytes=default_budget(),
-        gaussian_bytes=len(points) * floats * 4,
+        gaussian_bytes=len(points) * parameter_bytes(sh_degree=3),
     )
 
 

@@ -26,7 +26,6 @@ class QuietParser(AbcdDataParser):
 class Survey:
     """A scene that can be read. Lists and rows are in the order of the photos' names."""
 
-    data: Path
     prepared: Prepared
     train: list[int]
     """Rows of the views that are trained on."""
@@ -74,7 +73,6 @@ def survey(data: Path, downscale: int | None) -> Survey:
     prepared = parser.prepared()
     outputs = parser.get_dataparser_outputs("train")
     return Survey(
-        data=data,
         prepared=prepared,
         train=parser.rows("train"),
         held_out=parser.rows("test"),

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.store import ParameterStore
-from abcd_ns.engine.store.parameter_store import StoreError
+from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.train.density.shedding import WEIGHED
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError, first_line
