@@ -63,10 +63,10 @@ def _parse_header(path: Path, header: str) -> tuple[str, int, np.dtype, bool]:
             elif words[:1] == ["element"]:
                 elements.append((words[1], int(words[2]), []))
             elif words[:1] == ["property"] and len(elements) == 1:
-                elements[0][2].append((words[2], _ORDERS[header.split()[2]] + _TYPES[words[1]]))
+                elements[0][2].append((words[2], order + _TYPES[words[1]]))
         name, count, fields = elements[0]
         row = np.dtype(fields)
-    except (KeyError, IndexError, ValueError):
+    except (KeyError, IndexError, TypeError, ValueError):  # also where no format was given before
         raise _bad(path, "has a header that cannot be read") from None
     if order is None or name != "vertex" or count < 0 or not {"x", "y", "z"} <= set(row.names or ()):
         raise _bad(path, "does not start with vertices that have x, y and z")

@@ -61,10 +61,10 @@ def read_transforms(path: Path) -> Scene:
         )
     with problems.collect():
         transform = rigid(
-            _matrix(meta.get("applied_transform", np.eye(4).tolist()), path), f"{path}: applied_transform"
+            _matrix(meta.get("applied_transform", np.eye(4)), path), f"{path}: applied_transform"
         )
     with problems.collect():
-        scale = _number({"applied_scale": meta.get("applied_scale", 1.0)}, "applied_scale", str(path))
+        scale = _number(meta, "applied_scale", str(path), default=1.0)
         if scale <= 0:
             problems.add(f"{path}: applied_scale is {scale:g}; it must be positive.")
     problems.raise_if_any()

@@ -320,7 +320,8 @@ def test_binary_ply(tmp_path, order):
     table = np.array([(*p, *c) for p, c in zip(xyz, rgb, strict=True)], dtype=row)
     kind = "little" if order == "<" else "big"
     types = "".join(f"property {'uchar' if t == 'u1' else 'float'} {name}\n" for name, t in row)
-    head = f"ply\nformat binary_{kind}_endian 1.0\nelement vertex 4\n{types}end_header\n".encode()
+    form = f"comment some\nformat binary_{kind}_endian 1.0\n"
+    head = f"ply\n{form}element vertex 4\n{types}end_header\n".encode()
     path = tmp_path / "points.ply"
     path.write_bytes(head + table.tobytes())
     assert np.array_equal(read_points(path)[0], xyz)
@@ -329,6 +330,7 @@ def test_binary_ply(tmp_path, order):
         head + table.tobytes()[:-1],
         head + table.tobytes() + b"!",
         b"",
+        head.replace(form.encode(), b"") + table.tobytes(),
         head.replace(b"4\n", b"-4\n"),
         head.replace(b"4\n", b"1152921504606846976\n") + table.tobytes(),
         head.replace(b"4\n", b"9" * 5000 + b"\n") + table.tobytes(),
