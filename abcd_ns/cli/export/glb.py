@@ -103,7 +103,8 @@ def glb_file(
     starts = list(accumulate((part.stride * count for part in parts), initial=0))
     document = _document(parts, starts, count, comment, up)
     words = 4 * -(-(len(json.dumps(document)) + _SPARE) // 4)
-    head, total = 12 + 8 + words + 8, 12 + 8 + words + 8 + starts[-1]
+    head = 12 + 8 + words + 8
+    total = head + starts[-1]
     if total >= _LARGEST:
         raise UserError(
             f"{count:,} Gaussians are {total / 2**30:.1f} GiB and a .glb holds 4; use --by-block."

@@ -147,11 +147,12 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     training = replace(training, limits=replace(training.limits, **fit.limits))
     tree = build_kd(points, fit.blocks)
     owner = tree.assign(points)
+    counts = owner.bincount(minlength=fit.blocks)
     with console.status("Looking which view sees which block"):
         seen = views_of_blocks(tree, points, views)
     batch = views_per_step(training.batch, fit.blocks, training.limits.batch_limit)
     needs = demand.needs(batch, training.limits.crop_pixels, levels_of(fit.blocks))
-    fullest = owner == owner.bincount(minlength=fit.blocks).argmax()
+    fullest = owner == counts.argmax()
     gaussians = gaussians_from_points(points[fullest], capture.colors[fullest]).to(device)
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
     with console.status("Timing a step"):
@@ -168,7 +169,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         points=len(points),
         batch=batch,
         views_of_block=seen,
-        points_of_block=tuple(owner.bincount(minlength=fit.blocks).tolist()),
+        points_of_block=tuple(counts.tolist()),
         **shares,
         steps=wanted.steps,
         seconds_per_step=seconds,

@@ -35,12 +35,11 @@ class Block:
 
 def describe_blocks(run: RunFolder) -> list[Block]:
     """All blocks, by number."""
-    counts = None
+    counts = [None] * run.story.blocks
     if run.checkpoint is not None:
         tree = run.checkpoint.tree
         counts = tree.assign(run.checkpoint.means).bincount(minlength=tree.num_blocks).tolist()
-    blocks = run.story.blocks if counts is None else len(counts)
-    return [_describe(run, block, None if counts is None else counts[block]) for block in range(blocks)]
+    return [_describe(run, block, count) for block, count in enumerate(counts)]
 
 
 def _describe(run: RunFolder, block: int, gaussians: int | None) -> Block:

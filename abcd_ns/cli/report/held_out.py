@@ -65,7 +65,7 @@ def look_at_held_out(pipeline: AbcdPipeline, pictures: int, console: Console) ->
     shown = {}
     for drawn in _with_progress(pipeline, "Pictures", console, places):
         row = drawn.view.row
-        shown[row] = _show(drawn, scores[row], places[row], max(len(places), 1))
+        shown[row] = _show(drawn, scores[row], places[row], len(places))
     return HeldOut(
         tuple(scores), note if gap is None else f"{gap:.1f} dB", tuple(shown[row] for row in places)
     )

@@ -123,7 +123,6 @@ def read_story(path: Path) -> Story:
     lines = [_read_line(text, f"{path}, line {number}") for number, text in enumerate(texts, start=1)]
     if not any(isinstance(line, TrainingLine) for line in lines):
         raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
-    ends = _of(lines, EndLine)
     return Story(
         trainings=_of(lines, TrainingLine),
         samples=_of(lines, SampleLine),
@@ -132,7 +131,7 @@ def read_story(path: Path) -> Story:
         workers=_of(lines, WorkerLine),
         held_out=tuple(line for line in _of(lines, HeldOutLine) if line.psnr is not None),
         shed_at_end=next(reversed(_of(lines, ShedAtEndLine)), None),
-        end=ends[-1] if ends else None,
+        end=next(reversed(_of(lines, EndLine)), None),
         moments=tuple((line.step, line.seconds) for line in lines),
     )
 
