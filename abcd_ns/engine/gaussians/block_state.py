@@ -60,12 +60,6 @@ class BlockState:
         return len(self.gaussians)
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of all tensors."""
-        parts = (self.gaussians, self.exp_avg, self.exp_avg_sq, self.waits, *self.growth.values())
-        return sum(part.nbytes for part in parts)
-
-    @property
     def nobody(self) -> "BlockState":
         """None of its Gaussians, under its clocks; shares no memory, as an empty slice would."""
         return self[torch.zeros(0, dtype=torch.long, device=self.gaussians.device)]

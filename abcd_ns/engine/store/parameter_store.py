@@ -126,11 +126,6 @@ class ParameterStore:
         return in_order(self._manifest.blocks)
 
     @property
-    def nbytes(self) -> int:
-        """Bytes on disk of this generation's shards."""
-        return sum(shard.nbytes for shard in self._manifest.blocks.values())
-
-    @property
     def pins(self) -> list[str]:
         """The names of the pinned generations."""
         return pin_names(self.folder)
