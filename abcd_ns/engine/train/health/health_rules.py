@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.transfer import upload
-from abcd_ns.engine.types import Gaussians, Layer, View, centers_of
+from abcd_ns.engine.types import Gaussians, View, centers_of
 
 SHOWS = 1 / 255
 """Rasterizers skip a Gaussian wherever its alpha is below this: with less opacity it is never drawn."""
@@ -65,15 +65,15 @@ def wider_than(
 
 
 @torch.no_grad()
-def share_of_picture(before: Layer | None, own: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+def share_of_picture(in_front: Float[Tensor, "h w"] | None, own: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
     """How large a part of a picture a block can be, 0..1.
 
     Args:
-        before: the frozen layer in front of the block, if there are layers.
-        own: transmittance of the block, and of what was sorted in with it.
+        in_front: transmittance of what lies before the block; None for nothing.
+        own: that of the block, and of what was sorted in with it.
     """
     alpha = 1 - own
-    return (alpha if before is None else before.transmittance * alpha).mean()
+    return (alpha if in_front is None else in_front * alpha).mean()
 
 
 def stand_ins(sound: Gaussians, count: int) -> Gaussians:

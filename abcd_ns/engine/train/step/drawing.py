@@ -59,15 +59,10 @@ class StepDrawing:
 
     def shown_in(self, views: Sequence[int]) -> dict[int, float]:
         """The influence that the block has on each of these views by now."""
-        shown, live = {}, live_gaussians(self._run.params)
+        run, shown, live = self._run, {}, live_gaussians(self._run.params)
         for view in views:
-            seen, crop = self._run.views_at(self._run.reduction)[view], self._run.active.geometry.crops[view]
-            sample = self._sample_of(seen, crop, 0, self._run.state.step)
-            before = sample.layers and sample.layers.front.transmittance
-            antialiased = self._run.config.antialiased
-            shown[view] = share_shown(
-                live, self._run.rasterizer, sample.shot, before, antialiased=antialiased
-            )
+            seen, options = self.whole(view), {"antialiased": run.config.antialiased}
+            shown[view] = share_shown(live, run.rasterizer, seen.shot, seen.in_front, **options)
         return shown
 
     def _views_of_step(self) -> tuple[int, ...]:
@@ -89,7 +84,7 @@ class StepDrawing:
         rendered = self._draw(live_gaussians(self._run.params), batch.samples, self.degree)
         if not self._run.active.shown:
             for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
-                self._run.health.see(share_of_picture(sample.layers and sample.layers.front, own))
+                self._run.health.see(share_of_picture(sample.in_front, own))
         return rendered
 
     def loss(
