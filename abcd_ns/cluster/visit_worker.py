@@ -11,7 +11,6 @@ from abcd_ns.cluster.lease import VisitOutcome, VisitTask
 from abcd_ns.cluster.shared_residual import ROOM, SharedResidual
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.loss import psnrs
 from abcd_ns.engine.store.lent_scene import LentScene
@@ -62,10 +61,6 @@ class OnLease(Visits):
     def begin(self, at_once: int = 1) -> ActiveVisit:  # noqa: ARG002 - there is but one
         """The one visit that there is."""
         return self._run.active
-
-    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:  # noqa: ARG002 - all alike
-        """Others see the live block as it is."""
-        return lambda: live_gaussians(self._run.params)
 
     def room(self) -> int | None:
         """What the block's limit, and its part of the scene's, leave."""

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
@@ -164,7 +164,7 @@ class BlocksAlone(Visits):
         run.rest(self._scene.tree, {block: self._joined(block)}, run.config.commit_seconds)
         return state.active
 
-    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:
+    def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:
         """Others see the block as it will be merged."""
         block = active.geometry.block
         self._look(block)
@@ -173,7 +173,7 @@ class BlocksAlone(Visits):
         cell = self._scene.tree.cell(block)
 
         def inside() -> Gaussians:
-            live = live_gaussians(self._run.params)
+            live = live_gaussians(params)
             return live[cell.contains(live.means)]
 
         return inside

@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
 from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import overlap, worth_training
@@ -55,8 +55,10 @@ class Visits(Protocol):
             NothingSeenError: no view sees any block.
         """
 
-    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:
-        """Its block is live, at the visit's beginning or after a resume; what others see of it meanwhile."""
+    def attached(self, active: ActiveVisit, params: Params) -> Callable[[], Gaussians]:  # noqa: ARG002
+        """Its block is live, at the visit's beginning or after a resume; what others see of it meanwhile: all
+        that is live."""
+        return lambda: live_gaussians(params)
 
     def room(self) -> int | None:
         """Gaussians that may be added to the block; None for any number."""
@@ -95,10 +97,6 @@ class Planner(Visits):
             state.active = self._next_visit(state, run.sh_degree, began, at_once)
         state.visit += 1
         return state.active
-
-    def attached(self, active: ActiveVisit) -> Callable[[], Gaussians]:  # noqa: ARG002 - all alike
-        """Others see the live block as it is."""
-        return lambda: live_gaussians(self._run.params)
 
     def room(self) -> int | None:
         """What the limits of scene and block leave; in the warm-up what the memory of a visit holds."""

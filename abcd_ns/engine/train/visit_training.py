@@ -55,7 +55,7 @@ class VisitTraining:
         run, state = self.run, self.run.state
         self.live.attach(active, self.batch)
         block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
-        run.scene.set_live(block, self._visits.attached(active))
+        run.scene.set_live(block, self._visits.attached(active, run.params))
         gaussians, self.influence = len(self.live), None
         if active.is_whole:
             self.influence = InfluenceTable(run.scene.tree, run.views, state.influence, run.device)
