@@ -26,7 +26,7 @@ from torch import Tensor
 from abcd_ns.engine.events import StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
-from abcd_ns.engine.layers.compositing import composite, fold
+from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.image_size import image_size
 from abcd_ns.engine.space.culling import Optics
@@ -233,11 +233,8 @@ class ExactTrainer(Trainer):
         layers, own = self._in_order(place), self._layers_of[place][block]
         at = next(k for k, layer in enumerate(layers) if layer is own)
         front, back = fold(layers[:at], like=own), fold(layers[at + 1 :], like=own)
-        gradient = self._pictures[place].grad
-        behind = composite(back, self._batch.samples[place].background)
-        by_color = front.transmittance[..., None] * gradient
-        outputs = (raster.color, raster.transmittance)
-        torch.autograd.backward(outputs, (by_color, (by_color * behind).sum(dim=-1)))
+        picture = sandwich(front, raster.layer, back, self._batch.samples[place].background)
+        picture.backward(self._pictures[place].grad)
 
     def _step(
         self, block: int, state: BlockState, gradients: Gradients, rows: Int64[Tensor, "m"], taken: int

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.compositing import composite, empty_layer, fold
+from abcd_ns.engine.layers.compositing import empty_layer, fold, sandwich
 from abcd_ns.engine.layers.painter import Loaded, Painter, PaintSettings
 from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.types import Layer, View
@@ -166,13 +166,9 @@ class WholePictures:
         if at is None:
             return
         layers, like = [part.layer for part in parts], parts[at].layer
-        raster = self._raster(unit, loaded, view)
         front, back = fold(layers[:at], like=like), fold(layers[at + 1 :], like=like)
-        by_color = front.transmittance[..., None] * pull
-        behind = composite(back, pull.new_zeros(3))
-        outputs = (raster.color, raster.transmittance)
-        pulls = (by_color, (by_color * behind).sum(dim=-1))
-        torch.autograd.backward(outputs, pulls, retain_graph=True)  # views share what leads to `loaded`
+        picture = sandwich(front, self._raster(unit, loaded, view).layer, back, pull.new_zeros(3))
+        picture.backward(pull, retain_graph=True)  # views share what leads to `loaded`
 
 
 def _part(unit: int, raster: Raster) -> _Part:
