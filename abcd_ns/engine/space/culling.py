@@ -10,19 +10,14 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from abcd_ns.engine.space.tree import Box, in_float64
-from abcd_ns.engine.space.visibility import (
-    reach_radius,
-    widest_slant,
-    world_size,
-)
+from abcd_ns.engine.space.tree import EVERYWHERE, Box, in_float64
+from abcd_ns.engine.space.visibility import reach_radius, widest_slant, world_size
 from abcd_ns.engine.types import Crop, Gaussians, View, centers_of
 
 BOUNDS_SLANT = 3.0
 """The largest `widest_slant` that bounds allow for: fields of view up to about 140 degrees."""
 ROUNDING = 2.0
 """Frusta are this much wider than what they must hold, px; generously."""
-EVERYWHERE = Box(torch.full((3,), -torch.inf).double(), torch.full((3,), torch.inf).double())
 
 
 def bounds_of(gaussians: Gaussians) -> Box | None:

@@ -3,11 +3,10 @@
 import math
 from itertools import count
 
-import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from abcd_ns.engine.space.tree import BlockTree, Box, in_float64, tree_from_rows
+from abcd_ns.engine.space.tree import EVERYWHERE, BlockTree, Box, in_float64, tree_from_rows
 
 MAX_CELLS = 65_536
 """The most cells that a grid may have: far more than any scene needs, few enough to fit in memory."""
@@ -53,8 +52,7 @@ def build_kd(points: Float[Tensor, "n 3"], num_blocks: int) -> BlockTree:
     if num_blocks < 1:
         raise ValueError(f"cannot build {num_blocks} blocks: ask for 1 or more")
     _check_finite(points)
-    everything = Box(torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double())
-    return _flatten(_kd_node(in_float64(points).cpu(), everything, num_blocks))
+    return _flatten(_kd_node(in_float64(points).cpu(), EVERYWHERE, num_blocks))
 
 
 def build_grid(points: Float[Tensor, "n 3"], counts: tuple[int, int, int]) -> BlockTree:

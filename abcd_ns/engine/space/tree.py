@@ -37,6 +37,9 @@ class Box:
         return Box(self.lower - margin, self.upper + margin)
 
 
+EVERYWHERE = Box(torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double())
+
+
 @dataclass(frozen=True, eq=False)
 class BlockTree:
     """A k-d tree over all of R^3 with one block at each leaf; all tensors live on the CPU.

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, Seen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.space.culling import BOUNDS_SLANT, EVERYWHERE, Frusta, Optics, bounds_of, intersection
+from abcd_ns.engine.space.culling import BOUNDS_SLANT, Frusta, Optics, bounds_of, intersection
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.space.tree import EVERYWHERE, Box
 from abcd_ns.engine.space.visibility import DRAWN_SIGMAS
 from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians
