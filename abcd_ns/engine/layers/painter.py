@@ -11,7 +11,6 @@ from functools import partial
 from typing import Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
@@ -19,7 +18,7 @@ from abcd_ns.engine.render import CutShot, Rasterizer, ZWindow
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.culling import Frusta, Optics, intersection
 from abcd_ns.engine.space.intervals import ray_interval
-from abcd_ns.engine.space.ordering import front_to_back, node_children_in_order
+from abcd_ns.engine.space.ordering import node_children_in_order, nodes_in_order
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.space.visibility import reaches
 from abcd_ns.engine.store.scene import BlockScene
@@ -219,7 +218,7 @@ class Painter:
     def order(self, units: Sequence[int], view: View) -> tuple[int, ...]:
         """The units front to back, as `view` sees them."""
         wanted, center = set(units), view.center.double().cpu()
-        return tuple(node for node in self._walk(0, center) if node in wanted)
+        return tuple(node for node in nodes_in_order(self.tree, center) if node in wanted)
 
     def fold_up(self, parts: dict[int, FrozenLayers | None], unit: int, view: View) -> None:
         """Collapse what has come in with `unit` and its neighbours in the tree, in place, as far as it goes.
@@ -291,15 +290,8 @@ class Painter:
         yield from self._descend(int(self.tree.left[node]), exclude)
         yield from self._descend(int(self.tree.right[node]), exclude)
 
-    def _walk(self, node: int, center: Float[Tensor, "3"]) -> Iterator[int]:
-        yield node
-        if int(self.tree.block[node]) < 0:
-            for child in node_children_in_order(self.tree, node, center):
-                yield from self._walk(child, center)
-
     def _is_in_front(self, unit: int, active: int, view: View) -> bool:
-        order = front_to_back(self.tree, view.center.double().cpu())
-        return order.index(self.tree.leaves(unit)[0]) < order.index(active)
+        return self.order((unit, self.tree.node_of(active)), view)[0] == unit
 
 
 def _over(front: FrozenLayers | None, behind: FrozenLayers | None) -> FrozenLayers | None:

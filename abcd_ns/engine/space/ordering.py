@@ -6,6 +6,8 @@ tree there is one order for the whole image. Sorting cells by the depth of their
 guarantee. (Fuchs, Kedem and Naylor 1980, "On visible surface generation by a priori tree structures".)
 """
 
+from collections.abc import Iterator
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -28,14 +30,19 @@ def node_children_in_order(tree: BlockTree, node: int, center: Float[Tensor, "3"
     return (left, right) if float(center[axis]) < float(tree.threshold[node]) else (right, left)
 
 
-def front_to_back(tree: BlockTree, center: Float[Tensor, "3"]) -> tuple[int, ...]:
-    """All blocks, nearest first, as seen from the camera centre (world space)."""
-    order, stack = [], [0]
+def nodes_in_order(tree: BlockTree, center: Float[Tensor, "3"]) -> Iterator[int]:
+    """All nodes as seen from the camera centre (world space): each before what is under it, and all that is
+    under the nearer of two children before the other one."""
+    stack = [0]
     while stack:
         node = stack.pop()
-        if int(tree.axis[node]) < 0:
-            order.append(int(tree.block[node]))
-        else:
+        yield node
+        if int(tree.axis[node]) >= 0:
             near, far = node_children_in_order(tree, node, center)
             stack += [far, near]
-    return tuple(order)
+
+
+def front_to_back(tree: BlockTree, center: Float[Tensor, "3"]) -> tuple[int, ...]:
+    """All blocks, nearest first, as seen from the camera centre (world space)."""
+    blocks = (int(tree.block[node]) for node in nodes_in_order(tree, center))
+    return tuple(block for block in blocks if block >= 0)
