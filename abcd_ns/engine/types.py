@@ -145,9 +145,13 @@ class View:
         """The same camera with pixels `by` times as wide; a last column or row that is not whole goes."""
         if by == 1:
             return self
-        size = {"width": self.width // by, "height": self.height // by}
-        scale = self.K.new_tensor([[1 / by], [1 / by], [1.0]])
-        return replace(self, K=self.K * scale, reduction=self.reduction * by, **size)
+        smaller = self.resized(1 / by, self.width // by, self.height // by)
+        return replace(smaller, reduction=self.reduction * by)
+
+    def resized(self, times: float, width: int, height: int) -> "View":
+        """The same camera with an image of this size, in which everything is so many times as large."""
+        scale = self.K.new_tensor([[times], [times], [1.0]])
+        return replace(self, K=self.K * scale, width=width, height=height)
 
     def to(self, *args, **kwargs) -> "View":
         """As Tensor.to, for both matrices."""

@@ -59,7 +59,7 @@ class Case:
 
     def shots(self, rasterizer: Rasterizer, frozen: Gaussians, view: View) -> list[Shot]:
         """What is to be drawn."""
-        views = [_resized(view, size) for size in self.sizes]
+        views = [view.resized(k, round(k * view.width), round(k * view.height)) for k in self.sizes]
         options = {"sh_degree": self.sh_degree, "antialiased": self.antialiased}
         seen = [rasterizer.project(frozen, each, **options) if self.frozen else None for each in views]
         crops = [self.crop or each.full for each in views]
@@ -86,11 +86,6 @@ def _window(rasterizer: Rasterizer, crop: Crop, device: torch.device) -> ZWindow
     tile = torch.arange(grid.tiles, device=device, dtype=torch.float32)
     near = 3.6 + torch.sin(2.3 * tile)
     return ZWindow(grid, near, near + 1.1 + torch.sin(1.7 * tile + 1))
-
-
-def _resized(view: View, times: float) -> View:
-    scale = view.K.new_tensor([[times], [times], [1.0]])
-    return replace(view, K=view.K * scale, width=round(times * view.width), height=round(times * view.height))
 
 
 def _loss(raster: Raster) -> Float[Tensor, ""]:

@@ -176,8 +176,7 @@ def overlap(influence: Influence, block: int, others: Iterable[int]) -> float:
 
 def coarser(view: View, times: int) -> View:
     """The same camera with an image that is `times` smaller, rounded up to whole pixels."""
-    scale = view.K.new_tensor([[1 / times], [1 / times], [1.0]])
-    return replace(view, K=view.K * scale, width=-(-view.width // times), height=-(-view.height // times))
+    return view.resized(1 / times, -(-view.width // times), -(-view.height // times))
 
 
 def worth_training(views: Mapping[int, float], share: float) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -90,8 +90,7 @@ class World(ABC):
 
     def photo(self, view: View, fine: int = 2) -> Float[Tensor, "h w 3"]:
         """The picture: the mean of `fine` x `fine` rays in each pixel."""
-        scale = view.K.new_tensor([[fine], [fine], [1.0]])
-        larger = replace(view, K=view.K * scale, width=fine * view.width, height=fine * view.height)
+        larger = view.resized(float(fine), fine * view.width, fine * view.height)
         rows, bands = max(1, RAYS_AT_ONCE // (fine * larger.width)), []
         for top in range(0, view.height, rows):
             height = fine * min(rows, view.height - top)
