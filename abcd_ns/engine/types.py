@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Integer
+from jaxtyping import Bool, Float, Integer
 from torch import Tensor
 
 PARAM_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
@@ -140,6 +140,13 @@ class View:
     def center(self) -> Float[Tensor, "3"]:
         """The camera's centre in world space: -R^T t."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def depths_of(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
+        """Camera z of points, world units, and which of them are in the image, beyond the near plane."""
+        matrix, K = self.viewmat.to(points), self.K.to(points)
+        x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).unbind(1)
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        return z, (z > self.near) & (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
     def reduced(self, by: int) -> "View":
         """The same camera with pixels `by` times as wide; a last column or row that is not whole goes."""

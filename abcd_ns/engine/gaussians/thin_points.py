@@ -50,9 +50,7 @@ def finest_pixel(points: Float[Tensor, "n 3"], views: Sequence[View]) -> Float[T
     none does."""
     finest = points.new_full((len(points),), torch.inf, dtype=torch.float64)
     for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
-        matrix, K = view.viewmat.to(points), view.K.to(points)
-        x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).unbind(1)
-        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        seen = (z > view.near) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
-        finest = torch.where(seen, torch.minimum(finest, (z / K[0, 0]).double()), finest)
+        z, seen = view.depths_of(points)
+        pixel = (z / view.K[0, 0].to(points)).double()
+        finest = torch.where(seen, torch.minimum(finest, pixel), finest)
     return finest

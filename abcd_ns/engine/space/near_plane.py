@@ -26,6 +26,7 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
 
     Args:
         points: of the sparse reconstruction, world units.
+        views: what is nearer than their own near planes is not looked at.
 
     Returns:
         Camera z, world units; gsplat's own where there is nothing to tell by, and never less.
@@ -37,9 +38,6 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
 
 
 def _nearest(points: Float[Tensor, "n 3"], view: View) -> float | None:
-    matrix, K = view.viewmat.to(points), view.K.to(points)
-    x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).unbind(1)
-    ahead = z > NEAR_PLANE
-    u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-    seen = z[ahead & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)]
-    return float(torch.quantile(seen, OUTLIERS)) if len(seen) else None
+    depths, seen = view.depths_of(points)
+    depths = depths[seen]
+    return float(torch.quantile(depths, OUTLIERS)) if len(depths) else None
