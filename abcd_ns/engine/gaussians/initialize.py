@@ -64,8 +64,15 @@ def gaussians_from_points(
 
 
 def spacing(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """The mean distance of each point to its three nearest others; never 0."""
-    return torch.from_numpy(_neighbour_distance(points.double().numpy())).to(points.dtype)
+    """The mean distance of each point to its three nearest others; never 0: equal points get the smallest
+    positive distance there is."""
+    if len(points) < 2:
+        return points.new_ones(len(points))
+    places = points.double().numpy()
+    distance = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[0][:, 1:].mean(axis=1)
+    positive = distance[distance > 0]
+    least = positive.min() if len(positive) else 1.0
+    return torch.from_numpy(np.maximum(distance, least)).to(points.dtype)
 
 
 def split_off(gaussians: Gaussians, keep: int, seed: int) -> tuple[Gaussians, Gaussians]:
@@ -96,19 +103,6 @@ def random_points(count: int, extent: float, seed: int = 0) -> tuple[Tensor, Ten
     generator = torch.Generator().manual_seed(seed)
     points = (torch.rand((count, 3), generator=generator) - 0.5) * extent
     return points, torch.rand((count, 3), generator=generator) * 255
-
-
-def _neighbour_distance(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:
-    """[n] mean distance to the nearest others; equal points get the smallest positive distance there is."""
-    count = len(points)
-    if count < 2:
-        return np.ones(count)
-    k = min(neighbours, count - 1) + 1
-    distance = cKDTree(points).query(points, k=k)[0][:, 1:].mean(axis=1)
-    positive = distance[distance > 0]
-    if len(positive) == 0:
-        return np.ones(count)
-    return np.maximum(distance, positive.min())
 
 
 def _random_quats(count: int, generator: torch.Generator) -> Tensor:
