@@ -52,7 +52,7 @@ class Kernel:
     def __call__(self, *tensors: Tensor, built: bool = True) -> tuple[Tensor, ...]:
         """Run, from machine code if that is wanted, there, and suits the tensors."""
         if built and self.suits(*tensors):
-            return self.load()(*tensors)
+            return _load(self)(*tensors)
         return self.function(*tensors)
 
     def suits(self, *tensors: Tensor) -> bool:
@@ -71,11 +71,7 @@ class Kernel:
     @property
     def is_built(self) -> bool:
         """Whether machine code is there for this machine."""
-        return self.load() is not None
-
-    def load(self) -> Run | None:
-        """The machine code, or None. A file that cannot be loaded counts as none, with a warning."""
-        return _load(self)
+        return _load(self) is not None
 
     @property
     def path(self) -> Path:
@@ -106,6 +102,7 @@ def _is_plain(tensor: Tensor) -> bool:
 
 @functools.cache
 def _load(kernel: Kernel) -> Run | None:
+    """The machine code, or None. A file that cannot be loaded counts as none, with a warning."""
     path = kernel.path
     if not path.is_file():
         return None
