@@ -82,9 +82,9 @@ def count(rasterizer: TorchRasterizer, own: Gaussians, samples: tuple[Sample, ..
     for sample in samples:
         grid = TileGrid(sample.crop, rasterizer.tile_side)
         counts.own += bin_splats(rasterizer.project(own, sample.view), grid, rasterizer.chunk).fragments
-        if sample.interleaved is not None:
+        if sample.layers is not None and sample.layers.inside is not None:
             counts.frozen += bin_splats(
-                sample.interleaved, grid, rasterizer.chunk, window=sample.window
+                sample.layers.inside, grid, rasterizer.chunk, window=sample.window
             ).fragments
 
 

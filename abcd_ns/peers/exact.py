@@ -105,7 +105,7 @@ class ExactTrainer(Trainer):
             behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
             crop = part_to_draw(self.config, view.full, step, place)
             share = crop.pixels / view.full.pixels
-            samples.append(Sample(view, crop, None, None, None, behind, share))
+            samples.append(Sample(view, crop, None, None, behind, share))
         return Batch(step, tuple(samples))
 
     def render(self, batch: Batch) -> Rendered:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -10,7 +10,6 @@ from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
 from abcd_ns.engine.layers.painter import FrozenLayers, Loaded, Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Rasterizer, ZWindow
-from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.visibility import footprint
 from abcd_ns.engine.store.special_blocks import BlockName
@@ -49,18 +48,6 @@ def survey(gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: 
         for view, extent in zip(views, extents, strict=True)
     }
     return VisitGeometry(block, {view: crop for view, crop in crops.items() if crop is not None})
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What one training view sees around the active block."""
-
-    layers: FrozenLayers
-    """F (front) and B (back), for the view's crop."""
-    interleaved: Splats | None
-    """Frozen Gaussians to be sorted in with the active ones, as this view sees them."""
-    window: ZWindow | None
-    """Where the fragments of `interleaved` count; None by means."""
 
 
 class VisitLayers:
@@ -152,20 +139,18 @@ class VisitLayers:
         """Whether this very view is drawn, from where it was when the visit began."""
         return self._views[view.index].viewmat is view.viewmat
 
-    def around(self, view: int, crop: Crop | None = None) -> Surroundings:
-        """What `view` sees around the active block, in a part of the visit's crop or in all of it."""
+    def around(self, view: int, crop: Crop | None = None) -> tuple[FrozenLayers, ZWindow | None]:
+        """What `view` sees around the active block, in a part of the visit's crop or in all of it: F, B and
+        what is to be sorted in; and the window in which fragments of that count, None by means."""
         whole = self._geometry.crops[view]
         kept = self._store.get(view)
         if kept is None:  # there was no room for it, or nobody knew that it would be asked for
             ((_, kept),) = self._draw([view])
         part = crop or whole
         layers = kept.layers[(slice(None), *part.within(whole).slices)]
-        window = self._window(view)
-        return Surroundings(
-            unpacked(layers.to(self._views[view].viewmat.dtype)),
-            kept.interleaved,
-            window and window.on(TileGrid(part, window.grid.side)),
-        )
+        layers, window = unpacked(layers.to(self._views[view].viewmat.dtype)), self._window(view)
+        window = window and window.on(TileGrid(part, window.grid.side))
+        return replace(layers, inside=kept.interleaved), window
 
     @property
     def frozen(self) -> int:

@@ -90,7 +90,7 @@ def test_the_loss_of_parts_is_on_average_that_of_the_whole(background, pixel_los
     photo = torch.full_like(picture, background)
 
     def loss(part: Crop) -> torch.Tensor:
-        sample = Sample(view, part, None, None, None, photo[0, 0], share=part.pixels / crop.pixels)
+        sample = Sample(view, part, None, None, photo[0, 0], share=part.pixels / crop.pixels)
         place = part.within(crop).slices
         return sample.loss(picture[place], photo[place], config)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from abcd_ns.engine.layers.compositing import empty_layer
 from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.z_window import ZWindow
@@ -33,7 +34,7 @@ DRAW = TorchRasterizer(primitive="2dgs")
 
 
 def sample_of(crop: Crop = VIEW.full, view: View = VIEW, **parts) -> Sample:
-    given = {"layers": None, "interleaved": None, "window": None, "background": torch.zeros(3), **parts}
+    given = {"layers": None, "window": None, "background": torch.zeros(3), **parts}
     return Sample(view, crop, **given)
 
 
@@ -102,7 +103,8 @@ def test_a_block_among_others_has_what_it_has_in_the_whole_scene():
     whole, leaves = as_leaves(SCENE), as_leaves(own)
     expected = normal_consistency(whole, [sample_of()], DRAW)
     window = ZWindow.everything(DRAW.window_grid(VIEW.full), torch.device("cpu"), torch.float64)
-    given = sample_of(interleaved=DRAW.project(other, VIEW), window=window)
+    nothing = empty_layer(VIEW.height, VIEW.width, dtype=torch.float64)
+    given = sample_of(layers=FrozenLayers(nothing, nothing, DRAW.project(other, VIEW)), window=window)
     found = normal_consistency(leaves, [given], DRAW)
     torch.testing.assert_close(found, expected)
     (found + expected).backward()

@@ -147,8 +147,8 @@ def test_poses_stay_through_a_visit_and_its_layers_show_them(make, photos):
         if made.state.active is not None:
             assert torch.equal(poses_of(made.run), seen[-1])
             layers, view = made.visit.steps.layers, made.state.active.views[0]
-            kept = layers.around(view).layers.front
-            fresh = made.source.draw(made.state.active, [view]).around(view).layers.front
+            kept = layers.around(view)[0].front
+            fresh = made.source.draw(made.state.active, [view]).around(view)[0].front
             assert torch.equal(kept.color, fresh.color)
     assert sum(not torch.equal(a, b) for a, b in pairwise(seen)) > 1
 

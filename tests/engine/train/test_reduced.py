@@ -20,7 +20,7 @@ def small_pictures(monkeypatch):
 
 
 def sample_of(view: View, crop: Crop) -> Sample:
-    return Sample(view, crop, None, None, None, torch.zeros(3))
+    return Sample(view, crop, None, None, torch.zeros(3))
 
 
 def test_pictures_grow_by_share_and_never_become_too_small():

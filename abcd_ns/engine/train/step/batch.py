@@ -14,7 +14,6 @@ from abcd_ns.engine.layers.compositing import composite, sandwich
 from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
-from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.capture.light import Use, lit
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.step.cutouts import random_part
@@ -34,8 +33,9 @@ class Sample:
     view: View
     crop: Crop
     layers: FrozenLayers | None
-    interleaved: Splats | None
+    """What is frozen around the block, if anything is."""
     window: ZWindow | None
+    """Where fragments of what is frozen inside count; None for everywhere."""
     background: Float[Tensor, "3"]
     share: float = 1.0
     """Of the pixels that might have been drawn in this step, those that are: the crop's."""
@@ -48,7 +48,8 @@ class Sample:
     @property
     def shot(self) -> Shot:
         """What the rasterizer is to draw."""
-        return Shot(self.view, self.crop, self.interleaved, None if self.interleaved is None else self.window)
+        inside = None if self.layers is None else self.layers.inside
+        return Shot(self.view, self.crop, inside, None if inside is None else self.window)
 
     @property
     def source(self) -> Crop:

@@ -133,15 +133,8 @@ class StepDrawing:
     def _sample_of(self, view: View, crop: Crop, place: int, step: int) -> Sample:
         if self.layers and not self.layers.shows(view):
             raise RuntimeError(f"View {view.index} has moved since its layers were drawn.")
-        around = self.layers.around(view.index, crop) if self.layers else None
-        return Sample(
-            view=view,
-            crop=crop,
-            layers=around and around.layers,
-            interleaved=around and around.interleaved,
-            window=around and around.window,
-            background=self._backgrounds.at(step, place),
-        )
+        layers, window = self.layers.around(view.index, crop) if self.layers else (None, None)
+        return Sample(view, crop, layers, window, self._backgrounds.at(step, place))
 
     def _draw(self, gaussians: Gaussians, samples: Sequence[Sample], sh_degree: int) -> Rendered:
         run = self._run

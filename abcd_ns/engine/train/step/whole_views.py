@@ -64,7 +64,7 @@ class WholeViews:
 
     def beside(self, view: View, shown: Float[Tensor, "h w 3"]) -> Beside:
         """A picture on black beside the view's photo."""
-        sample = Sample(view, view.full, None, None, None, shown.new_zeros(3))
+        sample = Sample(view, view.full, None, None, shown.new_zeros(3))
         photo, counts = self._target(sample)
         light = self._run.light
         seen = shown if light is None else lit(shown, light.of(view.index).detach(), view.full, view)
