@@ -11,6 +11,7 @@ from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded,
 from abcd_ns.engine.layers.painter import FrozenLayers, Loaded, Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.space.visibility import footprint
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -101,23 +102,13 @@ class VisitLayers:
                 f"The layers around block {block} have NaN or infinite pixels; another block has diverged."
             )
 
-    def _groups(self, views: Sequence[int]) -> Iterator[Sequence[int]]:
+    def _groups(self, views: Sequence[int]) -> Iterable[Sequence[int]]:
         """Views that are drawn together: as many as there is room for what their units are folded from."""
         if len(self._units) == 1:
-            yield views
-            return
+            return [views]
         levels = max(map(self._painter.depth_of, self._units), default=0) + 1
-        group: list[int] = []
-        room = PARTS_BYTES
-        for view in views:
-            crop = self._geometry.crops[view]
-            room -= levels * BYTES_PER_PIXEL * crop.pixels
-            if group and room < 0:
-                yield group
-                group, room = [], PARTS_BYTES - levels * BYTES_PER_PIXEL * crop.pixels
-            group.append(view)
-        if group:
-            yield group
+        crops = [self._geometry.crops[view] for view in views]
+        return runs(views, crops, PARTS_BYTES // (levels * BYTES_PER_PIXEL))
 
     def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
         """All units one after the other, each for all of these views: the device holds one at a time."""

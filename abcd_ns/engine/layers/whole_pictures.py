@@ -17,6 +17,7 @@ from torch import Tensor
 from abcd_ns.engine.layers.compositing import empty_layer, fold, sandwich
 from abcd_ns.engine.layers.painter import Loaded, Painter, PaintSettings
 from abcd_ns.engine.render import Raster, Shot
+from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.types import Layer, View
 
 LAYERS_BYTES = 256 << 20
@@ -54,15 +55,8 @@ class WholePictures:
 
     def groups(self, views: Sequence[View]) -> list[list[View]]:
         """Views whose layers have room at the same time: each group reads the scene twice."""
-        groups, room = [], 0
-        for view in views:
-            needed = len(self._units) * BYTES_PER_PIXEL * view.full.pixels
-            if not groups or needed > room:
-                groups.append([])
-                room = LAYERS_BYTES
-            groups[-1].append(view)
-            room -= needed
-        return groups
+        pixels = LAYERS_BYTES // (len(self._units) * BYTES_PER_PIXEL)
+        return list(runs(views, [view.full for view in views], pixels))
 
     @torch.no_grad()
     def draw(self, views: Sequence[View]) -> Iterator[WholePicture]:

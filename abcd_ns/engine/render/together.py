@@ -13,16 +13,18 @@ DEVICE_PIXELS, DEVICE_SPLATS = 1 << 21, 400_000
 def runs(
     items: Sequence[Item],
     crops: Sequence[Crop],
-    gaussians: int,
     pixels: int,
-    splats: int,
+    *,
+    gaussians: int = 0,
+    splats: int = 0,
     kinds: Sequence[Hashable] | None = None,
 ) -> Iterator[list[Item]]:
     """The items, a crop each, in runs of neighbours of one kind.
 
     Args:
-        gaussians: that are drawn in each crop.
-        pixels, splats: most of a run of more than one.
+        pixels: most of a run of more than one.
+        gaussians: that are drawn in each crop, if they are limited, too.
+        splats: most of these in all crops of a run of more than one.
         kinds: of each item; None if they are all alike.
     """
     run: list[Item] = []

@@ -148,7 +148,7 @@ class TorchRasterizer(Rasterizer):
     ) -> Iterator[Cut]:
         """See Rasterizer.cuts. Each view is projected and binned once, and a few are drawn in one pass."""
         crops = [shot.crop for shot in shots]
-        for few in runs(shots, crops, len(gaussians), PIXELS_AT_ONCE, SPLATS_AT_ONCE):
+        for few in runs(shots, crops, PIXELS_AT_ONCE, gaussians=len(gaussians), splats=SPLATS_AT_ONCE):
             yield from self._cut_together(gaussians, few, sh_degree, antialiased)
 
     def _cut_together(
@@ -177,7 +177,7 @@ class TorchRasterizer(Rasterizer):
     ) -> Iterator[ZWindow]:
         """See Rasterizer.depth_windows. A few views are drawn in one pass."""
         crops = [crop for _, crop in seen]
-        for few in runs(seen, crops, len(gaussians), PIXELS_AT_ONCE, SPLATS_AT_ONCE):
+        for few in runs(seen, crops, PIXELS_AT_ONCE, gaussians=len(gaussians), splats=SPLATS_AT_ONCE):
             yield from self._windows_together(gaussians, few, visible, antialiased)
 
     def _windows_together(

@@ -173,7 +173,8 @@ def _a_few(
 ) -> Iterator[list[Item]]:
     kinds = [(view.width, view.height, view.near) for view, _ in seen]
     crops = [crop for _, crop in seen]
-    return runs(items, crops, len(gaussians), DEVICE_PIXELS, DEVICE_SPLATS, kinds)
+    limits = {"gaussians": len(gaussians), "splats": DEVICE_SPLATS}
+    return runs(items, crops, DEVICE_PIXELS, **limits, kinds=kinds)
 
 
 Seen = TypeVar("Seen", Projected, Packed)
