@@ -245,6 +245,10 @@ class StoredScene(VisitScene):
         """Whether all blocks are live, and `count` is right in sum alone."""
         return self._live is not None and self._live[0] is None
 
+    def _is_live(self, block: int) -> bool:
+        """Whether the block is, or all of them are."""
+        return self._live is not None and self._live[0] in (None, block)
+
     def has(self, name: BlockName) -> bool:
         """Whether there is such a block, or anything under such a special name."""
         return name in self._unsaved or name in self.store.blocks
@@ -268,15 +272,19 @@ class StoredScene(VisitScene):
 
     def state(self, name: BlockName) -> BlockState:
         """A block, or what is kept under a special name, at rest and whole, without its mail."""
-        return BlockState.unpacked(self._whole(name))
+        return BlockState.unpacked(self._packed(name, whole=True))
 
-    def _whole(self, name: BlockName) -> Packed:
+    def _packed(self, name: BlockName, *, whole: bool) -> Packed:
+        """What is at rest under a name, or what others draw of it; in RAM from now on."""
         with self._writer.lock:
             if name in self._unsaved:
                 return self._unsaved[name]
-            found = self._memory.whole(name)
+            found = self._memory.whole(name) if whole else self._memory.drawn(name)
             if found is None:
-                found = Packed(*self.store.load(name))
+                if whole:
+                    found = Packed(*self.store.load(name))
+                else:
+                    found = Packed(self.store.load_names(name, DRAWN), self.store.meta(name))
                 self._memory.put(name, found)
                 self._memory.shrink(self.unsaved_bytes)
             return found
@@ -291,24 +299,22 @@ class StoredScene(VisitScene):
         """Have `state` of a block at hand soon; returns at once."""
         with self._writer.lock:
             if block not in self._unsaved and self._memory.whole(block) is None:
-                self._writer.do(partial(self._whole, block))
+                self._writer.do(partial(self._packed, block, whole=True))
 
     def gaussians(self, block: int) -> Gaussians:
-        if self._live is not None and self._live[0] is None:
-            everything = self._live[1]().detach()
-            return everything[self.tree.assign(everything.means) == block]
-        if self._live is not None and self._live[0] == block:
-            return self._live[1]().detach()
-        return self._seen_at_rest(block, "cpu", None)
+        if not self._is_live(block):
+            return self._seen_at_rest(block, "cpu", None)
+        live = self._live[1]().detach()
+        return live[self.tree.assign(live.means) == block] if self.is_live_as_a_whole else live
 
     def drawn(self, block: int, device: torch.device | str, which: Which | None = None) -> Gaussians:
         """As for any scene; what is at rest is cut while it is packed, and unpacked on the device."""
-        if self._live is not None and self._live[0] in (None, block):
+        if self._is_live(block):
             return super().drawn(block, device, which)
         return self._seen_at_rest(block, device, which)
 
     def _seen_at_rest(self, block: int, device: torch.device | str, which: Which | None) -> Gaussians:
-        packed, mail = self._drawn(block), self.mail(block)
+        packed, mail = self._packed(block, whole=False), self.mail(block)
         rows = ~packed.tensors[WAITS]  # they are not to be seen before the block's next visit
         if which is not None:
             rows &= which(packed.tensors["means"], packed.tensors["scales"])
@@ -324,18 +330,7 @@ class StoredScene(VisitScene):
 
     def stored(self, name: BlockName) -> Gaussians:
         """What is at rest under a name, without mail; those included who wait for the block's next visit."""
-        return self._drawn(name).gaussians()
-
-    def _drawn(self, name: BlockName) -> Packed:
-        with self._writer.lock:
-            if name in self._unsaved:
-                return self._unsaved[name]
-            found = self._memory.drawn(name)
-            if found is None:
-                found = Packed(self.store.load_names(name, DRAWN), self.store.meta(name))
-                self._memory.put(name, found)
-                self._memory.shrink(self.unsaved_bytes)
-            return found
+        return self._packed(name, whole=False).gaussians()
 
     @property
     def unsaved_bytes(self) -> int:
@@ -353,12 +348,10 @@ class StoredScene(VisitScene):
         return self._versions.get(block, 0)
 
     def count(self, block: int) -> int:
-        if self._live is not None and self._live[0] is None:
-            # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
-            return len(self._live[1]()) if block == 0 else 0
-        if self._live is not None and self._live[0] == block:
-            return len(self._live[1]())
-        return self.rows(block) + len(self.mail(block) or ())
+        if not self._is_live(block):
+            return self.rows(block) + len(self.mail(block) or ())
+        # Right in sum. Who lives where changes with every step, and is too dear to ask that often.
+        return 0 if self.is_live_as_a_whole and block > 0 else len(self._live[1]())
 
     def parameters(self) -> int:
         """Of how many numbers all Gaussians are, what is live included; harmonics count up to the degree of
@@ -375,7 +368,7 @@ class StoredScene(VisitScene):
         return counted
 
     def bounds(self, block: int) -> Box | None:
-        if self._live is not None and self._live[0] in (None, block):
+        if self._is_live(block):
             return bounds_of(self.gaussians(block))
         version = self.version(block)
         if block not in self._bounds or self._bounds[block][0] != version:
