@@ -107,16 +107,6 @@ def _walk_group(
     return final
 
 
-def _composite(
-    job: Job, table: Tensor, origins: Float[Tensor, "2 a"], keep_states: bool
-) -> tuple[Float[Tensor, "5 p a"], list[_Drawn]]:
-    """Draw all levels. Returns the final state of every tile and, if kept, what was drawn."""
-    trace = list[_Drawn]()
-    # Not a closure: where shapes are checked, the checks of one are made anew at every drawing.
-    draw = partial(_draw_level, job, table, origins, trace if keep_states else None)
-    return _walk(job.lists, _initial_state(job.lists, table.dtype), draw), trace
-
-
 def _draw_level(
     job: Job,
     table: Tensor,
@@ -145,7 +135,10 @@ class Composite(torch.autograd.Function):
     def forward(ctx: Any, drawn: Float[Tensor, "d m"], job: Job) -> Float[Tensor, "5 p t"]:
         lists, sheet = job.lists, job.lists.sheet
         table, origins = _table(drawn, job)
-        final, trace = _composite(job, table, origins, keep_states=any(ctx.needs_input_grad))
+        trace = list[_Drawn]()
+        # Not a closure: where shapes are checked, the checks of one are made anew at every drawing.
+        draw = partial(_draw_level, job, table, origins, trace if any(ctx.needs_input_grad) else None)
+        final = _walk(lists, _initial_state(lists, table.dtype), draw)
         planes = final.new_zeros((STATE_PLANES, sheet.pixels_per_tile, sheet.tiles))
         planes[0] = 1.0
         planes.index_copy_(2, lists.tiles, torch.cat((final[:1].abs(), final[1:])))
