@@ -58,6 +58,16 @@ class ZWindow:
         return ZWindow(grid, self.near.index_select(0, tile), self.far.index_select(0, tile))
 
 
+def ends_of(window: ZWindow | None, grid: TileGrid, like: Tensor) -> Float[Tensor, "2 t"]:
+    """(near, far) of a window in the tiles of a grid, see ZWindow.on; None masks nothing.
+
+    Args:
+        like: has the dtype and device for None.
+    """
+    found = ZWindow.everything(grid, like.device, like.dtype) if window is None else window.on(grid)
+    return torch.stack((found.near, found.far))
+
+
 @torch.no_grad()
 def showing(
     pixels: Int[Tensor, "c t"],

@@ -19,7 +19,7 @@ from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.splat_kernels import DEPTH, TILE_COLUMNS
 from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
-from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.render.z_window import ZWindow, ends_of
 
 SHRINK = 0.875
 """A level is narrowed once fewer than this share of its tiles still have Gaussians to draw."""
@@ -225,14 +225,9 @@ class Candidates:
         return self.rows.index_select(0, self.pairs.rank.unique_consecutive()).sort().values
 
     def _holds(self, windows: Sequence[ZWindow | None]) -> Bool[Tensor, "q"]:
-        everything = torch.tensor([-math.inf, math.inf]).to(self.depths)[:, None]
-        planes = []
-        for grid, window in zip(self.sheet.grids, windows, strict=True):
-            found = None if window is None else window.on(grid)
-            planes.append(
-                everything.expand(2, grid.tiles) if found is None else torch.stack((found.near, found.far))
-            )
-        near, far = torch.cat(planes, dim=1).index_select(1, self.pairs.tile)
+        pairs = zip(windows, self.sheet.grids, strict=True)
+        ends = [ends_of(window, grid, self.depths) for window, grid in pairs]
+        near, far = torch.cat(ends, dim=1).index_select(1, self.pairs.tile)
         return (self.z >= near) & (self.z < far)
 
 

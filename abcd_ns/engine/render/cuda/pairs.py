@@ -19,7 +19,7 @@ from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.render.z_window import ZWindow, showing
+from abcd_ns.engine.render.z_window import ZWindow, ends_of, showing
 from abcd_ns.engine.types import Crop, Layer
 
 TILE = 16
@@ -138,11 +138,8 @@ class Sheet:
 
     def spread(self, windows: Sequence[ZWindow | None], like: Tensor) -> Float[Tensor, "2 tiles"]:
         """(near, far) of each camera's window; the same numbers twice, so nothing, where it has no tile."""
-        spread = []
-        for grid, window in zip(self.grids, windows, strict=True):
-            window = window or ZWindow.everything(grid, like.device, like.dtype)
-            window = window.on(grid)
-            spread.append(self._padded(torch.stack((window.near, window.far)), grid))
+        pairs = zip(windows, self.grids, strict=True)
+        spread = [self._padded(ends_of(window, grid, like), grid) for window, grid in pairs]
         return torch.stack(spread, dim=1).view(2, -1)
 
     def _padded(self, values: Shaped[Tensor, "*v t"], grid: TileGrid) -> Shaped[Tensor, "*v tiles"]:
