@@ -24,7 +24,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from abcd_ns.engine.events import StepTaken
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
@@ -33,7 +33,7 @@ from abcd_ns.engine.space.culling import Optics
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.visibility import reaches
-from abcd_ns.engine.store.scaffold import join, split_by_block
+from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.train.density.control import DensityClock
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step

@@ -25,14 +25,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.tree import BlockTree, Box
-from abcd_ns.engine.store.scaffold import blocks_at_rest, join
+from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import BlockName, initial_of
 from abcd_ns.engine.train.coordinator import Coordinator

@@ -1,7 +1,7 @@
 """All that belongs to one block: its Gaussians, their Adam moments, growth statistics and clocks."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -81,20 +81,8 @@ class BlockState:
         return BlockState(gaussians, *moments, growth, self.clocks, change(self.waits))
 
     def joined_by(self, arrivals: "BlockState") -> "BlockState":
-        """This block with the Gaussians of `arrivals` added at the end, moments and statistics included.
-
-        The clocks stay this block's. A statistic which only one side has starts at zero for the other.
-        """
-        names = dict.fromkeys([*self.growth, *arrivals.growth])
-        growth = {name: torch.cat([_statistic(self, name), _statistic(arrivals, name)]) for name in names}
-        return BlockState(
-            Gaussians.cat([self.gaussians, arrivals.gaussians]),
-            Gaussians.cat([self.exp_avg, arrivals.exp_avg]),
-            Gaussians.cat([self.exp_avg_sq, arrivals.exp_avg_sq]),
-            growth,
-            self.clocks,
-            torch.cat([self.waits, arrivals.waits]),
-        )
+        """This block with the Gaussians of `arrivals` added at the end; see `join`."""
+        return join([self, arrivals])
 
     def forgetful(self) -> "BlockState":
         """As if no optimizer had ever seen it: zero moments and no statistics. The other clocks stay."""
@@ -124,6 +112,22 @@ class BlockState:
     def clocks_of(meta: dict[str, Any]) -> Clocks:
         """Those in the JSON of `packed`."""
         return Clocks(**meta["clocks"])
+
+
+def join(states: Sequence[BlockState]) -> BlockState:
+    """All in one, in order, moments and statistics included, under the clocks of the first; a single one is
+    itself. A statistic which only some have starts at zero for the others."""
+    if len(states) == 1:
+        return states[0]
+    names = dict.fromkeys(name for state in states for name in state.growth)
+    growth = {name: torch.cat([_statistic(state, name) for state in states]) for name in names}
+    return BlockState(
+        Gaussians.cat([state.gaussians for state in states]),
+        *(Gaussians.cat([getattr(state, moment) for state in states]) for moment in MOMENTS),
+        growth,
+        states[0].clocks,
+        torch.cat([state.waits for state in states]),
+    )
 
 
 def checksum(gaussians: Gaussians) -> str:

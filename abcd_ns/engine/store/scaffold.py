@@ -39,14 +39,6 @@ def split_by_block(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
     return {block: state[owner == block] for block in owner.unique().tolist()}
 
 
-def join(states: list[BlockState]) -> BlockState:
-    """All in one, in order, under the clocks of the first."""
-    joined = states[0]
-    for state in states[1:]:
-        joined = joined.joined_by(state)
-    return joined
-
-
 def blocks_at_rest(
     tree: BlockTree, gaussians: Gaussians, keep: int | None = None, seed: int = 0
 ) -> dict[BlockName, tuple[dict[str, Tensor], dict[str, Any]]]:

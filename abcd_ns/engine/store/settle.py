@@ -6,8 +6,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.store.scaffold import join, put_to_wait, split_by_block
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
+from abcd_ns.engine.store.scaffold import put_to_wait, split_by_block
 from abcd_ns.engine.store.scene import StoredScene, VisitScene
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE, RESERVE, WHOLE, BlockName
 
