@@ -35,9 +35,9 @@ def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int =
     return Crop(x, y, width, height)
 
 
-def reach_radius(scales: Float[Tensor, "n 3"], sigma: float = DRAWN_SIGMAS) -> Float[Tensor, "n"]:
-    """`sigma` standard deviations along each Gaussian's longest axis, world units; `scales` are logs."""
-    return sigma * scales.amax(dim=1).exp()
+def reach_radius(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """DRAWN_SIGMAS standard deviations along each Gaussian's longest axis, world units; `scales` are logs."""
+    return DRAWN_SIGMAS * scales.amax(dim=1).exp()
 
 
 def world_size(pixels: float, depths: Float[Tensor, "n"], view: View) -> Float[Tensor, "n"]:

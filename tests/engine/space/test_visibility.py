@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.render.extents import extents_of
-from abcd_ns.engine.render.primitive import SPLATS
+from abcd_ns.engine.render.primitive import DRAWN_SIGMAS, SPLATS
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions
 from abcd_ns.engine.space.tree import Box
@@ -148,7 +148,8 @@ def test_reach_is_measured_to_the_nearest_point_of_the_box():
     gaussians.means.copy_(torch.tensor([[0.5, 0.5, 0.5], [4.0, 5.0, 0.5], [-9.0, 0.5, 0.5]]))
     gaussians.scales.copy_(torch.log(torch.tensor([[0.1, 0.1, 0.1], [0.1, 1.0, 0.2], [1.0, 1.0, 1.0]])))
     box = Box(torch.zeros(3).double(), torch.ones(3).double())
-    assert reach_radius(gaussians.scales, sigma=3.0).tolist() == pytest.approx([0.3, 3.0, 3.0])
+    radii = [0.1 * DRAWN_SIGMAS, DRAWN_SIGMAS, DRAWN_SIGMAS]
+    assert reach_radius(gaussians.scales).tolist() == pytest.approx(radii)
     shapes = gaussians.means, gaussians.scales
     # Distances 0, 5 and 9.
     assert reaches(*shapes, box, slant=1.0).tolist() == [True, False, False]
