@@ -22,7 +22,6 @@ import tyro
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render import TorchRasterizer
-from abcd_ns.engine.render.cpu.binning import bin_splats
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.store.scene import MemoryScene
@@ -35,6 +34,7 @@ from abcd_ns.lab.stability.lab import Stage, merged
 from abcd_ns.lab.stability.scenarios.real import read_stage
 from benchmarks.runs import Asked, write_runs
 from benchmarks.visit import begin
+from tests.reference.rasterizer_scenes import bin_splats, fragments_in
 
 COUNTED = 10
 """Fragments are counted in one of so many steps."""
@@ -80,12 +80,12 @@ class Row:
 def count(rasterizer: TorchRasterizer, own: Gaussians, samples: tuple[Sample, ...], counts: Counts) -> None:
     """Add up the fragments that a step is about to draw."""
     for sample in samples:
-        grid = TileGrid(sample.crop, rasterizer.tile_side)
-        counts.own += bin_splats(rasterizer.project(own, sample.view), grid, rasterizer.chunk).fragments
-        if sample.layers is not None and sample.layers.inside is not None:
-            counts.frozen += bin_splats(
-                sample.layers.inside, grid, rasterizer.chunk, window=sample.window
-            ).fragments
+        grid, frozen = TileGrid(sample.crop, rasterizer.tile_side), sample.shot.frozen
+        seen = rasterizer.project(own, sample.view)
+        counts.own += fragments_in(bin_splats(seen, grid, rasterizer.chunk))
+        if frozen is not None:
+            lists = bin_splats(frozen, grid, rasterizer.chunk, window=sample.window)
+            counts.frozen += fragments_in(lists)
 
 
 def run(capture: Stage, side: int, seed: int, args: Args) -> Row:

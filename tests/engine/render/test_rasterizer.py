@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
 from abcd_ns.engine.render.cpu import binning
-from abcd_ns.engine.render.cpu.binning import bin_splats
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.reference.naive_rasterizer import naive_rasterize
 from tests.reference.rasterizer_scenes import (
     as_leaves,
+    bin_splats,
+    fragments_in,
     gradients,
     probe,
     project,
@@ -262,7 +263,7 @@ def test_lists_hold_every_fragment_and_few_others():
     )
     drawn = naive_rasterize(faint, VIEW, sh_degree=0).fragments
     lists = bin_splats(project(faint, VIEW), TileGrid(VIEW.full, 1), 4)
-    assert drawn <= lists.fragments <= 1.05 * drawn + 10  # with tiles of one pixel, lists are fragments
+    assert drawn <= fragments_in(lists) <= 1.05 * drawn + 10  # with tiles of one pixel, lists are fragments
 
 
 @pytest.mark.parametrize("with_frozen", [False, True])
@@ -325,7 +326,7 @@ def test_backward_keeps_little():
     gaussians = random_gaussians(300, sh_degree=0)
     changed = {"scales": gaussians.scales + 2, "opacities": torch.full_like(gaussians.opacities, -4.5)}
     wide = Gaussians(**{**dict(gaussians.items()), **changed})
-    fragments = bin_splats(project(wide, VIEW), TileGrid(VIEW.full, 4), 8).fragments
+    fragments = fragments_in(bin_splats(project(wide, VIEW), TileGrid(VIEW.full, 4), 8))
     saved = []
     with torch.autograd.graph.saved_tensors_hooks(lambda x: (saved.append(x.numel()), x)[1], lambda x: x):
         EAGER(as_leaves(wide), VIEW, sh_degree=0)

@@ -9,7 +9,6 @@ fragment is lost by that, and none is added.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,7 +17,7 @@ from torch import Tensor
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.render.splat_kernels import DEPTH, TILE_COLUMNS
-from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
+from abcd_ns.engine.render.tile_grid import TileSheet
 from abcd_ns.engine.render.z_window import ZWindow, ends_of
 
 SHRINK = 0.875
@@ -60,11 +59,6 @@ class TileLists:
     """Where each (Gaussian, tile) pair stands; the pairs of one Gaussian are neighbours, by rank."""
     bags: Int[Tensor, "m"]
     """Index of each rank's first pair in `slots`."""
-
-    @cached_property
-    def fragments(self) -> int:
-        """Pixel-Gaussian pairs that the lists hold: an upper bound of what is computed."""
-        return self.slots.numel() * self.sheet.pixels_per_tile
 
 
 @dataclass(frozen=True)
@@ -254,18 +248,3 @@ def find_candidates(
     spans, bands = spans.index_select(1, rows).long(), bands.index_select(1, rows)
     places = sheet.places(planes.device).index_select(1, grid_of.index_select(0, rows))
     return Candidates(sheet, rows, depths.values, _pairs(spans, bands, places, built))
-
-
-def bin_splats(
-    splats: Splats,
-    grid: TileGrid,
-    chunk: int,
-    *,
-    masked: Bool[Tensor, "n"] | None = None,
-    window: ZWindow | None = None,
-    built: bool = True,
-) -> TileLists:
-    """The lists of a single view: see Candidates.lists and Candidates.within."""
-    grid_of = torch.zeros(len(splats), dtype=torch.long, device=splats.planes.device)
-    candidates = find_candidates(splats, grid_of, TileSheet((grid,)), built=built)
-    return (candidates if window is None else candidates.within([window], masked)).lists(chunk)
