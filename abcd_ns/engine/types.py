@@ -179,7 +179,3 @@ class Layer:
     """Premultiplied linear colour; may exceed 1."""
     transmittance: Float[Tensor, "h w"]
     """The share of light from behind that passes: 1 - alpha."""
-
-    def __getitem__(self, part: Crop) -> "Layer":
-        """Some of its pixels, counted from its own upper left corner; shares memory."""
-        return Layer(self.color[part.slices], self.transmittance[part.slices])
