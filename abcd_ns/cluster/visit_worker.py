@@ -21,6 +21,7 @@ from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.train.training_loop import step_by
 from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians, View
 
@@ -160,7 +161,7 @@ class VisitWorker:
         return run
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
-        batch, optimizers = training.next_batch(), training.run.optimizers.values()
+        batch = training.next_batch()
         targets = [self._target(sample) for sample in batch.samples]
         rendered = training.render(batch)
         pictures, photos, wanted = [], [], []
@@ -170,11 +171,5 @@ class VisitWorker:
                 found = tuple(pixels * counts.to(picture.device) for pixels in found)
             for pixels, into in zip(found, (pictures, photos, wanted), strict=True):
                 into.append(pixels)
-        loss = training.loss(batch, pictures, wanted)
-        for optimizer in optimizers:
-            optimizer.zero_grad(set_to_none=True)
-        if loss.requires_grad:
-            loss.backward()
-        for optimizer in optimizers:
-            optimizer.step()
+        step_by(training.loss(batch, pictures, wanted), training.run.optimizers)
         training.after_step(rendered, psnrs(pictures, photos))

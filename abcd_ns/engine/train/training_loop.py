@@ -5,6 +5,7 @@ from collections.abc import Callable
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.gaussians.param_swap import Optimizers
 from abcd_ns.engine.render.loss import psnrs
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop
@@ -32,11 +33,15 @@ def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
     read = (sample.reduced(photo(sample.view.index, sample.source)) for sample in batch.samples)
     photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
     rendered = coordinator.render(batch)
-    loss = coordinator.loss(batch, rendered.pictures, photos)
-    for optimizer in coordinator.optimizers.values():
+    step_by(coordinator.loss(batch, rendered.pictures, photos), coordinator.optimizers)
+    coordinator.after_step(rendered, psnrs(rendered.pictures, photos))
+
+
+def step_by(loss: Float[Tensor, ""], optimizers: Optimizers) -> None:
+    """Take a loss' gradient, if it has one, and step every optimizer."""
+    for optimizer in optimizers.values():
         optimizer.zero_grad(set_to_none=True)
     if loss.requires_grad:
         loss.backward()
-    for optimizer in coordinator.optimizers.values():
+    for optimizer in optimizers.values():
         optimizer.step()
-    coordinator.after_step(rendered, psnrs(rendered.pictures, photos))
