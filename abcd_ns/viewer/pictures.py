@@ -113,8 +113,7 @@ class BlockPictures:
         if len(gaussians) == 0 and frozen is None:
             return self._nothing()
         shot = Shot(self.view, self.view.full, frozen, window)
-        options = {"sh_degree": self.settings.sh_degree, "antialiased": self.settings.antialiased}
-        return self.painter.rasterizer.draw(gaussians, [shot], **options)[0]
+        return self.painter.rasterizer.draw(gaussians, [shot], **vars(self.settings))[0]
 
     def _nothing(self) -> Raster:
         view = self.view

@@ -31,7 +31,7 @@ LEAST_PASS = 200_000
 
 @dataclass(frozen=True)
 class PaintSettings:
-    """What every drawing of a run has in common."""
+    """What every drawing of a run has in common, under rasterizers' names for it."""
 
     sh_degree: int
     antialiased: bool = False
@@ -180,8 +180,7 @@ class Painter:
             for one, shown in zip(seen, shows, strict=True)
             if shown and one.window is not None
         ]
-        options = {"sh_degree": settings.sh_degree, "antialiased": settings.antialiased}
-        cuts = self.rasterizer.cuts(loaded.gaussians, shots, **options)
+        cuts = self.rasterizer.cuts(loaded.gaussians, shots, **vars(settings))
         for one, shown in zip(seen, shows, strict=True):
             if not shown:
                 yield None
@@ -262,14 +261,7 @@ class Painter:
         if len(gaussians) == 0:
             return self._nothing(view, crop)
         with torch.no_grad():
-            return self.rasterizer(
-                gaussians,
-                view,
-                crop=crop,
-                sh_degree=settings.sh_degree,
-                antialiased=settings.antialiased,
-                z_window=window,
-            ).layer
+            return self.rasterizer(gaussians, view, crop=crop, z_window=window, **vars(settings)).layer
 
     def _nothing(self, view: View, crop: Crop) -> Layer:
         return empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)

@@ -135,12 +135,8 @@ class WholePictures:
         window = None
         if self._painter.ownership == "fragments" and unit:
             window = self._painter.span(unit, still(view), view.full)
-        return self._painter.rasterizer.draw(
-            loaded.gaussians,
-            [Shot(view, view.full, None, window)],
-            sh_degree=self._settings.sh_degree,
-            antialiased=self._settings.antialiased,
-        )[0]
+        shot = Shot(view, view.full, None, window)
+        return self._painter.rasterizer.draw(loaded.gaussians, [shot], **vars(self._settings))[0]
 
     def _in_order(self, view: View, parts: Sequence[_Part]) -> list[_Part]:
         order = self._painter.order([part.unit for part in parts], still(view))
