@@ -14,15 +14,11 @@ from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.schedule import (
-    endless_order,
-    view_order,
-    views_per_step,
-)
+from abcd_ns.engine.train.schedule import endless_order, view_order, views_per_step
 from abcd_ns.engine.train.step.batch import Backgrounds, Batch, Rendered, Sample, part_to_draw
 from abcd_ns.engine.train.step.normal_consistency import BEGINS, normal_consistency
 from abcd_ns.engine.train.step.weighing import weighed
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import Crop, View
 
 
 class StepDrawing:
@@ -81,7 +77,7 @@ class StepDrawing:
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
-        rendered = self._draw(live_gaussians(self._run.params), batch.samples, self.degree)
+        rendered = self._draw(batch.samples)
         if not self._run.active.shown:
             for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
                 self._run.health.see(share_of_picture(sample.in_front, own))
@@ -136,12 +132,12 @@ class StepDrawing:
         layers, window = self.layers.around(view.index, crop) if self.layers else (None, None)
         return Sample(view, crop, layers, window, self._backgrounds.at(step, place))
 
-    def _draw(self, gaussians: Gaussians, samples: Sequence[Sample], sh_degree: int) -> Rendered:
+    def _draw(self, samples: Sequence[Sample]) -> Rendered:
         run = self._run
         rasters = run.rasterizer.draw(
-            gaussians,
+            live_gaussians(run.params),
             [sample.shot for sample in samples],
-            sh_degree=sh_degree,
+            sh_degree=self.degree,
             antialiased=run.config.antialiased,
             absgrad=run.density.absgrad,
             weigh=run.density.weighs,
