@@ -14,7 +14,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step.batch import Sample, part_to_draw
 from abcd_ns.engine.train.step.cutouts import ALIGN, random_part
 from abcd_ns.engine.train.training_loop import train
-from abcd_ns.engine.types import Crop, Layer
+from abcd_ns.engine.types import Crop
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from tests.reference.scenes import make_coordinator, ring_of_views, training_config, whole_scene
@@ -121,13 +121,6 @@ def test_a_part_depends_on_seed_step_and_place_alone():
     assert len(set(drawn)) > 20
     assert part_to_draw(training_config(crop_pixels=40_000, seed=1), crop, 0, 0) != drawn[0]
     assert part_to_draw(TrainingConfig(), crop, 0, 0) == crop
-
-
-def test_a_layer_is_cut_from_its_own_corner():
-    layer = Layer(torch.rand(5, 7, 3), torch.rand(5, 7))
-    part = layer[Crop(2, 1, 4, 3)]
-    assert torch.equal(part.color, layer.color[1:4, 2:6])
-    assert torch.equal(part.transmittance, layer.transmittance[1:4, 2:6])
 
 
 @pytest.mark.parametrize("room", [0, 1 << 20])

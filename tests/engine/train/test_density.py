@@ -14,10 +14,9 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl, for_primitive
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
-from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
-from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
+from tests.reference.scenes import random_gaussians, ring_of_views
 
 
 def live(gaussians: Gaussians):
@@ -74,13 +73,8 @@ def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
     control, batch = DensityControl(DensityConfig()), 4
 
     def due(first: bool) -> list[int]:
-        options = {
-            "refined": 1000,
-            "taken": batch,
-            "views": batch * steps,
-            "visit": batch * steps,
-            "usual": 30,
-        }
+        drawn = batch * steps
+        options = {"refined": 1000, "taken": batch, "views": drawn, "visit": drawn}
         each = (
             clock(steps=1000 + batch * k, spent=k / steps, first=first, **options)
             for k in range(1, steps + 1)
@@ -275,28 +269,6 @@ def test_covariances_against_the_definition():
     eigenvalues = torch.linalg.eigvalsh(found)
     assert torch.allclose(eigenvalues, (scales**2).sort(dim=1).values)
     assert torch.allclose(found, found.transpose(1, 2))
-
-
-def test_blocks_refine_after_fewer_steps_than_what_is_trained_at_once(tmp_path, views, photos, start):
-    """The warm-up is as one block: by the steps of blocks it would have three times the Gaussians."""
-    usual = {}
-    for blocks in (1, 4):
-        (tmp_path / str(blocks)).mkdir()
-        options = {"blocks": blocks, "steps": 60, "scaffold": None if blocks == 1 else 20}
-        coordinator = make_coordinator(tmp_path / str(blocks), start, views, **options)
-        while not coordinator.finished:
-            train_step(coordinator, photos)
-            if (active := coordinator.state.active) is not None:
-                found = coordinator.visit.live.density_clock(1, 1, None).usual
-                usual.setdefault((blocks, active.is_whole), set()).add(found)
-    assert usual == {(1, False): {100}, (4, True): {100}, (4, False): {30}}
-
-
-@pytest.mark.parametrize(("given", "usual", "due"), [(0, 100, 100), (0, 30, 30), (7, 100, 7)])
-def test_steps_between_refinements_are_those_given_or_the_usual(given, usual, due):
-    control = DensityControl(DensityConfig(refine_every=given))
-    assert control.is_due(clock(steps=due, usual=usual))
-    assert not control.is_due(clock(steps=due - 1, usual=usual))
 
 
 def test_surfels_grow_by_plain_gradients_and_2dgs_threshold():

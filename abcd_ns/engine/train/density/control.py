@@ -30,7 +30,6 @@ BEFORE_RESET, AFTER_RESET = 7, 4
 
 GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
-REFINE_EVERY_SCENE, REFINE_EVERY_BLOCK = 100, 30
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
 """Shares of a visit after which a block among others is neither refined nor reset."""
 CULL_SCALE = 0.5
@@ -62,9 +61,8 @@ class DensityConfig:
     refine_stop: float = 0.5
     """Share of the run after which none is cloned or split; a block grows in its first visit all the same,
     unless that is in the last third. Who fills less than the `price` goes later, too."""
-    refine_every: int = 0
-    """A block's own steps between refinements; never fewer than the views that show the block. 0 takes 100
-    where all is trained at once, as splatfacto has it, also in the warm-up, and 30 elsewhere."""
+    refine_every: int = 100
+    """A block's own steps between refinements; never fewer than the views that show the block."""
     reset_every: int = 3000
     """A block's own steps between opacity resets (`default` strategy); 0 means never."""
     cull_alpha_thresh: float = 0.005
@@ -114,8 +112,6 @@ class DensityClock:
     """Gaussians that may still be added to the scene; None for no limit."""
     seed: int
     """Of the random numbers drawn in this step."""
-    usual: int = REFINE_EVERY_SCENE
-    """`refine_every` where it is not given."""
     refined: int | None = None
     """`steps` when the block was last refined; None refines at the very step that it is due."""
     resets: int | None = None
@@ -173,9 +169,9 @@ class DensityControl:
         if not begins <= clock.progress < ends:
             return False
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
+        every = max(self.config.refine_every, views, 1)
         if clock.first and clock.visit is not None:  # what it was refined at before is the warm-up's
-            views = min(views, int(REFINE_UNTIL * clock.visit) - clock.taken)
-        every = max(self.config.refine_every or clock.usual, views, 1)
+            every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         if clock.refined is None:
             return clock.reached(every)
         return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= every

@@ -8,7 +8,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
-from abcd_ns.engine.train.density.control import REFINE_EVERY_BLOCK, REFINE_EVERY_SCENE, DensityClock, Infos
+from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.density.splitting import is_full
@@ -148,7 +148,6 @@ class LiveBlock:
             views=len(active.trained_on),
             visit=active.steps * batch if blocks > 1 else None,
             room=room,
-            usual=REFINE_EVERY_SCENE if blocks == 1 else REFINE_EVERY_BLOCK,
             seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
             refined=self.clocks.refined if among_others else None,
             resets=self.clocks.resets if among_others else None,
