@@ -100,8 +100,8 @@ def splatfacto_refines(cameras: int, steps: int = 15_000) -> int:
     "A7",
     "never densifies from 2,900 images on (nerfstudio #2927, #3743)",
     "the schedule for 1 to 15,000 cameras, and splatfacto's",
-    "at least one refinement in each visit that draws a hundred views or more; shorter ones, of fewer than 13 "
-    "cameras, gather statistics over several",
+    "at least one refinement in each visit that draws a hundred views or more; shorter ones, of fewer than "
+    "13 cameras, gather statistics over several",
 )
 def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no training
     """A7: the schedule alone, for captures of 1 to 15,000 photos."""
