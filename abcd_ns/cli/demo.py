@@ -1,6 +1,7 @@
 """`abcd demo`: the main job from end to end, on a scene of its own, through nerfstudio's commands."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -110,8 +111,8 @@ def demo(
     Raises:
         UserError: `out` holds something else, an option is out of range, or nerfstudio is not installed.
     """
-    if seconds <= 0:
-        raise UserError(f"--seconds is {seconds}; it must be above 0.")
+    if not 0 < seconds < math.inf:
+        raise UserError(f"--seconds is {seconds}; it must be above 0 and finite.")
     if blocks < 1:
         raise UserError(f"--blocks is {blocks}; it must be at least 1.")
     console = Console()

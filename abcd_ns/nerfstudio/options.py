@@ -1,6 +1,7 @@
 """Which options of a run go together, and which of nerfstudio's count."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from itertools import product
@@ -103,6 +104,9 @@ def check_options(config: TrainerConfig) -> None:
         if not getattr(pipeline, name) >= 0:
             flag = name.replace("_", "-")
             raise UserError(f"--pipeline.{flag} must be 0 or more, not {getattr(pipeline, name)}.")
+    if pipeline.max_seconds is not None and not 0 < pipeline.max_seconds < math.inf:
+        refused = f"--pipeline.max-seconds must be above 0 and finite, not {pipeline.max_seconds}"
+        raise UserError(f"{refused}; leave it out for no limit.")
     if config.is_viewer_legacy_enabled():
         raise UserError("--vis viewer_legacy cannot be guarded against strangers: use --vis viewer.")
     pipeline.training.check()

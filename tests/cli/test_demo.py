@@ -174,7 +174,13 @@ def test_a_folder_of_something_else_is_left_alone(commands, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [({"seconds": 0.0}, "--seconds is 0"), ({"blocks": 0}, "--blocks is 0")]
+    ("options", "message"),
+    [
+        ({"seconds": 0.0}, "--seconds is 0"),
+        ({"seconds": float("nan")}, "--seconds is nan"),
+        ({"seconds": float("inf")}, "--seconds is inf"),
+        ({"blocks": 0}, "--blocks is 0"),
+    ],
 )
 def test_options_out_of_range_are_refused(tmp_path, options, message):
     with pytest.raises(UserError, match=message):

@@ -159,6 +159,16 @@ def test_what_has_no_effect_is_refused_from_files_too(change, says):
     assert says in str(refused.value)
 
 
+@pytest.mark.parametrize("seconds", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_time_limit_that_is_none_is_refused(seconds):
+    config = copy.deepcopy(METHODS["abcd"])
+    config.pipeline.max_seconds = seconds
+    with pytest.raises(UserError, match=r"--pipeline\.max-seconds must be above 0 and finite, not"):
+        check_options(config)
+    config.pipeline.max_seconds = 0.5
+    check_options(config)
+
+
 @pytest.mark.parametrize(
     ("word", "says"),
     [

@@ -38,7 +38,7 @@ def make_settings(data: Any, out: Any, seeds: Sequence[int], **given: Any) -> Se
     if (seconds is None) == (given["steps"] is None):
         raise UserError("Give each run's budget: either --seconds or --steps.")
     if seconds is not None and not 0 < seconds < float("inf"):
-        raise UserError(f"--seconds is {seconds}; it must be above 0.")
+        raise UserError(f"--seconds is {seconds}; it must be above 0 and finite.")
     check_ranges({name: given[name] for name in LOWEST})
     check_numbers("--seeds", seeds, 0)
     return Settings(data=str(Path(data).resolve()), **given)
