@@ -13,6 +13,7 @@ from abcd_ns.cli.report.page import GENERATOR, render_page
 from abcd_ns.cli.report.plan import Plan, make_plan
 from abcd_ns.cli.report.run_folder import RunFolder, find_run, load_pipeline, open_run
 from abcd_ns.cli.terminal import print_plain
+from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.checks import check_ranges
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
@@ -87,7 +88,8 @@ def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[
     """The trained model, or None and why there is none."""
     notes, version = [], run.settings.versions.abcd_ns
     if version != __version__:
-        notes.append(f"The run is of abcd_ns {version}; settings are compared with those of {__version__}.")
+        theirs = f"The run is of abcd_ns {one_line(version)}"
+        notes.append(f"{theirs}; settings are compared with those of {__version__}.")
     if run.checkpoint is None:
         return None, [*notes, "There is no checkpoint yet: held-out views and blocks could not be looked at."]
     if run.checkpoint.step < run.story.step:
@@ -96,7 +98,7 @@ def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[
             f"goes on to step {run.story.step:,}."
         )
     if data is None:
-        return None, [*notes, NO_PHOTOS.format(shlex.quote(run.settings.data_path))]
+        return None, [*notes, NO_PHOTOS.format(one_line(shlex.quote(run.settings.data_path)))]
     try:
         return load_pipeline(run, run.checkpoint, data), notes
     except UserError as error:

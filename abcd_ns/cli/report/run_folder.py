@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.cli.report.story import Story, read_story
+from abcd_ns.data.input_errors import one_line
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.train.density.shedding import WEIGHED
@@ -76,7 +77,7 @@ def find_run(path: Path) -> Path:
     """
     path = path.parent if path.name == "config.yml" else path
     if not (path / STATE / SETTINGS_FILE).exists():
-        raise UserError(f"{path} is no run with a log: {_hint(path)}")
+        raise UserError(one_line(f"{path} is no run with a log: {_hint(path)}"))
     return path
 
 
@@ -116,7 +117,8 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPip
         pipeline.load_pipeline(checkpoint.pipeline, checkpoint.step - 1)
     except (KeyError, RuntimeError) as error:
         where = _settings_file(run.path, run.settings)
-        raise UserError(f"{checkpoint.path} does not fit the options in {where}: {error}.") from None
+        why = " ".join(str(error).split())
+        raise UserError(one_line(f"{checkpoint.path} does not fit the options in {where}: {why}.")) from None
     return pipeline
 
 
@@ -132,10 +134,10 @@ def pipeline_config(run: Path, settings: Settings, data: Path) -> AbcdPipelineCo
 
 
 def _settings_file(run: Path, settings: Settings) -> str:
-    """In words."""
+    """In words, fit for a terminal."""
     versions = settings.versions
     wrote = f"abcd_ns {versions.abcd_ns}" + (f", commit {versions.commit}" if versions.commit else "")
-    return f"{run / STATE / SETTINGS_FILE} (written by {wrote})"
+    return one_line(f"{run / STATE / SETTINGS_FILE} (written by {wrote})")
 
 
 def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
@@ -145,7 +147,8 @@ def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
         if not name.startswith("pipeline.datamanager.") or not isinstance(value, str):
             continue
         if not name.endswith(".data") and not (folder / value).resolve().is_relative_to(folder):
-            raise UserError(f"{where}: {name} is {value}, outside of {folder}; nothing there is read.")
+            what = one_line(f"{name} is {value}")
+            raise UserError(f"{where}: {what}, outside of {folder}; nothing there is read.")
 
 
 def default_config(method: str, reader: str = OUR_READER) -> AbcdTrainerConfig | None:
@@ -163,7 +166,7 @@ def _registered(method: str, reader: str) -> AbcdTrainerConfig:
     if found is None:
         raise UserError(f"The run's method {method!r} is none of this version of abcd_ns.")
     if reader not in READERS:
-        raise UserError(f"The run's data was read by {reader}, which nerfstudio does not know here.")
+        raise UserError(f"The run's data was read by {reader!r}, which nerfstudio does not know here.")
     found.pipeline.datamanager.dataparser = copy.deepcopy(READERS[reader])
     return found
 
@@ -189,7 +192,7 @@ def _newest(folder: Path) -> Checkpoint | None:
         return Checkpoint(path, int(content["step"]) + 1, content["pipeline"], tree)
     except _DAMAGE as error:
         why = f"{path} cannot be read ({first_line(error)}); remove it to use an earlier one."
-        raise UserError(why) from None
+        raise UserError(one_line(why)) from None
 
 
 def _read_store(
@@ -209,7 +212,7 @@ def _read_store(
         }
         return state, filled, parameters
     except StoreError as error:
-        raise UserError(str(error)) from None
+        raise UserError(one_line(str(error))) from None
 
 
 def _filled(store: ParameterStore, block: int, views: int) -> float | None:

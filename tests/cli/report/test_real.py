@@ -1,5 +1,6 @@
 """`abcd report` on runs that were really trained, whole and damaged ones."""
 
+import dataclasses
 import json
 import os
 import pickle
@@ -126,6 +127,49 @@ def test_photos_are_those_of_a_folder_that_the_user_names(trained, copied, tmp_p
         opened = open_run(copied)
         with pytest.raises(UserError, match=r"images_path is .*secret, outside of .*nothing there is read"):
             load_pipeline(opened, opened.checkpoint, photos)
+
+
+def settings_changed(folder: Path, **changes) -> None:
+    """The run's settings, as someone else may have written them."""
+    path = folder / "abcd" / SETTINGS_FILE
+    settings = json.loads(path.read_text())
+    options = settings["options"] | changes.pop("options", {})
+    path.write_text(json.dumps(settings | changes | {"options": options}))
+
+
+def test_nothing_that_a_run_says_steers_the_terminal(trained, copied, capsys):
+    """An escape sequence could hide or fake what is printed; a newline as well."""
+    hostile, shown = "x\x1b[2J\nerror", r"x\x1b[2J\nerror"
+    versions = json.loads((copied / "abcd" / SETTINGS_FILE).read_text())["versions"] | {"abcd_ns": hostile}
+    settings_changed(copied, versions=versions, data_path=hostile)
+    assert report(copied) == 0
+    said = capsys.readouterr().out
+    assert said.count(shown) == 2
+    assert "\x1b[2J" not in said
+    for options in (
+        {"pipeline.datamanager.dataparser.images_path": f"../{hostile}"},
+        {f"pipeline.datamanager.data.{hostile}": "../x"},
+        {f"pipeline.{hostile}": 1},
+        {"pipeline.training.batch": hostile},
+    ):
+        shutil.copy(trained / "abcd" / SETTINGS_FILE, copied / "abcd" / SETTINGS_FILE)
+        settings_changed(copied, versions=versions, options=options)
+        opened = open_run(copied)
+        with pytest.raises(UserError) as refused:
+            load_pipeline(opened, opened.checkpoint, photos_of(trained))
+        assert str(refused.value).isprintable()
+        assert shown in str(refused.value)
+    shutil.copy(trained / "abcd" / SETTINGS_FILE, copied / "abcd" / SETTINGS_FILE)
+    opened = open_run(copied)
+    odd = {f"{name}{hostile}": value for name, value in opened.checkpoint.pipeline.items()}
+    with pytest.raises(UserError, match="does not fit the options in") as refused:
+        load_pipeline(opened, dataclasses.replace(opened.checkpoint, pipeline=odd), photos_of(trained))
+    assert str(refused.value).isprintable()
+    settings_changed(copied, reader=hostile)
+    opened = open_run(copied)
+    with pytest.raises(UserError, match="The run's data was read by 'x") as refused:
+        load_pipeline(opened, opened.checkpoint, photos_of(trained))
+    assert str(refused.value).isprintable()
 
 
 def test_a_run_that_is_still_going_on_has_a_page(copied):
