@@ -146,8 +146,14 @@ def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
     for name, value in options.items():
         if not name.startswith("pipeline.datamanager.") or not isinstance(value, str):
             continue
-        if not name.endswith(".data") and not (folder / value).resolve().is_relative_to(folder):
-            what = one_line(f"{name} is {value}")
+        if name.endswith(".data"):
+            continue
+        what = one_line(f"{name} is {value}")
+        try:
+            inside = (folder / value).resolve().is_relative_to(folder)
+        except ValueError:  # a NUL, which is in no path
+            raise UserError(f"{where}: {what}, which is no path; correct it there.") from None
+        if not inside:
             raise UserError(f"{where}: {what}, outside of {folder}; nothing there is read.")
 
 

@@ -172,6 +172,16 @@ def test_nothing_that_a_run_says_steers_the_terminal(trained, copied, capsys):
     assert str(refused.value).isprintable()
 
 
+@pytest.mark.parametrize("name", ["images_path", "masks_path"])
+def test_a_path_that_is_none_is_named(trained, copied, name):
+    settings_changed(copied, options={f"pipeline.datamanager.dataparser.{name}": "a\0b"})
+    opened = open_run(copied)
+    with pytest.raises(UserError, match=r"settings\.json .*_path is a\\x00b, which is no path; correct it"):
+        load_pipeline(opened, opened.checkpoint, photos_of(trained))
+    assert report(copied, data=photos_of(trained), pictures=0) == 0
+    assert "could not be drawn" in (copied / "report.html").read_text()
+
+
 def test_a_run_that_is_still_going_on_has_a_page(copied):
     shutil.rmtree(copied / "nerfstudio_models")
     log = copied / "abcd" / LOG_FILE
