@@ -101,9 +101,9 @@ def check_options(config: TrainerConfig) -> None:
     if config.machine.num_devices * config.machine.num_machines > 1:
         raise UserError("For several devices give --pipeline.workers; leave out --machine.num-devices.")
     for name in ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb"):
-        if not getattr(pipeline, name) >= 0:
+        if not 0 <= getattr(pipeline, name) < math.inf:
             flag = name.replace("_", "-")
-            raise UserError(f"--pipeline.{flag} must be 0 or more, not {getattr(pipeline, name)}.")
+            raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {getattr(pipeline, name)}.")
     if pipeline.max_seconds is not None and not 0 < pipeline.max_seconds < math.inf:
         refused = f"--pipeline.max-seconds must be above 0 and finite, not {pipeline.max_seconds}"
         raise UserError(f"{refused}; leave it out for no limit.")

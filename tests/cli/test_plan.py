@@ -158,7 +158,15 @@ def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
 
 
 @pytest.mark.parametrize(
-    "option", [{"blocks": -1}, {"steps": 0}, {"max_gaussians": -5}, {"workers": 0}, {"downscale": 0}]
+    "option",
+    [
+        {"blocks": -1},
+        {"steps": 0},
+        {"max_gaussians": -5},
+        {"workers": 0},
+        {"downscale": 0},
+        *({"device_budget_gb": value} for value in (-1.0, math.nan, math.inf)),
+    ],
 )
 def test_options_out_of_range_are_refused(tmp_path, option):
     with pytest.raises(UserError, match=next(iter(option)).replace("_", "-")):

@@ -159,6 +159,15 @@ def test_what_has_no_effect_is_refused_from_files_too(change, says):
     assert says in str(refused.value)
 
 
+@pytest.mark.parametrize("name", ["device_budget_gb", "near_plane", "ram_budget_gb"])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_what_must_be_0_or_more_is_refused_where_it_is_not(name, value):
+    config = copy.deepcopy(METHODS["abcd"])
+    setattr(config.pipeline, name, value)
+    with pytest.raises(UserError, match=f"--pipeline.{name.replace('_', '-')} must be 0 or more and finite"):
+        check_options(config)
+
+
 @pytest.mark.parametrize("seconds", [-1.0, 0.0, float("nan"), float("inf")])
 def test_a_time_limit_that_is_none_is_refused(seconds):
     config = copy.deepcopy(METHODS["abcd"])

@@ -1,5 +1,6 @@
 """`abcd plan`: what a run on these photos will need, and what would not fit."""
 
+import math
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -90,6 +91,8 @@ def plan(
     """
     if wanted.blocks < 0:
         raise UserError(f"--blocks is {wanted.blocks}; it must be 0 or more.")
+    if not 0 <= wanted.device_budget_gb < math.inf:
+        raise UserError(f"--device-budget-gb must be 0 or more and finite, not {wanted.device_budget_gb}.")
     given = {name: getattr(wanted, name) for name in ("max_gaussians", "steps", "workers")}
     check_ranges({**given, "downscale": downscale})
     console = Console()
