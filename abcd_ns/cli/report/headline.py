@@ -100,8 +100,8 @@ def _memory(run: RunFolder) -> list[Fact]:
     story, machine = run.story, run.settings.machine
     ram = max((line.rss_bytes for line in story.samples), default=0)
     device = max((line.device_bytes or 0 for line in story.samples), default=0)
-    if story.end is not None:
-        ram, device = story.end.peak_rss_bytes, story.end.peak_device_bytes or 0
+    if story.end is not None:  # of the last process; after a resume an earlier one may have had more
+        ram, device = max(ram, story.end.peak_rss_bytes), max(device, story.end.peak_device_bytes or 0)
     facts = [Fact("peak RAM", f"{ram / GIB:.2f}", "GiB", f"of {machine.ram_bytes / GIB:.0f} GiB")]
     if machine.gpu is not None:
         facts.append(Fact("peak GPU memory", f"{device / GIB:.2f}", "GiB", machine.gpu))

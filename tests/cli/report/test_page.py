@@ -33,6 +33,7 @@ from abcd_ns.lab.runs.evaluate import Drawn, HeldOutView
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from tests.cli.report.runs import (
+    TRAINING,
     line,
     log_lines,
     made_up_held_out,
@@ -109,6 +110,22 @@ def test_the_headline_counts_workers_where_there_were_any(tmp_path):
     assert facts["training time"].more == "9% for layers"  # of two workers' time: half of one process's 19%
     assert (facts["workers"].value, facts["workers"].more) == ("2", "waited 15% of the time, 1 lost")
     assert "workers" not in {fact.name for fact in headline(run, None)}
+
+
+@pytest.mark.parametrize(("sampled", "ended", "peak"), [(3, 2, "3.00"), (1, 2, "2.00"), (3, None, "3.00")])
+def test_peaks_of_memory_are_those_of_all_processes_of_a_run(tmp_path, sampled, ended, peak):
+    run = made_up_run(tmp_path)
+    machine = dataclasses.replace(run.settings.machine, gpu="made up")
+    memory = {"rss_bytes": sampled << 30, "device_bytes": sampled << 30, "held": {}}
+    lines = [line("training", 0, 0.0, **TRAINING), line("sample", 5, 2.0, **memory)]
+    lines += [line("training", 5, 2.0, **TRAINING)]
+    if ended is not None:
+        lines.append(line("end", 9, 4.0, peak_rss_bytes=ended << 30, peak_device_bytes=ended << 30))
+    story = read_story(write_log(tmp_path / "memory.jsonl", lines))
+    settings = dataclasses.replace(run.settings, machine=machine)
+    facts = headline(dataclasses.replace(run, story=story, settings=settings), None)
+    found = {fact.name: fact.value for fact in facts}
+    assert (found["peak RAM"], found["peak GPU memory"]) == (peak, peak)
 
 
 def test_without_pictures_the_last_evaluation_of_the_log_stands_in(tmp_path):
