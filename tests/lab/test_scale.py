@@ -1,5 +1,6 @@
 """`abcd scale`: the land is what it claims to be, and a measurement can be made and read back."""
 
+import shlex
 from dataclasses import replace
 
 import pytest
@@ -34,6 +35,13 @@ def test_each_block_of_the_land_is_one_tile(tiles):
         assert bool(
             ((means[:, :2] > torch.tensor([x, y])) & (means[:, :2] < torch.tensor([x + 1, y + 1]))).all()
         )
+
+
+def test_the_command_that_is_kept_can_be_given_again(tmp_path):
+    plan = make_plan(tmp_path / "my land; x", LandSettings(300, 1, MIB), [2, 4], [2], 0)
+    words = ["abcd", "scale", "--blocks", "2", "4", "--gaussians", "300", "--visits", "1"]
+    words += ["--ram-budget-mb", "1", "--monolithic-limit", "600", "--seed", "0", "--out", "my land; x"]
+    assert shlex.split(plan.command) == words
 
 
 def test_only_powers_of_two_part_in_equal_halves():

@@ -1,6 +1,7 @@
 """`abcd scale`: does memory follow the block and not the scene?"""
 
 import re
+import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -84,12 +85,12 @@ def make_plan(
         for method, counts in sizes
         for count in counts
     )
-    words = ["abcd scale --blocks", *by_blocks, "--gaussians", settings.gaussians]
+    words = ["abcd", "scale", "--blocks", *by_blocks, "--gaussians", settings.gaussians]
     words += ["--visits", settings.visits, "--ram-budget-mb", settings.ram_budget_bytes // MIB]
     words += ["--monolithic-limit", max(whole, default=0) * settings.gaussians, "--seed", seed]
     limit = settings.device_limit_bytes // MIB
     words += ["--device-limit-mb", limit] if limit else []
-    return Plan("study of scale", settings, out, jobs, " ".join(map(str, [*words, "--out", out.name])))
+    return Plan("study of scale", settings, out, jobs, shlex.join(map(str, [*words, "--out", out.name])))
 
 
 def too_large(job: LandJob, outcome: Run | Failure | None) -> LeftOut | None:
