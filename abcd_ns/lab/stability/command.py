@@ -74,13 +74,14 @@ def stability(
     check_ranges({"downscale": downscale})
     check_ranges({"seed": seed}, low=0)
     scene = None if data is None else data.resolve().name
-    asked = {"only": sorted(only), "quick": quick, "seed": seed, "data": scene, "downscale": downscale}
-    claim(out, KIND, {"scenarios": asked}, overwrite)
+    names = sorted({name.upper() for name in only})
+    asked = {"only": names, "quick": quick, "seed": seed, "data": scene, "downscale": downscale}
     console, known = Console(), dict(SCENARIOS)
     if data is not None:
         stage = read_stage(data, downscale, MOST_POINTS)
         known |= {scenario.id: scenario for scenario in real_scenarios(stage, data.resolve().name)}
-    chosen = choose(only, known)
+    chosen = choose(names, known)
+    claim(out, KIND, {"scenarios": asked}, overwrite)  # only now: what is refused takes no folder
     wanted = () if only or quick else studies()
     blank, paths = new_results(KIND, _command(asked, out), describe_machine()), []
 

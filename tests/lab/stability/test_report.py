@@ -10,8 +10,10 @@ from rich.progress import Progress
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.findings import headline
+from abcd_ns.lab.results.records import read_json
 from abcd_ns.lab.results.results import Curve, Line, Outcome, Results
 from abcd_ns.lab.runs.experiment import write_report
+from abcd_ns.lab.stability import command
 from abcd_ns.lab.stability.charts import draw_curves
 from abcd_ns.lab.stability.command import KIND, SCENARIOS, Meter, carry_out, choose
 from abcd_ns.lab.stability.curves import studies
@@ -121,6 +123,23 @@ def test_the_command_writes_a_report(tmp_path, capsys):
     assert cli.main(["stability", "--out", str(tmp_path / "out"), "--only", "A7"]) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert (tmp_path / "out" / "results.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("wrong", [["--only", "Z9"], ["--data", "nothing"]])
+def test_what_is_refused_takes_no_folder(tmp_path, wrong):
+    out = tmp_path / "out"
+    assert cli.main(["stability", "--out", str(out), *wrong]) == 2
+    assert not out.exists()
+
+
+def test_scenarios_are_recorded_by_their_ids_however_they_are_written(tmp_path, monkeypatch):
+    carried = []
+    monkeypatch.setattr(command, "carry_out", lambda _, chosen, *__: carried.append(chosen) or [GOOD])
+    for only in (["a7", "A21", "A7"], ["A21", "A7"]):  # the second is no other experiment than the first
+        assert cli.main(["stability", "--out", str(tmp_path / "out"), "--only", *only]) == 0
+    assert [[scenario.id for scenario in chosen] for chosen in carried] == [["A7", "A21"]] * 2
+    marker = read_json(tmp_path / "out" / f"{KIND.replace(' ', '-')}.json")
+    assert marker["scenarios"]["only"] == ["A21", "A7"]
 
 
 def test_a_seed_below_0_is_refused(tmp_path, capsys):
