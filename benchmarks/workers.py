@@ -135,9 +135,10 @@ class Watch:
         step = trainer.state.step + sum(self._done.values())
         self._first = step if self._first is None else self._first
         share = (self._kills - self._left + 0.5) / self._kills
-        if step >= self._first + share * (trainer.run.budget.steps - self._first):
+        pids = trainer.workers.pids  # none where no worker is out: then the next chance is waited for
+        if pids and step >= self._first + share * (trainer.run.budget.steps - self._first):
             with suppress(ProcessLookupError):  # it has just ended by itself
-                os.kill(self._rng.choice(trainer.workers.pids), signal.SIGKILL)
+                os.kill(self._rng.choice(pids), signal.SIGKILL)
                 self._killed_at, self._left = time.perf_counter(), self._left - 1
                 self._row.kills.append(Kill(step))
 

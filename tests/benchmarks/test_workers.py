@@ -19,10 +19,14 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 class Mortal:
     """Workers in this process, who are lost when their "process" was killed."""
 
-    pids = (1, 2)
+    def __init__(self, inner, idle: int = 0) -> None:
+        self._inner, self._idle, self.killed = inner, idle, False
 
-    def __init__(self, inner) -> None:
-        self._inner, self.killed = inner, False
+    @property
+    def pids(self) -> list[int]:
+        """None at the first `idle` times, as between visits."""
+        self._idle -= 1
+        return [] if self._idle >= 0 else [1, 2]
 
     def __getattr__(self, name):
         return getattr(self._inner, name)
@@ -41,12 +45,12 @@ def scene():
     return views, Photos(random_gaussians(60, seed=1), views)
 
 
-def trained(folder, scene, monkeypatch, kills: int) -> Row:
+def trained(folder, scene, monkeypatch, kills: int, idle: int = 0) -> Row:
     views, photos = scene
     folder.mkdir()
 
     def kind(run):
-        return Dispatcher(Coordinator(run), Mortal(in_process(run, photos, 2)))
+        return Dispatcher(Coordinator(run), Mortal(in_process(run, photos, 2), idle))
 
     options = {"blocks": 4, "steps": 40, "visit_steps": 5, "kind": kind}
     run = make_coordinator(folder, random_gaussians(90, seed=2), views, **options)
@@ -74,6 +78,14 @@ def test_every_kill_has_its_cost_and_leaves_no_trace(tmp_path, scene, monkeypatc
     assert sum(line.startswith("| ") for line in table.splitlines()) == 4
     assert "each visit was taken in once" in table
     assert "the same to the last bit" in table
+
+
+def test_a_kill_waits_until_a_worker_is_out(tmp_path, scene, monkeypatch):
+    row = trained(tmp_path / "idle", scene, monkeypatch, 1, idle=3)
+    at_once = trained(tmp_path / "at once", scene, monkeypatch, 1)
+    assert len(row.kills) == len(at_once.kills) == 1
+    assert row.kills[0].step >= at_once.kills[0].step
+    assert row.is_whole
 
 
 def test_what_is_lost_or_there_twice_is_told():
