@@ -67,6 +67,8 @@ def main(args: Args) -> int:
     parts = [] if args.draw else [part for part in PARTS if part in args.parts]
     if args.data is None and NEED_DATA & set(parts):
         raise UserError(f"Give the scene with --data DIR, or --parts without {', '.join(sorted(NEED_DATA))}.")
+    if parts:
+        check_kind(parts, args, out)
     ends = time.monotonic() + 60 * args.minutes
     for number, part in enumerate(parts):
         path = out / f"{part}.json"
@@ -84,6 +86,23 @@ def main(args: Args) -> int:
         print(drawn)
     show(records, Console())
     return int(any(record["error"] for record in records if record["part"] in parts))
+
+
+def check_kind(parts: Sequence[str], args: Args, out: Path) -> None:
+    """See that a dry run's records, whose numbers mean nothing, and those of a real run do not mix.
+
+    Raises:
+        UserError: `out` has records of the other kind, and they are not made anew.
+    """
+    kept = [part for part in PARTS if not (args.again and part in parts)]
+    paths = [path for part in kept if (path := out / f"{part}.json").exists()]
+    others = [path.stem for path in paths if read_json(path)["dry_run"] != args.dry_run]
+    if others:
+        kind = "real runs" if args.dry_run else "dry runs"
+        names = ", ".join(others)
+        raise UserError(
+            f"--out {out} holds records of {kind} ({names}); name another folder, or use --again."
+        )
 
 
 def run_part(

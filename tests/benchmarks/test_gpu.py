@@ -102,6 +102,32 @@ def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkey
     assert len(ran) == 3
 
 
+@pytest.mark.parametrize("dry", [True, False])
+def test_records_of_dry_and_real_runs_do_not_mix(tmp_path, monkeypatch, dry):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    ran = []
+
+    def note(part, args, out, _):
+        ran.append(part)
+        record = WHOLE | {"part": part, "dry_run": args.dry_run, "found": {}}
+        write_json(out / f"{part}.json", record)
+        return record
+
+    monkeypatch.setattr("benchmarks.gpu.__main__.run_part", note)
+    path = tmp_path / "build.json"
+    write_json(path, WHOLE | {"dry_run": not dry})
+    for part in ("build", "tests"):
+        with pytest.raises(
+            UserError, match=r"holds records of (dry|real) runs \(build\); name another folder"
+        ):
+            main(Args(out=tmp_path, parts=(part,), dry_run=dry))
+    assert not ran
+    assert main(Args(out=tmp_path, parts=("build",), dry_run=dry, again=True)) == 0
+    assert (ran, read_json(path)["dry_run"]) == (["build"], dry)
+    assert main(Args(out=tmp_path, parts=("build", "tests"), dry_run=dry)) == 0
+    assert ran == ["build", "tests"]
+
+
 def test_without_a_cuda_device_it_says_so(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(Args(out=tmp_path / "out")) == 2
