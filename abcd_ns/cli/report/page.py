@@ -4,7 +4,6 @@ import base64
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
 import matplotlib
@@ -64,7 +63,7 @@ def render_page(run: RunFolder, held_out: HeldOut | None, plan: Plan | None, not
         dark_charts=Markup(theme_css()),
         scene=settings.scene,
         method=settings.method,
-        begun=f"{datetime.fromisoformat(settings.begun):%Y-%m-%d %H:%M} UTC",
+        begun=f"{settings.begun:%Y-%m-%d %H:%M} UTC",
         unfinished=_unfinished(story),
         headline=headline(run, held_out),
         notes=[without_home(note) for note in notes],

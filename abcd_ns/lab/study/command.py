@@ -1,5 +1,6 @@
 """`abcd study`: vary one thing and see what it does."""
 
+import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -120,8 +121,9 @@ class GaussiansStudy(Conditions):
         if self.max_gaussians:
             check_numbers("--max-gaussians", self.max_gaussians, 1, several=True)
         prices, limits = sorted(set(self.prices)), sorted(self.max_gaussians)
-        if prices and prices[0] < 0:
-            raise UserError(f"--prices {prices[0]:g}: a price is 0 or more, in pixels.")
+        for price in prices:
+            if not 0 <= price < math.inf:
+                raise UserError(f"--prices {price:g}: a price is 0 or more, in pixels.")
         varied = ["--prices", *(f"{price:g}" for price in prices), "--max-gaussians", *limits]
         variants = [AS_IT_IS, *(_one(PRICE, f"{price:g}") for price in prices)]
         variants += [_one(LIMIT, limit) for limit in limits]

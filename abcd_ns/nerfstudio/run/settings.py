@@ -13,6 +13,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.store.atomic import write_file
@@ -38,8 +39,8 @@ class Settings:
     """The folder, as it was given."""
     data_path: str
     """The same as an absolute path."""
-    begun: str
-    """When training began: ISO 8601, UTC."""
+    begun: datetime
+    """When training began: UTC."""
     options: dict[str, Plain]
     """Every option by its dotted name, as on `ns-train`'s command line."""
     versions: Versions
@@ -62,13 +63,14 @@ def write_settings(config: TrainerConfig, options: dict[str, Plain], folder: Pat
         scene=path.parent.name if path.suffix == ".json" else path.name,
         data=str(data),
         data_path=str(path),
-        begun=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        begun=datetime.now(timezone.utc).replace(microsecond=0),
         options=options,
         versions=describe_versions(),
         machine=describe_machine(),
         reader=reader_name(config.pipeline.datamanager.dataparser),
     )
-    content = json.dumps(dataclasses.asdict(settings), indent=2, allow_nan=False)
+    plain = msgspec.to_builtins(settings, enc_hook=str)  # torch's version is a string of its own
+    content = json.dumps(plain, indent=2, allow_nan=False)
     write_file(folder / SETTINGS_FILE, (content + "\n").encode())
 
 

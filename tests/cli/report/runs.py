@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from datetime import datetime, timezone
 from pathlib import Path
 
 import torch
@@ -64,7 +65,7 @@ def made_up_settings(method: str = "abcd", **fields) -> Settings:
         "scene": "made-up",
         "data": "made-up",
         "data_path": "/absent/made-up",
-        "begun": "2026-01-02T03:04:05+00:00",
+        "begun": datetime(2026, 1, 2, 3, 4, 5, tzinfo=timezone.utc),
         "options": flat_options(config),
         "versions": VERSIONS,
         "machine": MACHINE,

@@ -293,7 +293,9 @@ def test_what_gaussians_fill_is_the_weight_that_was_added_up_over_the_views(tmp_
     rest[0] = ({**tensors, "growth.weight": torch.full((count,), 3.0), "growth.looks": looks}, meta)
     folder = tmp_path / "run"
     (folder / "abcd").mkdir(parents=True)
-    (folder / "abcd" / SETTINGS_FILE).write_text(json.dumps(dataclasses.asdict(made_up_settings())))
+    (folder / "abcd" / SETTINGS_FILE).write_text(
+        json.dumps(dataclasses.asdict(made_up_settings()), default=str)
+    )
     write_log(folder / "abcd" / LOG_FILE, log_lines())
     with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
         store.commit(rest, state=RunState(views={0: 4, 1: 4}).to_json())

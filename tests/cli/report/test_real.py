@@ -199,6 +199,7 @@ def test_a_run_that_is_still_going_on_has_a_page(copied):
         (lambda folder: (folder / "abcd" / SETTINGS_FILE).unlink(), "is no run with a log"),
         (lambda folder: (folder / "abcd" / LOG_FILE).unlink(), r"log\.jsonl does not exist"),
         (lambda folder: (folder / "abcd" / SETTINGS_FILE).write_text("{"), r"settings\.json is not JSON"),
+        (lambda folder: settings_changed(folder, begun="today"), r"settings\.json: .*begun"),
         (
             lambda folder: (folder / "abcd" / LOG_FILE).write_text('{"kind": "magic"}\n'),
             r"log\.jsonl, line 1 is of the unknown kind 'magic'",

@@ -1,6 +1,7 @@
 """Studies: what is refused before anything is written, and which runs follow from what is given."""
 
 import copy
+import math
 from pathlib import Path
 
 import pytest
@@ -118,8 +119,9 @@ def test_a_study_of_gaussians_has_the_method_as_it_is_prices_limits_and_mcmc(sce
     assert {c.blocks for c in configs} == {4}
     assert "--prices 0.5 8 --max-gaussians 100 500" in plan.command
     assert not GaussiansStudy(**given(scene), prices=(), max_gaussians=()).plan().jobs[1:]
-    with pytest.raises(UserError, match="--prices -1: a price is 0 or more"):
-        GaussiansStudy(**given(scene), prices=(-1.0,)).plan()
+    for price in (-1.0, math.nan, math.inf):
+        with pytest.raises(UserError, match=f"--prices {price:g}: a price is 0 or more"):
+            GaussiansStudy(**given(scene), prices=(1.0, price)).plan()
 
 
 def test_an_ablation_begins_with_the_method_as_it_is(scene):
