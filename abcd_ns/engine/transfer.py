@@ -31,8 +31,8 @@ class Download:
         kind = event_of(tensor.device)
         self._there = tensor.to("cpu", non_blocking=kind is not None)
         self._event = kind and kind()
-        if self._event is not None:
-            self._event.record()
+        if self._event is not None:  # of this device, which need not be the current one
+            self._event.record(torch.get_device_module(tensor.device).current_stream(tensor.device))
 
     def read(self) -> Tensor:
         """It; waits until it is there."""

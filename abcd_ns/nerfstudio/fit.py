@@ -9,7 +9,13 @@ import torch
 from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, fewest_blocks, levels_of
+from abcd_ns.engine.train.memory import (
+    DeviceNeeds,
+    drawings_of,
+    fewest_blocks,
+    free_on_gpu,
+    levels_of,
+)
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 
@@ -94,8 +100,8 @@ def device_budget(wanted_gb: float, device: torch.device | str) -> int:
     """Bytes of the device that training may take: what is wanted, or with 0 what there is."""
     if wanted_gb > 0:
         return int(wanted_gb * GB)
-    if torch.device(device).type == "cuda":
-        return int(FREE_SHARE * torch.cuda.mem_get_info(device)[0])
+    if (device := torch.device(device)).type == "cuda":
+        return int(FREE_SHARE * free_on_gpu(device))
     return int(RAM_SHARE * psutil.virtual_memory().total)
 
 

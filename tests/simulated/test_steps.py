@@ -27,7 +27,7 @@ from tests.reference.scenes import (
 )
 from tests.reference.simulated_device import DEVICE
 
-GATHERING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=10**6, reset_every=0)
+GATHERING = DensityConfig(refine_start=1.0, refine_stop=1.0, reset_every=0)
 STILL = DensityConfig(strategy="off")
 
 

@@ -211,8 +211,8 @@ def _read_store(
         if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
         state = RunState.from_json(store.state) if store.state else None
-        views = {} if state is None else {block: n for block, n in state.views.items() if n}
-        filled = {block: px for block, n in views.items() if (px := _filled(store, block, n)) is not None}
+        seen = [] if state is None else [block for block, views in state.views.items() if views]
+        filled = {block: px for block in seen if (px := _filled(store, block)) is not None}
         parameters = {
             block: store.meta(block)["parameters"] for block in store.blocks if isinstance(block, int)
         }
@@ -221,10 +221,10 @@ def _read_store(
         raise UserError(one_line(str(error))) from None
 
 
-def _filled(store: ParameterStore, block: int, views: int) -> float | None:
+def _filled(store: ParameterStore, block: int) -> float | None:
     """Pixels; None where nobody was weighed, as by methods that keep everything."""
     with suppress(KeyError):
-        weight, looks = store.load_names(block, [f"growth.{name}" for name in WEIGHED]).values()
-        if bool((looks > 0).any()):
-            return float((weight * views / looks)[looks > 0].median())
+        weight, passes = store.load_names(block, [f"growth.{name}" for name in WEIGHED]).values()
+        if bool((passes > 0).any()):
+            return float((weight / passes)[passes > 0].median())
     return None

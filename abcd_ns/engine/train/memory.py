@@ -182,7 +182,14 @@ def free_bytes(device: torch.device) -> int:
     if device.type != "cuda":
         return psutil.virtual_memory().available
     reserve = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return torch.cuda.mem_get_info(device)[0] + reserve
+    return free_on_gpu(device) + reserve
+
+
+def free_on_gpu(device: torch.device) -> int:
+    """What a GPU has left, whoever uses the rest; torch 2.4 wants to know which, where that goes without
+    saying."""
+    number = torch.cuda.current_device() if device.index is None else device.index
+    return torch.cuda.mem_get_info(number)[0]
 
 
 def check_room(gaussians: int, sh_degree: int, device: torch.device) -> None:

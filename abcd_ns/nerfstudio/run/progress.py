@@ -72,7 +72,7 @@ class ProgressReport:
                 self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
             case Shedding():
                 self._show(f"last shedding {event.done}/{event.total}")
-            case ShedAtEnd() if event.gone:
+            case ShedAtEnd():
                 self._print(_shed(event))
             case WorkersSeen():
                 self._workers = event.workers
@@ -178,6 +178,8 @@ class ProgressReport:
 
 
 def _shed(event: ShedAtEnd) -> str:
+    if not event.gone:
+        return f"no Gaussian is gone at the end: {event.views} training views would miss each"
     before, cost = event.gaussians + event.gone, event.before - event.after
     where = f"{event.views} training views"
     return f"{event.gone:,} of {before:,} Gaussians were hardly missed and are gone: {cost:.2f} dB of {where}"

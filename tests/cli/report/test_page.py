@@ -283,14 +283,14 @@ def test_blocks_say_what_their_gaussians_are_and_fill_and_how_many_were_shed(tmp
 
 
 def test_what_gaussians_fill_is_the_weight_that_was_added_up_over_the_views(tmp_path):
-    """Three pixels in two looks, and four views: six pixels. Who was never looked at does not count."""
+    """Three pixels in half a pass over the views: six in all. Who was never drawn does not count."""
     scene = random_gaussians(6)
     tree = build_kd(scene.means, 2)
     rest = blocks_at_rest(tree, scene)
     tensors, meta = rest[0]
     count = len(tensors["means"])
-    looks = torch.full((count,), 2.0).index_fill(0, torch.tensor([0]), 0.0)
-    rest[0] = ({**tensors, "growth.weight": torch.full((count,), 3.0), "growth.looks": looks}, meta)
+    passes = torch.full((count,), 0.5).index_fill(0, torch.tensor([0]), 0.0)
+    rest[0] = ({**tensors, "growth.weight": torch.full((count,), 3.0), "growth.passes": passes}, meta)
     folder = tmp_path / "run"
     (folder / "abcd").mkdir(parents=True)
     (folder / "abcd" / SETTINGS_FILE).write_text(

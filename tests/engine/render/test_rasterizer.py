@@ -368,7 +368,7 @@ def test_each_view_of_a_batch_counts_by_its_own_size():
         control.before_backward(infos)
         weights = [probe(*r.transmittance.shape, dtype=torch.float32) for r in rasters]
         sum((stacked(r) * w).sum() for r, w in zip(rasters, weights, strict=True)).backward()
-        return control.count(gaussians.means, infos)
+        return control.count(gaussians.means, infos, 1)
 
     together, one_by_one = counted(views, 3), [counted([view], 3) for view in views]
     for name, value in together.items():

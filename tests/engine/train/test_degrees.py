@@ -21,8 +21,8 @@ STILL = DensityConfig(refine_start=1.0, refine_stop=0.0, price=1e-9)
 COEFFICIENTS = (1, 4, 9, 16)
 
 
-def weighed(count: int, weight: float = 30.0, looks: float = 12.0) -> dict[str, torch.Tensor]:
-    return {"weight": torch.full((count,), weight), "looks": torch.full((count,), looks)}
+def weighed(count: int, weight: float = 30.0) -> dict[str, torch.Tensor]:
+    return {"weight": torch.full((count,), weight), "passes": torch.ones(count)}
 
 
 def look(mean: torch.Tensor, size: float, view: View) -> tuple[np.ndarray, float]:
@@ -84,7 +84,7 @@ def test_the_dearer_a_number_the_fewer_there_are(monkeypatch):
 def test_seen_from_one_place_a_colour_is_all_that_there_is():
     """And it is the colour that was seen there."""
     (view, *_), gaussians = ring_of_views(4), random_gaussians(30, sh_degree=3)
-    found = lowered(gaussians, weighed(30, looks=1.0), [view])
+    found = lowered(gaussians, weighed(30), [view])
     away = torch.nn.functional.normalize(gaussians.means - view.center, dim=1)
     bases = torch.stack(sh_basis_rows(*away.unbind(1)), dim=1)
     inside = gaussians.means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
@@ -98,7 +98,7 @@ def test_seen_from_one_place_a_colour_is_all_that_there_is():
 
 def test_nobody_is_judged_who_was_not_looked_at_in_every_view():
     gaussians, growth = random_gaussians(10, sh_degree=2), weighed(10)
-    growth["looks"][4:] = 11.0
+    growth["passes"][4:] = 11 / 12
     growth["weight"][:] = 1e-9
     found = lowered(gaussians, growth, ring_of_views(12))
     assert found.gone.tolist() == [2.0] * 4 + [0.0] * 6

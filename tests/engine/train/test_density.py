@@ -94,16 +94,19 @@ def test_the_default_strategy_clones_where_gradients_are_high():
     assert all(len(optimizers[n].param_groups[0]["params"][0]) == 16 for n in PARAM_NAMES)
 
 
-def test_the_wide_are_split_whatever_their_gradients_say():
-    params, optimizers = live(random_gaussians(8, size=0.1))
+@pytest.mark.parametrize("size", [0.1, 0.001])
+@pytest.mark.parametrize("room", [None, 3, 2, 0])
+def test_the_wide_are_split_whatever_their_gradients_and_the_scenes_units_say(size, room):
+    params, optimizers = live(random_gaussians(8, size=size))
     control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
     wide, infos = torch.arange(8) < 3, (fake_info(8, gradient=0.0),)
     before = params["scales"].detach().clone()
-    control.after_step(params, optimizers, {}, infos, clock(), wide)
-    assert len(params["means"]) == 11
-    assert torch.equal(params["scales"][:5], before[3:])  # the others, as they were
-    halves = params["scales"][5:].view(2, 3, 3)
-    assert torch.allclose(halves, (before[:3] - math.log(1.6)).expand(2, 3, 3))
+    split = 3 if room is None else room
+    control.after_step(params, optimizers, {}, infos, clock(room=room), wide)
+    assert len(params["means"]) == 8 + split
+    assert torch.equal(params["scales"][: 8 - split], before[split:])  # the others, as they were
+    halves = params["scales"][8 - split :].view(2, split, 3)
+    assert torch.allclose(halves, (before[:split] - math.log(1.6)).expand(2, split, 3))
 
 
 def test_wide_is_what_covers_a_twentieth_of_the_nearest_cameras_picture():
@@ -187,7 +190,7 @@ def test_only_those_grow_that_fill_several_prices(views, visit):
         "grad2d": torch.full((8,), 9.0),
         "count": torch.ones(8),
         "weight": torch.tensor([13.0] * 4 + [11.0] * 4) / views,
-        "looks": torch.ones(8),
+        "passes": torch.full((8,), 1 / views),
     }
     control = DensityControl(DensityConfig(price=3.0, refine_every=10))
     now = clock(steps=40, taken=40, views=views, visit=visit)
@@ -334,7 +337,7 @@ def test_statistics_are_gsplats_to_the_last_bit(views, count, absgrad):
     strategy = DefaultStrategy(absgrad=absgrad)
     for info in infos:
         strategy._update_state({"means": torch.zeros(count, 3)}, state, info)
-    found = control.count(torch.zeros(count, 3), infos)
+    found = control.count(torch.zeros(count, 3), infos, 1)
     assert {name: value.dtype for name, value in found.items()} == dict.fromkeys(state, torch.float32)
     assert all(torch.equal(found[name], value) for name, value in state.items())
 
@@ -342,7 +345,7 @@ def test_statistics_are_gsplats_to_the_last_bit(views, count, absgrad):
 def test_statistics_pass_over_what_is_no_number():
     info = fake_info(4, 1.0)
     info["means2d"].absgrad[0, 2] = math.nan
-    found = DensityControl(DensityConfig()).count(torch.zeros(4, 3), (info,))
+    found = DensityControl(DensityConfig()).count(torch.zeros(4, 3), (info,), 1)
     assert found["count"].tolist() == [1, 1, 0, 1]
     assert float(found["grad2d"][2]) == 0
 

@@ -133,6 +133,20 @@ def test_a_run_that_stops_goes_on_with_its_poses(make, photos, blocks, warmup):
         assert torch.equal(getattr(whole_scene(went_on), name), getattr(whole_scene(whole), name)), name
 
 
+@pytest.mark.parametrize(("blocks", "warmup"), [(1, 0.0), (4, 0.4)])
+def test_where_photos_are_too_many_for_many_uses_poses_are_refined_all_the_same(
+    make, photos, monkeypatch, blocks, warmup
+):
+    """From a share of the run on that the warm-up comes to, for with workers they are refined there alone."""
+    monkeypatch.setattr(pose_rounds, "FIRST", 1e9)
+    made = make(blocks=blocks, steps=60, warmup=warmup, scaffold=60)
+    while made.progress < pose_rounds.LATEST:
+        train(made, photos, steps=1)
+        assert made.state.posed == 0
+    train(made, photos, steps=2)
+    assert made.state.posed > 0
+
+
 def test_poses_stay_through_a_visit_and_its_layers_show_them(make, photos):
     """They change between visits alone, and each visit's layers are drawn from where its views then are."""
     made, seen = make(steps=60), []

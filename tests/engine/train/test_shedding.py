@@ -12,7 +12,7 @@ from abcd_ns.engine.events import Mended
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.density.shedding import PASSES, faded, may_grow, price_at, weigh, worthless
+from abcd_ns.engine.train.density.shedding import PASSES, faded, fills, may_grow, price_at, weigh, worthless
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import (
@@ -29,8 +29,8 @@ STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
 HIDDEN = 20
 
 
-def statistics(weight: list[float], looks: list[float]) -> dict[str, torch.Tensor]:
-    return {"weight": torch.tensor(weight), "looks": torch.tensor(looks), "grad2d": torch.ones(len(weight))}
+def statistics(weight: list[float], passes: list[float]) -> dict[str, torch.Tensor]:
+    return {"weight": torch.tensor(weight), "passes": torch.tensor(passes), "grad2d": torch.ones(len(weight))}
 
 
 def some_hidden(seed: int = 1) -> Gaussians:
@@ -47,25 +47,43 @@ def some_hidden(seed: int = 1) -> Gaussians:
     looks=st.integers(0, 200),
 )
 def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_price(weight, views, price, looks):
-    found = worthless(statistics(weight, [float(looks)] * len(weight)), views, price).tolist()
+    found = worthless(statistics(weight, [looks / views] * len(weight)), price).tolist()
     for value, goes in zip(weight, found, strict=True):
         per_view = value / max(looks, 1)
         if abs(per_view * views - price) > 1e-3:
             assert goes == (looks >= views and per_view * views < price)
 
 
-@given(weight=st.floats(0, 100), views=st.integers(1, 50), price=st.floats(0, 20), looks=st.integers(0, 200))
-def test_who_goes_does_not_grow_and_who_was_not_weighed_may(weight, views, price, looks):
-    growth = statistics([weight if looks else 0.0], [float(looks)])
-    grows = may_grow(growth, views, price)
-    assert not bool((grows & worthless(growth, views, price) & (growth["weight"] > 0)).any())
-    assert bool(grows) or looks > 0
+@given(weight=st.floats(0, 100), price=st.floats(0, 20), passes=st.floats(0, 200))
+def test_who_goes_does_not_grow_and_who_was_not_weighed_may(weight, price, passes):
+    growth = statistics([weight if passes else 0.0], [passes])
+    grows = may_grow(growth, price)
+    assert not bool((grows & worthless(growth, price) & (growth["weight"] > 0)).any())
+    assert bool(grows) or passes > 0
+
+
+@given(
+    whole=st.integers(1, 5000), block=st.integers(1, 5000), before=st.integers(1, 20), now=st.integers(1, 9)
+)
+def test_the_warm_ups_views_and_a_blocks_own_say_the_same(whole, block, before, now):
+    """A Gaussian that fills 20 px in `block` of a scene's `whole` views, and none in the others."""
+    whole, total = max(whole, block), torch.zeros(2)
+    for views, passes in ((whole, before), (block, now)):
+        (weight, looks) = (20.0 * passes, passes * views)
+        drawn = {"weights": torch.zeros(1, 1, requires_grad=True)}
+        drawn["weights"].grad = torch.full((1, 1), weight / looks)
+        one = weigh([drawn], views)
+        total += looks * torch.cat((one["weight"], one["passes"]))
+    growth = {"weight": total[:1], "passes": total[1:]}
+    torch.testing.assert_close(fills(growth), torch.tensor([20.0]), rtol=1e-4, atol=0.0)
+    assert bool(worthless(growth, 20.1))
+    assert not bool(worthless(growth, 19.9))
 
 
 def test_what_was_seen_long_ago_counts_for_less():
-    found = faded(statistics([8.0, 8.0], [10.0, 3.0]), views=5)
+    found = faded(statistics([8.0, 8.0], [2.0, 0.6]))
     assert found["weight"].tolist() == [4.0, 8.0]
-    assert found["looks"].tolist() == [5.0, 3.0]
+    assert found["passes"].tolist() == pytest.approx([1.0, 0.6])
     assert found["grad2d"].tolist() == [1.0, 1.0]
 
 
@@ -78,7 +96,7 @@ def test_the_price_rises_with_growth_and_is_off_when_nothing_could_be_made_good(
 
 
 def test_drawings_without_weights_say_nothing():
-    assert weigh([{"means2d": torch.zeros(1, 3, 2)}]) == {}
+    assert weigh([{"means2d": torch.zeros(1, 3, 2)}], 5) == {}
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
@@ -129,7 +147,7 @@ def test_statistics_weigh_what_lies_before_the_block(tmp_path, views, photos, st
     (sample,) = batch.samples
     rendered = coordinator.render(batch)
     coordinator.loss(batch, rendered.pictures, [photos(sample.view.index, sample.crop)]).backward()
-    found = run.density.count(run.params["means"], rendered.infos)["weight"]
+    found = run.density.count(run.params["means"], rendered.infos, len(views))["weight"]
     owner = torch.cat([torch.full((coordinator.scene.count(b),), b) for b in range(2)])
     expected = weights(before, rasterizer, [replace(sample.shot, frozen=None, z_window=None)])[
         0, owner == block

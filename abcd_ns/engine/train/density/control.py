@@ -193,20 +193,21 @@ class DensityControl:
             return clock.reached(every)
         return clock.spent <= RESET_UNTIL and clock.steps // every > clock.resets
 
-    def count(self, means: Tensor, infos: Infos) -> dict[str, Tensor]:
+    def count(self, means: Tensor, infos: Infos, views: int) -> dict[str, Tensor]:
         """What drawings add to a block's statistics, after backward; by name, each [n].
 
         Args:
             means: of the block, [n, 3].
+            views: that the block is trained on.
         """
         if self.config.strategy != "default":
             return {}
         with_gradient = _with_gradient(infos)
         if not with_gradient or len(means) == 0:
             return {}
-        views = [view for info in with_gradient for view in zip(*self._norms(info), strict=True)]
-        norms, seen = (reduce(torch.add, parts) for parts in zip(*views, strict=True))
-        return {**dict(zip(GRADIENTS, (norms, seen), strict=True)), **weigh(with_gradient)}
+        drawings = [each for info in with_gradient for each in zip(*self._norms(info), strict=True)]
+        norms, seen = (reduce(torch.add, parts) for parts in zip(*drawings, strict=True))
+        return {**dict(zip(GRADIENTS, (norms, seen), strict=True)), **weigh(with_gradient, views)}
 
     def _norms(self, info: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """What DefaultStrategy._update_state adds up: norms of the gradients in each view, and 1 where there
@@ -243,7 +244,7 @@ class DensityControl:
             return growth
         if self.config.strategy == "default":
             infos = _with_gradient(infos)
-            growth = added(growth, self.count(params["means"], infos))
+            growth = added(growth, self.count(params["means"], infos, clock.views))
             if not (self.refines(clock, infos) or self.resets(clock)):
                 return growth
         device = params["means"].device
@@ -260,11 +261,9 @@ class DensityControl:
         params: Params,
         optimizers: Optimizers,
         growth: dict[str, Tensor],
-        *,
-        views: int,
         progress: float,
     ) -> dict[str, Tensor]:
-        """Take out what fills too little of the block's `views`, at a share of the run, and what is too faint
+        """Take out what fills too little of the block's views, at a share of the run, and what is too faint
         for any picture to show, which nothing would train again.
 
         Returns:
@@ -273,8 +272,8 @@ class DensityControl:
         if not self.weighs or any(name not in growth for name in WEIGHED):
             return growth
         price = price_at(self.config.price, progress, self.config.refine_stop)
-        drop = worthless(growth, views, price) | (torch.sigmoid(params["opacities"][:, 0]) < MIN_ALPHA)
-        growth = faded(growth, views)
+        drop = worthless(growth, price) | (torch.sigmoid(params["opacities"][:, 0]) < MIN_ALPHA)
+        growth = faded(growth)
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)
         return growth
@@ -302,12 +301,12 @@ class DensityControl:
         )
         state: dict[str, Any] = {"scene_scale": 1.0, **growth}
         if self.refines(clock, infos):
+            grows, room = self._may_grow(growth), clock.room
+            growth = {**growth, "grad2d": torch.where(grows, growth["grad2d"], 0.0)}
             if wide is not None:
-                wanted = torch.where(wide, 2 * config.densify_grad_thresh * growth["count"].clamp_min(1), 0.0)
-                growth = {**growth, "grad2d": torch.maximum(growth["grad2d"], wanted)}
-            growth = self._payable(growth, clock.views)
+                growth, room = _split(params, optimizers, growth, wide & grows, room)
             state |= growth
-            strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, clock.room)
+            strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, room)
             # Nothing is visible in this info, so the statistics are not gathered twice.
             unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
             strategy.step_post_backward(params, optimizers, state, REFINE, unseen)
@@ -315,12 +314,11 @@ class DensityControl:
             gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
         return {name: value for name, value in state.items() if isinstance(value, Tensor)}
 
-    def _payable(self, growth: dict[str, Tensor], views: int) -> dict[str, Tensor]:
-        """The statistics without the gradients of those that fill too little to become two."""
+    def _may_grow(self, growth: dict[str, Tensor]) -> Bool[Tensor, "n"]:
+        """Who fills enough to become two."""
         if not self.weighs or any(name not in growth for name in WEIGHED):
-            return growth
-        grows = may_grow(growth, views, self.config.price)
-        return {**growth, "grad2d": torch.where(grows, growth["grad2d"], 0.0)}
+            return torch.ones_like(growth["grad2d"], dtype=torch.bool)
+        return may_grow(growth, self.config.price)
 
     def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:
         room = len(params["means"]) if clock.room is None else clock.room
@@ -349,6 +347,26 @@ def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str,
     """Statistics of more drawings added to a block's."""
     sums = {name: growth[name] + value if name in growth else value for name, value in more.items()}
     return {**growth, **sums}
+
+
+def _split(
+    params: Params,
+    optimizers: Optimizers,
+    growth: dict[str, Tensor],
+    which: Bool[Tensor, "n"],
+    room: int | None,
+) -> tuple[dict[str, Tensor], int | None]:
+    """Make two smaller ones of each, as far as there is room; and what is left of it.
+
+    gsplat would clone those that are small in scene units, as what is near to a camera is: as wide as before.
+    """
+    if room is not None:
+        which = which & (which.cumsum(0) <= room)
+    before = len(which)
+    growth = {**growth, "grad2d": torch.where(which, 0.0, growth["grad2d"])}  # once is enough
+    if bool(which.any()):
+        gsplat_ops.split(params, optimizers, growth, which)
+    return growth, room if room is None else room - (len(params["means"]) - before)
 
 
 def _threshold_within(growth: dict[str, Tensor], threshold: float, room: int | None) -> float:

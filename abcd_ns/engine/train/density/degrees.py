@@ -18,7 +18,7 @@ from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.gaussians.sh_degrees import up_to_degree
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows
-from abcd_ns.engine.train.density.shedding import WEIGHED
+from abcd_ns.engine.train.density.shedding import WEIGHED, fills
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
@@ -86,15 +86,13 @@ def lower(
 
 
 def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[View]) -> Lowered:
-    """Gaussians with the degrees that pay. Nobody is judged before as many drawings as there are views.
+    """Gaussians with the degrees that pay. Nobody is judged who was not drawn in all views yet.
 
     Args:
         growth: with WEIGHED.
         views: that the block is trained on.
     """
-    seen = len(views)
-    weight, looks = (growth[name] for name in WEIGHED)
-    weight = torch.where(looks >= seen, weight * seen / looks.clamp_min(1.0), torch.nan)
+    weight = fills(growth)
     gone = growth.get(GONE, torch.zeros_like(weight))
     chosen = views[:: max(-(-len(views) // MOST_VIEWS), 1)]
     cameras = _beside(gaussians.means, chosen)

@@ -15,8 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-WEIGHED = ("weight", "looks")
-"""What is added up for each Gaussian: its weight, px, and the drawings in which it might have shown."""
+WEIGHED = ("weight", "passes")
+"""What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
+trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used: all of a
+scene's in the warm-up, and then those that show its block."""
+WHOLE = 0.999
+"""Of a pass, in sums that are rounded."""
 LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 GROWS = 4.0
@@ -25,44 +29,53 @@ PASSES = 4
 """A block that is the whole scene sheds whenever each of its views was drawn so often."""
 
 
-def weigh(infos: Sequence[Mapping[str, Any]]) -> dict[str, Tensor]:
-    """What drawings add to WEIGHED, after backward; each [n]. Nothing if they were drawn without weighing."""
+def weigh(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
+    """What drawings add to WEIGHED, after backward; each [n]. Nothing if they were drawn without weighing.
+
+    Args:
+        views: that the block is trained on.
+    """
     found = [info["weights"].grad for info in infos if "weights" in info]
     if not found or any(weights is None for weights in found):
         return {}
     weight = torch.cat(found).sum(dim=0)
-    looks = torch.full_like(weight, float(sum(len(weights) for weights in found)))
+    passes = torch.full_like(weight, sum(len(weights) for weights in found) / views)
     # An accelerator may have skipped a step that was no number.
-    return dict(zip(WEIGHED, (weight.nan_to_num(0.0, 0.0, 0.0), looks), strict=True))
+    return dict(zip(WEIGHED, (weight.nan_to_num(0.0, 0.0, 0.0), passes), strict=True))
 
 
-def worthless(growth: Mapping[str, Tensor], views: int, price: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians fill less than `price` pixels in all of their block's views together.
-
-    Nobody is judged before as many drawings as there are views.
+def fills(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
+    """Pixels that each fills in all of its block's views together; NaN for who was not drawn in all yet.
 
     Args:
         growth: with WEIGHED.
-        views: that see the block.
     """
-    weight, looks = (growth[name] for name in WEIGHED)
-    return (looks >= views) & (weight * views <= price * looks)
+    weight, passes = (growth[name] for name in WEIGHED)
+    return torch.where(passes >= WHOLE, weight / passes, torch.nan)
 
 
-def may_grow(growth: Mapping[str, Tensor], views: int, price: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians fill GROWS prices in all of their block's views together; those never weighed may grow.
+def worthless(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians fill less than `price` pixels; nobody is judged before a pass.
 
     Args:
         growth: with WEIGHED.
-        views: that see the block.
     """
-    weight, looks = (growth[name] for name in WEIGHED)
-    return weight * views >= GROWS * price * looks
+    return fills(growth) <= price
 
 
-def faded(growth: Mapping[str, Tensor], views: int) -> dict[str, Float[Tensor, "n"]]:
+def may_grow(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians fill GROWS prices, as far as is known by now; those never weighed may grow.
+
+    Args:
+        growth: with WEIGHED.
+    """
+    weight, passes = (growth[name] for name in WEIGHED)
+    return weight >= GROWS * price * passes
+
+
+def faded(growth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n"]]:
     """The statistics when all have been judged: what is seen from now on soon counts for more."""
-    half = torch.where(growth["looks"] >= views, 0.5, 1.0)
+    half = torch.where(growth["passes"] >= WHOLE, 0.5, 1.0)
     return {name: value * half if name in WEIGHED else value for name, value in growth.items()}
 
 

@@ -101,8 +101,7 @@ class LiveBlock:
     def shed(self) -> None:
         """Take out Gaussians that fill too little of the block's views; tells how many."""
         run, before = self._run, len(self)
-        options = {"views": len(run.active.trained_on), "progress": run.share}
-        self.growth = run.density.shed(run.params, run.optimizers, self.growth, **options)
+        self.growth = run.density.shed(run.params, run.optimizers, self.growth, run.share)
         run.health.count("shed", before - len(self))
 
     def lower_degrees(self) -> None:
