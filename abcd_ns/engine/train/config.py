@@ -115,7 +115,7 @@ class TrainingConfig:
         if density.reset_every > 0 and 2 * density.cull_alpha_thresh < MIN_ALPHA:
             raise UserError(
                 f"--pipeline.training.density.cull-alpha-thresh must be {MIN_ALPHA / 2:.4f} or more where "
-                f"opacities are reset to twice of it, not {density.cull_alpha_thresh}: nothing would show again."
+                f"opacities are reset to twice of it, not {density.cull_alpha_thresh}: nothing would show."
             )
         if self.primitive == "2dgs" and (self.antialiased or self.poses != "off"):
             name = "antialiased" if self.antialiased else "poses"

@@ -16,8 +16,8 @@ from abcd_ns.engine.types import View
 FIRST = 16.0
 """Uses of each view by the whole scene before its pose is refined: from blobs, poses only become worse."""
 LATEST = 0.3
-"""Share of the run after which it is, whatever the uses: a run of thousands of photos may never come to so many,
-and where workers train blocks poses are refined in the warm-up alone."""
+"""Share of the run after which it is, whatever the uses: a run of thousands of photos may never come to so
+many, and where workers train blocks poses are refined in the warm-up alone."""
 EVERY, SHARE = 1.0, 0.04
 """Uses of each view from round to round, at least, and as a share of all so far."""
 
