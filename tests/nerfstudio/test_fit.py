@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from abcd_ns.engine.layers.visit_layers import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
@@ -110,6 +111,13 @@ def test_a_deep_tree_leaves_less_room_where_photos_are_large():
     needs = needs_of(many, GARDEN, many.blocks_at_the_end)
     assert needs.drawing_bytes > needs.step_bytes
     assert needs.bytes_for(many.limit) <= needs.left(12 * GB)
+
+
+@given(side=st.integers(100, 6000), batch=st.integers(1, 4))
+def test_layers_that_are_folded_take_no_more_than_the_steps_that_follow(side, batch):
+    needs = DeviceNeeds(side**2, batch)
+    beside = needs.drawing_bytes - max(PARTS_BYTES, needs.levels * BYTES_PER_PIXEL * needs.pixels)
+    assert PARTS_BYTES <= needs.fold_bytes <= max(needs.fixed_bytes - beside, PARTS_BYTES)
 
 
 def test_a_cpu_keeps_layers_and_photos_under_another_budget():

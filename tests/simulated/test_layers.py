@@ -1,10 +1,14 @@
 """Where layers lie on a device: there, in RAM, or nowhere; and what is copied for it."""
 
+from collections import Counter
+
 import pytest
 import torch
 
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore
+from abcd_ns.engine.layers.painter import Painter
 from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.train import memory
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import whole_scene
@@ -77,3 +81,24 @@ def test_a_run_does_not_depend_on_where_its_layers_are(tmp_path, start, views, p
         scenes.append(whole_scene(coordinator))
     for other in scenes[1:]:
         assert all(torch.equal(value, getattr(other, name)) for name, value in scenes[0].items())
+
+
+@pytest.mark.usefixtures("simulated_gsplat")
+@pytest.mark.parametrize(("floats", "groups"), [(1, 4), (1e6, 1)])
+def test_where_steps_take_much_memory_layers_are_drawn_for_more_views_at_once(
+    tmp_path, start, views, photos, monkeypatch, floats, groups
+):
+    """Each time that blocks around the one that is visited are read, some are copied to the device anew."""
+    monkeypatch.setattr(memory, "PARTS_BYTES", 1)
+    monkeypatch.setattr(memory, "PIXEL_FLOATS", floats)
+    options = {"density": DensityConfig(strategy="off"), "warmup": 0.0, "pass_gaussians": 1, "steps": 1}
+    coordinator = on_device(tmp_path, start, views, blocks=4, **options)
+    loaded, load = Counter(), Painter.load
+
+    def counted(self, unit, **options):
+        loaded[unit] += 1
+        return load(self, unit, **options)
+
+    monkeypatch.setattr(Painter, "load", counted)
+    train(coordinator, photos, steps=1)
+    assert set(loaded.values()) == {groups}

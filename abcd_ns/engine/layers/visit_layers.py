@@ -17,7 +17,8 @@ from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
 
 PARTS_BYTES = 256 << 20
-"""Size of the layers held while units are folded, at most, unless those of a single view are larger."""
+"""Size of the layers held while units are folded, at most, unless those of a single view are larger, or the
+steps that follow take more. Each group of views that has room loads the scene around the block once."""
 BYTES_PER_PIXEL = 32
 """Of a front and a back layer in float32."""
 CROP_MARGIN = SSIM_WINDOW - 1
@@ -59,6 +60,7 @@ class VisitLayers:
         own: the block's Gaussians when the visit began; they decide the windows.
         window_weight: see TrainingConfig.
         views: all views, by index.
+        parts_bytes: size of the layers held while units are folded.
     """
 
     def __init__(
@@ -71,11 +73,12 @@ class VisitLayers:
         settings: PaintSettings,
         *,
         window_weight: float,
+        parts_bytes: int = PARTS_BYTES,
     ) -> None:
         self._painter, self._store = painter, store
         # A copy: whatever becomes of the views, these are drawn.
         self._geometry, self._views, self._settings = geometry, dict(views), settings
-        self._window_weight = window_weight
+        self._window_weight, self._parts_bytes = window_weight, parts_bytes
         self._units = painter.units(exclude=geometry.block)
         self._own = own if painter.ownership == "fragments" else None
         # All views of the block, though few may be drawn: what is loaded must not depend on which.
@@ -108,7 +111,7 @@ class VisitLayers:
             return [views]
         levels = max(map(self._painter.depth_of, self._units), default=0) + 1
         crops = [self._geometry.crops[view] for view in views]
-        return runs(views, crops, PARTS_BYTES // (levels * BYTES_PER_PIXEL))
+        return runs(views, crops, self._parts_bytes // (levels * BYTES_PER_PIXEL))
 
     def _draw_group(self, views: Sequence[int]) -> Iterator[tuple[int, Kept]]:
         """All units one after the other, each for all of these views: the device holds one at a time."""

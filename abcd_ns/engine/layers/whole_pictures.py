@@ -47,15 +47,19 @@ class _Part:
 
 
 class WholePictures:
-    """Draws a scene for it, or for poses, to be judged by."""
+    """Draws a scene for it, or for poses, to be judged by.
 
-    def __init__(self, painter: Painter, settings: PaintSettings) -> None:
-        self._painter, self._settings = painter, settings
+    Args:
+        layers_bytes: size of the layers held at a time.
+    """
+
+    def __init__(self, painter: Painter, settings: PaintSettings, layers_bytes: int = LAYERS_BYTES) -> None:
+        self._painter, self._settings, self._layers_bytes = painter, settings, layers_bytes
         self._units = painter.units()
 
     def groups(self, views: Sequence[View]) -> list[list[View]]:
         """Views whose layers have room at the same time: each group reads the scene twice."""
-        pixels = LAYERS_BYTES // (len(self._units) * BYTES_PER_PIXEL)
+        pixels = self._layers_bytes // (len(self._units) * BYTES_PER_PIXEL)
         return list(runs(views, [view.full for view in views], pixels))
 
     @torch.no_grad()

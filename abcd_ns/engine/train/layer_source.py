@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from abcd_ns.engine.events import LayersDrawn
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
-from abcd_ns.engine.layers.visit_layers import VisitLayers
+from abcd_ns.engine.layers.visit_layers import PARTS_BYTES, VisitLayers
 from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.train.memory import needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.types import View
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,14 @@ class LayerSource:
             views_in_use,
             PaintSettings(active.sh_degree, config.antialiased),
             window_weight=config.window_weight,
+            parts_bytes=self._parts_bytes(views_in_use.values()),
         )
         wanted = dict.fromkeys(views)
         for done, _ in enumerate(layers.draw(wanted), start=1):
             run.announce(LayersDrawn(active.number, done, len(wanted)))
         return layers
+
+    def _parts_bytes(self, views: Iterable[View]) -> int:
+        if self._run.device.type == "cpu":  # where a block is loaded from RAM to RAM
+            return PARTS_BYTES
+        return needs_of(self._run.config, max(view.full.pixels for view in views), 2).fold_bytes

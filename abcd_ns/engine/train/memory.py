@@ -86,8 +86,17 @@ class DeviceNeeds:
         if self.levels == 0:
             return 0
         parts = max(PARTS_BYTES, self.levels * BYTES_PER_PIXEL * self.pixels)
+        return parts + self._drawn_bytes
+
+    @property
+    def _drawn_bytes(self) -> int:
         frozen = LEAST_PASS * self.parameter_bytes + DEVICE_SPLATS * projected_bytes(self.primitive)
-        return parts + max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT + frozen
+        return max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT + frozen
+
+    @property
+    def fold_bytes(self) -> int:
+        """Of the layers that are held while they are folded: what the steps that follow will take anyway."""
+        return max(PARTS_BYTES, self.step_bytes - self._drawn_bytes)
 
     @property
     def fixed_bytes(self) -> int:
@@ -122,19 +131,17 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
         block: Gaussians of the largest block, one of several.
         pixels: of the largest image.
     """
-    batches = (
-        views_per_step(config.batch, 2, config.limits.batch_limit),
-        views_per_step(config.batch, 1),
-    )
-    options = {
-        "crop_pixels": config.limits.crop_pixels,
-        "primitive": config.primitive,
-        "drawings": drawings_of(config),
-    }
-    visit, warm_up = (DeviceNeeds(pixels, n, config.sh_degree, **options) for n in batches)
+    visit, warm_up = (needs_of(config, pixels, blocks) for blocks in (2, 1))
     # By steps alone: room for layers, which a visit needs and the warm-up does not, would hold many blocks.
     room = visit.step_bytes + block * visit.gaussian_bytes - warm_up.step_bytes
     return config.limits.scaffold_gaussians or room // warm_up.gaussian_bytes
+
+
+def needs_of(config: TrainingConfig, pixels: int, blocks: int) -> DeviceNeeds:
+    """Of a run on images of so many pixels at most, in so many blocks, what depends on neither."""
+    batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
+    options = {"primitive": config.primitive, "drawings": drawings_of(config)}
+    return DeviceNeeds(pixels, batch, config.sh_degree, config.limits.crop_pixels, **options)
 
 
 def drawings_of(config: TrainingConfig) -> int:

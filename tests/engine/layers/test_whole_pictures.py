@@ -6,9 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.layers import whole_pictures
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
-from abcd_ns.engine.layers.whole_pictures import WholePictures
+from abcd_ns.engine.layers.whole_pictures import BYTES_PER_PIXEL, WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scene import MemoryScene
@@ -19,10 +18,10 @@ SCENE = random_gaussians(60, size=0.15, dtype=torch.float64)
 VIEWS = ring_of_views(3, dtype=torch.float64)
 
 
-def whole_pictures_of(pass_gaussians: int) -> WholePictures:
+def whole_pictures_of(pass_gaussians: int, *layers_bytes: int) -> WholePictures:
     scene = MemoryScene(build_kd(SCENE.means, 4), SCENE)
     painter = Painter(scene, VIEWS, TorchRasterizer(), ownership="fragments", pass_gaussians=pass_gaussians)
-    return WholePictures(painter, PaintSettings(sh_degree=1))
+    return WholePictures(painter, PaintSettings(sh_degree=1), *layers_bytes)
 
 
 def weights_for(view):
@@ -80,11 +79,8 @@ def test_pictures_are_those_of_all_at_once(pass_gaussians):
             assert torch.allclose(getattr(picture, name), getattr(merged, name), atol=1e-3), name
 
 
-def test_views_are_drawn_together_as_far_as_their_layers_have_room(monkeypatch):
-    pictures = whole_pictures_of(0)
-    assert [len(group) for group in pictures.groups(VIEWS)] == [3]
-    one = 4 * whole_pictures.BYTES_PER_PIXEL * VIEWS[0].full.pixels
-    monkeypatch.setattr(whole_pictures, "LAYERS_BYTES", 2 * one)
-    assert [len(group) for group in pictures.groups(VIEWS)] == [2, 1]
-    monkeypatch.setattr(whole_pictures, "LAYERS_BYTES", 1)
-    assert [len(group) for group in pictures.groups(VIEWS)] == [1, 1, 1]
+def test_views_are_drawn_together_as_far_as_their_layers_have_room():
+    assert [len(group) for group in whole_pictures_of(0).groups(VIEWS)] == [3]
+    one = 4 * BYTES_PER_PIXEL * VIEWS[0].full.pixels
+    assert [len(group) for group in whole_pictures_of(0, 2 * one).groups(VIEWS)] == [2, 1]
+    assert [len(group) for group in whole_pictures_of(0, 1).groups(VIEWS)] == [1, 1, 1]
