@@ -171,12 +171,6 @@ def test_a_run_that_stops_goes_on(tmp_path, views, photos):
         assert torch.allclose(getattr(found, name), value, rtol=1e-4, atol=1e-4), name
 
 
-def test_every_block_sees_every_step_and_so_refines_as_one(tmp_path, views, start):
-    for blocks in (1, 4):
-        coordinator = exact(tmp_path / str(blocks), start, views, blocks=blocks)
-        assert coordinator._clock_of(0, 1, 100, 1).usual == 100
-
-
 def test_views_of_a_step_may_differ_in_size(tmp_path):
     """What density control counts is what it counts in one drawing of the whole batch."""
     views = [*ring_of_views(2), *ring_of_views(2, width=90)]

@@ -23,6 +23,7 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, Target
 from abcd_ns.engine.train.step.last_shedding import LastShedding
+from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
@@ -39,6 +40,7 @@ class Coordinator(Trainer):
         visits: decides which; None for ABCD's own.
         source: gives visits their layers; None for the run's scene, and little room.
         target: gives what a sample is trained on; needed where poses are refined, and for a last shedding.
+        live: the block in training; None for one that nobody else looks after.
     """
 
     def __init__(
@@ -47,10 +49,11 @@ class Coordinator(Trainer):
         visits: Visits | None = None,
         source: LayerSource | None = None,
         target: Callable[[Sample], Target] | None = None,
+        live: LiveBlock | None = None,
     ) -> None:
         super().__init__(run)
         self.visits, self.source = visits or Planner(run), source or LayerSource(run)
-        self.visit = VisitTraining(run, self.visits, self.source)
+        self.visit = VisitTraining(run, self.visits, self.source, live)
         if run.config.poses != "off" and target is None:
             raise ValueError("poses are refined by photos: give `target`")
         self.poses = None if run.config.poses == "off" else PoseRounds(run, target)

@@ -27,12 +27,19 @@ class VisitTraining:
     Args:
         visits: on what terms the block is trained.
         source: gives visits their layers.
+        live: the block in training; None for one that nobody else looks after.
     """
 
-    def __init__(self, run: TrainingRun, visits: Visits, source: LayerSource) -> None:
+    def __init__(
+        self,
+        run: TrainingRun,
+        visits: Visits,
+        source: LayerSource,
+        live: LiveBlock | None = None,
+    ) -> None:
         self.run, self._visits = run, visits
         self.steps = StepDrawing(run, source)
-        self.live = LiveBlock(run)
+        self.live = LiveBlock(run) if live is None else live  # one that is empty yet is false
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
