@@ -136,8 +136,7 @@ class AbcdModel(SplatfactoModel):
         read everything from disk."""
         if self._coordinator is None:
             return live_gaussians(self.gauss_params).detach()
-        scene = self._coordinator.scene
-        return Gaussians.cat([scene.drawn(block, device) for block in range(scene.tree.num_blocks)])
+        return self._coordinator.scene.everything(device)
 
     def initial_gaussians(self, views: Sequence[View], point_pixels: float) -> Gaussians:
         """What a run begins with: random Gaussians, or one for each point that the views can tell apart.

@@ -313,6 +313,13 @@ class StoredScene(VisitScene):
             return super().drawn(block, device, which)
         return self._seen_at_rest(block, device, which)
 
+    def everything(self, device: torch.device | str) -> Gaussians:
+        """All blocks, one after the other."""
+        if self.is_live_as_a_whole:  # who lives where is asked once
+            live = self._live[1]().detach()
+            return live[self.tree.assign(live.means).argsort(stable=True)].to(device)
+        return Gaussians.cat([self.drawn(block, device) for block in range(self.tree.num_blocks)])
+
     def _seen_at_rest(self, block: int, device: torch.device | str, which: Which | None) -> Gaussians:
         packed, mail = self._packed(block, whole=False), self.mail(block)
         rows = ~packed.tensors[WAITS]  # they are not to be seen before the block's next visit

@@ -106,6 +106,8 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, 
     scene, visited = coordinator.scene, set()
     train(coordinator, photos, steps=10)
     assert len(whole_scene(coordinator)) == 30
+    for name, value in whole_scene(coordinator).items():
+        assert torch.equal(getattr(scene.everything("cpu"), name), value), name
     while len(visited) < 4:
         coordinator.next_batch()
         active = coordinator.state.active
@@ -121,6 +123,7 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, 
             assert 0 < len(scene.gaussians(block)) < scene.count(block)
         train_step(coordinator, photos)
     assert len(whole_scene(coordinator)) == coordinator.count() == 120
+    assert torch.equal(scene.everything("cpu").means, whole_scene(coordinator).means)
 
 
 @pytest.mark.parametrize("stop", [4, 10, 13])
