@@ -156,6 +156,21 @@ def test_a_visit_that_made_its_pictures_worse_is_undone(tmp_path, views, photos,
     assert (record.undone, record.damping) == (1, 0.5)
 
 
+def test_who_waited_for_an_undone_visit_is_not_seen_before_the_next(
+    tmp_path, views, photos, start, monkeypatch
+):
+    """Untrained, they would be fog to all other blocks."""
+    monkeypatch.setattr("abcd_ns.engine.train.health.health.loss_rise", lambda _: (1.0, 2.0, 0.0))
+    monkeypatch.setattr("abcd_ns.engine.train.health.health.is_worse", lambda *_: True)
+    options = {"blocks": 2, "steps": 60, "scaffold": 60, "warmup": 0.25, "density": STILL}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    undone, scene = listen(coordinator, VisitUndone), coordinator.scene
+    while not undone and not coordinator.finished:
+        train(coordinator, photos, steps=1)
+    (event,) = undone
+    assert 0 < len(scene.gaussians(event.block)) < scene.count(event.block)
+
+
 def test_the_visit_after_an_undone_one_is_damped(tmp_path, views, photos, start):
     options = {"blocks": 2, "steps": 60, "density": STILL, "batch": 1}
     coordinator = make_coordinator(tmp_path, start, views, **options)

@@ -19,7 +19,7 @@ from abcd_ns.engine.events import Announcer, Mended, VisitUndone
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.store.scene import VisitScene
-from abcd_ns.engine.store.settle import state_for_visit
+from abcd_ns.engine.store.settle import state_for_visit, with_mail
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health.health_rules import (
     GIANT_ANGLE,
@@ -183,7 +183,7 @@ class Health:
         record.undone += 1
         record.damping = max(record.damping / 2, LEAST_DAMPING)
         self._announce(VisitUndone(active.number, active.geometry.block, rise[0], rise[1]))
-        before = state_for_visit(self._scene, active.geometry.block)
+        before = with_mail(self._scene, active.geometry.block)  # who has waited waits for the next visit
         clocks = replace(state.clocks, adam_views=before.clocks.adam_views)
         return replace(before, clocks=clocks)
 
