@@ -52,7 +52,7 @@ _RAYS = "it is about rays, and Gaussians are not drawn by rays"
 UNUSED_OF_MODEL = {
     "warmup_length": "set --pipeline.training.density.refine-start, a share of the run, instead",
     "stop_split_at": "set --pipeline.training.density.refine-stop, a share of the run, instead",
-    "reset_alpha_every": "set --pipeline.training.density.reset-every, in steps, instead",
+    "reset_alpha_every": "set --pipeline.training.density.reset-every, in views drawn, instead",
     **{name: f"set --pipeline.training.density.{flag} instead" for name, flag in SAME[DensityConfig].items()},
     **dict.fromkeys(("cull_scale_thresh", "densify_size_thresh", "n_split_samples"), _FIXED),
     "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",

@@ -62,9 +62,10 @@ class DensityConfig:
     """Share of the run after which none is cloned or split; a block grows in its first visit all the same,
     unless that is in the last third. Who fills less than the `price` goes later, too."""
     refine_every: int = 100
-    """A block's own steps between refinements; never fewer than the views that show the block."""
+    """Views drawn to train a block between its refinements; never fewer than show the block, but half of a
+    first visit's at most."""
     reset_every: int = 3000
-    """A block's own steps between opacity resets (`default` strategy); 0 means never."""
+    """Views drawn to train a block between opacity resets (`default` strategy); 0 means never."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
     densify_grad_thresh: float = 0.0008
