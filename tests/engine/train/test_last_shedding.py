@@ -45,11 +45,11 @@ def pictured(ring):
     return Photos(random_gaussians(150, seed=7, size=0.12), ring)
 
 
-def completed(folder, ring, pictured, **options):
+def completed(folder, ring, pictured, start=None, **options):
     """A complete run, and what it said of its last shedding."""
     options = {"blocks": 1, "steps": 40, "density": STILL, "batch": 1, "background": "black", **options}
     target = lambda sample: (pictured(sample.view.index, sample.crop), None)  # noqa: E731
-    coordinator = make_coordinator(folder, scene(), ring, target=target, **options)
+    coordinator = make_coordinator(folder, start or scene(), ring, target=target, **options)
     told: list = []
     coordinator.announce.subscribe(told.append)
     train(coordinator, pictured)
@@ -117,14 +117,13 @@ def test_who_shows_in_no_view_goes_first(tmp_path, ring, pictured):
     assert float(whole_scene(coordinator).means[:, 2].max()) < 40
 
 
-def test_who_is_opaque_is_not_taken_for_one_that_does_not_show(tmp_path, ring, pictured, monkeypatch):
+def test_who_is_opaque_is_not_taken_for_one_that_does_not_show(tmp_path, ring, pictured):
     """Its alpha is at its limit wherever it is drawn: no gradient tells of its opacity."""
     opaque, start = 10, scene()
     start.means[:opaque] *= 0.5
     start.scales[:opaque] = -0.7
     start.opacities[:opaque] = 20.0
-    monkeypatch.setitem(globals(), "scene", lambda: start)
-    coordinator, told = completed(tmp_path, ring, pictured)
+    coordinator, told = completed(tmp_path, ring, pictured, start)
     assert at_end(told).gone >= FAINT // 3
     assert int((whole_scene(coordinator).opacities > 8).sum()) == opaque
 
