@@ -117,7 +117,7 @@ def test_a_deep_tree_leaves_less_room_where_photos_are_large():
 def test_layers_that_are_folded_take_no_more_than_the_steps_that_follow(side, batch):
     needs = DeviceNeeds(side**2, batch)
     beside = needs.drawing_bytes - max(PARTS_BYTES, needs.levels * BYTES_PER_PIXEL * needs.pixels)
-    assert PARTS_BYTES <= needs.fold_bytes <= max(needs.fixed_bytes - beside, PARTS_BYTES)
+    assert PARTS_BYTES <= needs.parts_bytes <= max(needs.fixed_bytes - beside, PARTS_BYTES)
 
 
 def test_a_cpu_keeps_layers_and_photos_under_another_budget():

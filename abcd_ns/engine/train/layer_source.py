@@ -78,4 +78,4 @@ class LayerSource:
     def _parts_bytes(self, views: Iterable[View]) -> int:
         if self._run.device.type == "cpu":  # where a block is loaded from RAM to RAM
             return PARTS_BYTES
-        return needs_of(self._run.config, max(view.full.pixels for view in views), 2).fold_bytes
+        return needs_of(self._run.config, max(view.full.pixels for view in views), 2).parts_bytes

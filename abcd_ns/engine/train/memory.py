@@ -94,7 +94,7 @@ class DeviceNeeds:
         return max(self.pixels, DEVICE_PIXELS) * DRAWN_FLOATS * FLOAT + frozen
 
     @property
-    def fold_bytes(self) -> int:
+    def parts_bytes(self) -> int:
         """Of the layers that are held while they are folded: what the steps that follow will take anyway."""
         return max(PARTS_BYTES, self.step_bytes - self._drawn_bytes)
 
@@ -138,7 +138,7 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
 
 
 def needs_of(config: TrainingConfig, pixels: int, blocks: int) -> DeviceNeeds:
-    """Of a run on images of so many pixels at most, in so many blocks, what depends on neither."""
+    """What a visit takes in a run on images of so many pixels at most, in one block or several."""
     batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
     options = {"primitive": config.primitive, "drawings": drawings_of(config)}
     return DeviceNeeds(pixels, batch, config.sh_degree, config.limits.crop_pixels, **options)

@@ -283,9 +283,8 @@ def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, waiti
 
 
 def merged(coordinator: Coordinator) -> Gaussians:
-    """All blocks in one list, in the order of the blocks, without a graph."""
-    scene = coordinator.scene
-    return Gaussians.cat([scene.gaussians(block) for block in range(scene.tree.num_blocks)]).detach()
+    """All blocks in one list, in the order of the blocks, on the CPU and without a graph."""
+    return coordinator.scene.everything("cpu")
 
 
 def block_at(tree: BlockTree, *place: float) -> int:

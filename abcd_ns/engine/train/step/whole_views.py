@@ -64,7 +64,7 @@ class WholeViews:
         room = LAYERS_BYTES
         if run.device.type != "cpu":  # half of what a visit's have: here a view is drawn backward beside them
             largest = max(view.full.pixels for view in views)
-            room = max(room, needs_of(run.config, largest, 2).fold_bytes // 2)
+            room = max(room, needs_of(run.config, largest, 2).parts_bytes // 2)
         return WholePictures(painter, PaintSettings(run.sh_degree, run.config.antialiased), room)
 
     def beside(self, view: View, shown: Float[Tensor, "h w 3"]) -> Beside:
