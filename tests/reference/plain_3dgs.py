@@ -27,7 +27,7 @@ def train_plain(
     draw, density, growth = TorchRasterizer(), DensityControl(config.density), {}
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
-        share = settling(taken / steps) * rates_of_young(taken, 1)
+        share = settling(taken / steps, taken) * rates_of_young(taken, 1)
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, 1.0, config.means_lr_decay) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * share

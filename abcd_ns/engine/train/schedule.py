@@ -34,7 +34,9 @@ SHORTER = 4
 """Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
 others have made of themselves meanwhile."""
 SETTLES, SETTLED = 0.6, 0.1
-"""From this share of a run on learning rates fall, to this share of them."""
+"""From this share of a run on learning rates fall, to this share of them ..."""
+WAY = 1000
+"""... where a block was trained on so many views: one that saw fewer is on its way yet."""
 FROZEN_COST, WINDOW_COST = 0.3, 0.4
 """Of drawing a Gaussian into a layer, and of finding its block's window; a training step draws one for 1."""
 
@@ -194,9 +196,10 @@ def exponential_decay(progress: float, initial: float, final: float) -> float:
     return initial * (final / initial) ** min(max(progress, 0.0), 1.0)
 
 
-def settling(progress: float) -> float:
-    """The share of learning rates that is left, see SETTLES; a first visit, perhaps the only one, has all."""
-    return exponential_decay((progress - SETTLES) / (1 - SETTLES), 1.0, SETTLED)
+def settling(progress: float, views: int) -> float:
+    """The share of learning rates that is left, see SETTLES, to a block that was trained on so many views."""
+    settled = SETTLED ** min(views / WAY, 1.0)
+    return exponential_decay((progress - SETTLES) / (1 - SETTLES), 1.0, settled)
 
 
 def reduction_at(progress: float, coarse: float, shortest: int) -> int:

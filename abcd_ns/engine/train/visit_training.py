@@ -72,9 +72,11 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next."""
         run = self.run
         decay = exponential_decay(run.share, 1.0, run.config.means_lr_decay)
+        # A first visit, perhaps the only one, has all.
         settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
-        damping = run.health.damping * (settling(run.progress) if settles else 1.0)
-        self._pace.set(self.batch, self.live.clocks.adam_views, decay, damping)
+        trained = self.live.clocks.adam_views
+        damping = run.health.damping * (settling(run.progress, trained) if settles else 1.0)
+        self._pace.set(self.batch, trained, decay, damping)
         return self.steps.next_batch()
 
     def render(self, batch: Batch) -> Rendered:

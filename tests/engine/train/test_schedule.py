@@ -100,10 +100,15 @@ def test_learning_rate_decays_exponentially():
 
 
 def test_rates_of_one_block_fall_at_the_end_of_the_run():
-    assert [settling(progress) for progress in (0.0, 0.3, 0.6)] == [1.0, 1.0, 1.0]
-    assert settling(0.8) == pytest.approx(10**-0.5)
-    assert settling(1.0) == pytest.approx(0.1)
-    assert settling(3.0) == pytest.approx(0.1)  # a budget of seconds that was overdrawn
+    assert [settling(progress, 5000) for progress in (0.0, 0.3, 0.6)] == [1.0, 1.0, 1.0]
+    assert settling(0.8, 5000) == pytest.approx(10**-0.5)
+    assert settling(1.0, 5000) == pytest.approx(0.1)
+    assert settling(3.0, 5000) == pytest.approx(0.1)  # a budget of seconds that was overdrawn
+
+
+def test_rates_of_a_block_that_saw_few_views_hardly_fall():
+    assert settling(1.0, 0) == 1.0
+    assert settling(1.0, 100) == pytest.approx(10**-0.1)
 
 
 def test_degree_of_30000_steps_is_splatfactos():
