@@ -1,7 +1,7 @@
 """Trains single visits of somebody else's run, on parameters of its own."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -75,6 +75,7 @@ class VisitWorker:
 
     Args:
         target: gives what a sample is trained on.
+        expect: is told the views of the steps to come.
     """
 
     def __init__(
@@ -83,9 +84,10 @@ class VisitWorker:
         rasterizer: Rasterizer,
         target: Callable[[Sample], Target],
         device: torch.device | str = "cpu",
+        expect: Callable[[Iterable[int]], None] = lambda _: None,
     ) -> None:
         self._setup, self._rasterizer = setup, rasterizer
-        self._target, self._device = target, torch.device(device)
+        self._target, self._device, self._expect = target, torch.device(device), expect
 
     def visit(
         self,
@@ -163,6 +165,7 @@ class VisitWorker:
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
         batch = training.next_batch()
         targets = [self._target(sample) for sample in batch.samples]
+        self._expect(batch.coming)
         rendered = training.render(batch)
         pictures, photos, wanted = [], [], []
         for sample, picture, (photo, counts) in zip(batch.samples, rendered.pictures, targets, strict=True):

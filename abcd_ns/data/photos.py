@@ -2,7 +2,8 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +20,10 @@ from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.picture_files import has_alpha, open_picture, undecodable
 from abcd_ns.data.undistort import Undistortion
 
+READERS = 4
+"""Threads that decode what is expected."""
+EXPECTED = 16
+"""Pictures that may be decoded, beyond the budget, before anybody asks for them."""
 _MASK_USED = 255
 
 
@@ -83,7 +88,14 @@ class Photos:
         Raises:
             InputError: the file is gone, damaged or has another size than when it was checked.
         """
-        return self._cache.get(("image", index), lambda: _read_photo(self.sources[index]))
+        return self._cache.get(("image", index), self._read)
+
+    def expect(self, indices: Iterable[int]) -> None:
+        """Begin to decode these photos and their masks, if they are not kept, for whoever asks next."""
+        for index in indices:
+            self._cache.expect(("image", index), self._read)
+            if self.sources[index].mask_path is not None:
+                self._cache.expect(("mask", index), self._read)
 
     def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
         """Which pixels count, or None where the photo has no mask. Do not write to it.
@@ -95,7 +107,11 @@ class Photos:
         """
         if self.sources[index].mask_path is None:
             return None
-        return self._cache.get(("mask", index), lambda: _read_mask(self.sources[index]))
+        return self._cache.get(("mask", index), self._read)
+
+    def _read(self, key: "_Key") -> Tensor:
+        kind, index = key
+        return (_read_photo if kind == "image" else _read_mask)(self.sources[index])
 
 
 def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UInt8[np.ndarray, "y x c"]:
@@ -159,6 +175,10 @@ def _read_mask(source: PhotoSource) -> Tensor:
     return torch.from_numpy(used == _MASK_USED)
 
 
+_Key = tuple[Literal["image", "mask"], int]
+_Read = Callable[[_Key], Tensor]
+
+
 class _ByteCache:
     """Least recently used tensors go first. Two threads may both make one."""
 
@@ -166,19 +186,33 @@ class _ByteCache:
         self.budget = budget
         self.used = 0
         self._lock = threading.Lock()
-        self._kept: OrderedDict[tuple[Literal["image", "mask"], int], Tensor] = OrderedDict()
+        self._kept: OrderedDict[_Key, Tensor] = OrderedDict()
+        self._expected: OrderedDict[_Key, Future[Tensor]] = OrderedDict()
+        self._readers: ThreadPoolExecutor | None = None
 
-    def get(self, key: tuple[Literal["image", "mask"], int], make: Callable[[], Tensor]) -> Tensor:
+    def expect(self, key: _Key, make: _Read) -> None:
+        """Make it on another thread, for the next `get`."""
+        with self._lock:
+            if key in self._kept or key in self._expected:
+                return
+            if self._readers is None:
+                self._readers = ThreadPoolExecutor(READERS, "photos")
+            self._expected[key] = self._readers.submit(make, key)
+            while len(self._expected) > EXPECTED:  # nobody asked for it: its visit is over
+                self._expected.popitem(last=False)[1].cancel()
+
+    def get(self, key: _Key, make: _Read) -> Tensor:
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        value = make()  # not under the lock: several threads decode at once
+            expected = self._expected.pop(key, None)
+        value = make(key) if expected is None else expected.result()  # not under the lock
         with self._lock:
             self._keep(key, value)
         return value
 
-    def _keep(self, key: tuple[Literal["image", "mask"], int], value: Tensor) -> None:
+    def _keep(self, key: _Key, value: Tensor) -> None:
         if value.nbytes > self.budget or key in self._kept:
             return
         self._kept[key] = value

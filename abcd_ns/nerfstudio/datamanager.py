@@ -1,7 +1,7 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -166,6 +166,11 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         shot = sample.view.index, sample.source
         return sample.reduced(self.photo(*shot)), sample.reduced_mask(self.mask(*shot))
 
+    def expect(self, rows: Iterable[int]) -> None:
+        """Begin to read training photos that are not on the device; a CPU has its threads busy."""
+        if torch.device(self.device).type != "cpu":
+            self.train_dataset.photos.expect(row for row in rows if ("photo", row) not in self._on_device)
+
     def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
         """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""
         return self._pixels("mask", row, self.train_dataset.photos.mask, crop)
@@ -193,6 +198,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
         photos, masks = map(list, zip(*map(self.shown, samples.samples), strict=True))
+        self.expect(samples.coming)
         batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
         if any(mask is not None for mask in masks):
             batch["mask"] = masks

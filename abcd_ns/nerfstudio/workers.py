@@ -161,4 +161,5 @@ def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int)
     data.device_photo_bytes = device_photo_bytes
 
     drawn_by, primitive = config.pipeline.model.rasterizer, setup.config.primitive
-    return VisitWorker(setup, make_rasterizer(drawn_by, device, primitive=primitive), data.target, device)
+    rasterizer = make_rasterizer(drawn_by, device, primitive=primitive)
+    return VisitWorker(setup, rasterizer, data.target, device, data.expect)

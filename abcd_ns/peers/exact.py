@@ -37,7 +37,7 @@ from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.train.density.control import DensityClock
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
-from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, background, part_to_draw
+from abcd_ns.engine.train.step.batch import COMING, Batch, Rendered, Sample, background, part_to_draw
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer
 
@@ -99,14 +99,15 @@ class ExactTrainer(Trainer):
         decay = exponential_decay(self.progress, 1.0, self.config.means_lr_decay)
         self._pace.set(self.batch, self.state.step * self.batch, decay)
         step, views = self.state.step, self.run.views_at(self.run.reduction)
-        rows, samples = tuple(sorted(views)), []
+        rows, samples, first = tuple(sorted(views)), [], step * self.batch
+        order = [endless_order(rows, first + k, self.config.seed) for k in range(self.batch + COMING)]
         for place in range(self.batch):
-            view = views[endless_order(rows, step * self.batch + place, self.config.seed)]
+            view = views[order[place]]
             behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
             crop = part_to_draw(self.config, view.full, step, place)
             share = crop.pixels / view.full.pixels
             samples.append(Sample(view, crop, None, None, behind, share))
-        return Batch(step, tuple(samples))
+        return Batch(step, tuple(samples), tuple(order[self.batch :]))
 
     def render(self, batch: Batch) -> Rendered:
         """Pass 1: all blocks' layers, folded; differentiable in the pictures alone."""

@@ -15,6 +15,7 @@ from PIL import Image
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.ply import read_points
+from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -241,6 +242,17 @@ def test_nerfstudios_datamanager_takes_it(tmp_path):
     camera, data = manager.next_train(0)
     expected = manager.train_dataset.photos.image(camera.metadata["cam_idx"])
     assert torch.equal(data["image"], expected)
+
+
+@pytest.mark.parametrize(("device", "read"), [("cpu", []), ("cuda", [0, 2])])
+def test_photos_of_the_next_steps_are_read_ahead_of_a_device(scene, monkeypatch, device, read):
+    """But for those that are kept there."""
+    manager = AbcdDataManagerConfig(data=scene).setup(device="cpu", test_mode="val")
+    manager.device, manager._on_device["photo", 1] = device, torch.empty(0)
+    expected: list[int] = []
+    monkeypatch.setattr(manager.train_dataset.photos, "expect", expected.extend)
+    manager.expect([0, 1, 2])
+    assert expected == read
 
 
 def test_check_reads_once_and_names_faults(scene):

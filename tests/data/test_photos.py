@@ -1,5 +1,6 @@
 """Pixels: exact where nothing is to be done, an area mean where reduced, the lens's rays if undistorted."""
 
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -131,6 +132,43 @@ def test_threads_agree_on_photos(sources):
     with ThreadPoolExecutor(4) as pool:
         assert all(pool.map(work, range(4)))
     assert photos.cached_bytes == len(sources) * WIDTH * HEIGHT * 3
+
+
+def test_expected_photo_is_read_once_and_before_it_is_asked_for(sources, monkeypatch):
+    reads = _count_reads(monkeypatch)
+    photos = Photos(sources, 0)
+    photos.expect([2, 1, 2])
+    photos._cache._readers.shutdown(wait=True)
+    assert sorted(reads) == [1, 2]
+    assert all(np.array_equal(photos.image(i).numpy(), noise(i)) for i in (1, 2))
+    assert sorted(reads) == [1, 2]
+    photos.image(1)  # expected once, and no budget to keep it
+    assert sorted(reads) == [1, 1, 2]
+
+
+def test_kept_photo_is_not_read_again_because_it_is_expected(sources, monkeypatch):
+    reads = _count_reads(monkeypatch)
+    photos = Photos(sources)
+    photos.image(0)
+    photos.expect([0])
+    photos.image(0)
+    assert reads == [0]
+
+
+def test_expected_photos_that_nobody_asks_for_are_let_go(sources, monkeypatch):
+    monkeypatch.setattr("abcd_ns.data.photos.EXPECTED", 2)
+    photos = Photos(sources, 0)
+    photos.expect(range(len(sources)))
+    assert len(photos._cache._expected) == 2
+    assert all(np.array_equal(photos.image(i).numpy(), noise(i)) for i in range(len(sources)))
+
+
+def test_expected_photo_that_is_gone_is_told_to_who_asks(sources):
+    photos = Photos(sources, 0)
+    sources[1].path.unlink()
+    photos.expect([1])
+    with pytest.raises(InputError, match=re.escape(str(sources[1].path))):
+        photos.image(1)
 
 
 def _count_reads(monkeypatch) -> list[int]:

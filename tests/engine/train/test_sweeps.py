@@ -1,9 +1,13 @@
-"""Which blocks a sweep visits, how blocks grow in the first, and how rates fall at the end."""
+"""Which blocks a sweep visits, what is known of views ahead, how blocks grow in the first sweep, and how rates
+fall at the end."""
+
+import pytest
 
 from abcd_ns.engine.events import SweepEnded, VisitBegan
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import LOOK_AGAIN
+from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import listen, make_coordinator
 
@@ -28,7 +32,29 @@ def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(tmp_path, vie
         coordinator.state.health.clear()
 
 
-def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(tmp_path, views, photos, start):
+@pytest.mark.parametrize("blocks", [1, 4])
+def test_a_batch_tells_the_views_of_the_steps_to_come(tmp_path, views, start, blocks):
+    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=24)
+    told: dict[int, list[tuple[int, ...]]] = {}
+    drawn: dict[int, list[int]] = {}
+    while not coordinator.finished:
+        batch = coordinator.next_batch()
+        visit = coordinator.run.active.number
+        told.setdefault(visit, []).append(batch.coming)
+        drawn.setdefault(visit, []).extend(sample.view.index for sample in batch.samples)
+        rendered = coordinator.render(batch)
+        coordinator.after_step(rendered)
+    for visit, order in drawn.items():
+        for step, coming in enumerate(told[visit], start=1):
+            follows = order[step * coordinator.batch :][:COMING]
+            assert list(coming[: len(follows)]) == follows
+    assert any(any(coming) for coming in told.values())
+
+
+def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(
+    tmp_path, views, photos, start, monkeypatch
+):
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.WAY", 1)  # these blocks see a few dozen views
     still = DensityConfig(strategy="off")
     options = {"steps": 55, "density": still, "visit_steps": 5, "fast_start": True}
     coordinator = make_coordinator(tmp_path, start, views, blocks=7, **options)

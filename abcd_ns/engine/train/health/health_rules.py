@@ -24,7 +24,7 @@ WIDE_ANGLE = 0.05
 whatever their gradients: what lies before and behind such a one cannot be sorted from everywhere."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
-DISTANCES_AT_ONCE = 1 << 24
+DISTANCES_AT_ONCE = 1 << 22
 """Between Gaussians and cameras."""
 RISE = 0.1
 """A visit is undone if the loss of its views rose by more than this share ..."""
@@ -57,11 +57,16 @@ def wider_than(
     cameras = upload(torch.cat((centers_of(views), near), dim=1).to(means.dtype), means.device)
     nearest = means.new_full((len(means),), math.inf)
     for few in cameras.split(max(DISTANCES_AT_ONCE // max(len(means), 1), 1)):
-        # Not by a matrix product, which loses what is near to a camera.
-        distances = torch.cdist(means, few[:, :3], compute_mode="donot_use_mm_for_euclid_dist")
-        nearest = torch.minimum(nearest, torch.maximum(distances, few[:, 3]).amin(dim=1))
+        nearest = torch.minimum(nearest, torch.maximum(_distances(means, few[:, :3]), few[:, 3]).amin(dim=1))
     allowed = (angle * nearest).log()[:, None]
     return scales > allowed, allowed
+
+
+def _distances(ours: Float[Tensor, "n 3"], theirs: Float[Tensor, "m 3"]) -> Float[Tensor, "n m"]:
+    """Not by a matrix product, which loses what is near."""
+    if ours.device.type == "cpu":  # elsewhere this makes a block of threads for each distance
+        return torch.cdist(ours, theirs, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.linalg.vector_norm(ours[:, None] - theirs, dim=-1)
 
 
 @torch.no_grad()

@@ -24,6 +24,8 @@ Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
 """What a sample's picture should be, 0..1, and where that counts: [h, w, 1], None for everywhere."""
 BACKGROUNDS = 1024
 """Steps whose backgrounds are copied to a device together."""
+COMING = 8
+"""Views of which is known that they are next."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,8 @@ class Batch:
 
     step: int
     samples: tuple[Sample, ...]
+    coming: tuple[int, ...] = ()
+    """Views of the next steps, COMING of them as far as they are known: photos may be read ahead."""
 
     def losses(
         self,

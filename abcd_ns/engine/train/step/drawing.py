@@ -15,7 +15,7 @@ from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.train.schedule import endless_order, view_order, views_per_step
-from abcd_ns.engine.train.step.batch import Backgrounds, Batch, Rendered, Sample, part_to_draw
+from abcd_ns.engine.train.step.batch import COMING, Backgrounds, Batch, Rendered, Sample, part_to_draw
 from abcd_ns.engine.train.step.normal_consistency import BEGINS, normal_consistency
 from abcd_ns.engine.train.step.weighing import weighed
 from abcd_ns.engine.types import Crop, View
@@ -61,19 +61,21 @@ class StepDrawing:
             shown[view] = share_shown(live, run.rasterizer, seen.shot, seen.in_front, **options)
         return shown
 
-    def _views_of_step(self) -> tuple[int, ...]:
-        active = self._run.active
-        places = range(active.done * self.batch, (active.done + 1) * self.batch)
+    def _views_of(self, places: range) -> tuple[int, ...]:
+        """What is drawn at these places of the visit; fewer where it ends before."""
         if not self._order:
-            return tuple(endless_order(active.views, place, self._run.config.seed) for place in places)
+            views, seed = self._run.active.views, self._run.config.seed
+            return tuple(endless_order(views, place, seed) for place in places)
         return self._order[places.start : places.stop]
 
     # -- a step --------------------------------------------------------------------------------------
 
     def next_batch(self) -> Batch:
         """What to draw next."""
-        step, views = self._run.state.step, enumerate(self._views_of_step())
-        return Batch(step, tuple(self._sample(view, place, step) for place, view in views))
+        step, first = self._run.state.step, self._run.active.done * self.batch
+        views = enumerate(self._views_of(range(first, first + self.batch)))
+        coming = self._views_of(range(first + self.batch, first + self.batch + COMING))
+        return Batch(step, tuple(self._sample(view, place, step) for place, view in views), coming)
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
