@@ -1,5 +1,4 @@
-"""Which blocks a sweep visits, what is known of views ahead, how blocks grow in the first sweep, and how rates
-fall at the end."""
+"""What a sweep visits, what is known of it ahead, how blocks grow in the first, how rates fall at the end."""
 
 import pytest
 
