@@ -75,7 +75,7 @@ class VisitWorker:
 
     Args:
         target: gives what a sample is trained on.
-        expect: is told the views of the steps to come.
+        expect: is told the views of a step, and of those to come.
     """
 
     def __init__(
@@ -164,8 +164,8 @@ class VisitWorker:
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
         batch = training.next_batch()
+        self._expect([*(sample.view.index for sample in batch.samples), *batch.coming])
         targets = [self._target(sample) for sample in batch.samples]
-        self._expect(batch.coming)
         rendered = training.render(batch)
         pictures, photos, wanted = [], [], []
         for sample, picture, (photo, counts) in zip(batch.samples, rendered.pictures, targets, strict=True):

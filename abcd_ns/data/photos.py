@@ -22,7 +22,7 @@ from abcd_ns.data.undistort import Undistortion
 
 READERS = 4
 """Threads that decode what is expected."""
-EXPECTED = 16
+EXPECTED = 32
 """Pictures that may be decoded, beyond the budget, before anybody asks for them."""
 _MASK_USED = 255
 
@@ -193,6 +193,8 @@ class _ByteCache:
     def expect(self, key: _Key, make: _Read) -> None:
         """Make it on another thread, for the next `get`."""
         with self._lock:
+            if key in self._expected:
+                self._expected.move_to_end(key)
             if key in self._kept or key in self._expected:
                 return
             if self._readers is None:

@@ -111,6 +111,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._coordinator: Trainer | None = None
         self._on_device: dict[tuple[str, int], torch.Tensor] = {}
+        self._used = 0
         super().__init__(*args, **kwargs)
         self._eval_order = random.Random(0)
 
@@ -185,9 +186,9 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         whole, device = read(row), torch.device(self.device)
         if whole is None:
             return None
-        used = sum(each.nbytes for each in self._on_device.values())
-        if device.type == "cpu" or used + whole.nbytes > self.device_photo_bytes:
+        if device.type == "cpu" or self._used + whole.nbytes > self.device_photo_bytes:
             return upload(whole[crop.slices], device)
+        self._used += whole.nbytes
         kept = self._on_device[kind, row] = upload(whole, device)
         return kept[crop.slices]
 
@@ -197,8 +198,8 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         rows = [sample.view.index for sample in samples.samples]
         camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
+        self.expect([*rows, *samples.coming])
         photos, masks = map(list, zip(*map(self.shown, samples.samples), strict=True))
-        self.expect(samples.coming)
         batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
         if any(mask is not None for mask in masks):
             batch["mask"] = masks

@@ -119,6 +119,7 @@ def test_photos_are_copied_once_while_there_is_room_and_else_as_bytes(trained, c
     whole = manager.train_dataset.photos.image(0)
     expected = [manager.train_dataset.photos.image(row)[crop.slices].float() / 255 for row in rows]
     monkeypatch.setattr(manager, "_on_device", {})  # there was room for all in training
+    monkeypatch.setattr(manager, "_used", 0)
     monkeypatch.setattr(manager, "device_photo_bytes", whole.nbytes)  # now for one
     for copies, size in (
         (len(rows), whole.nbytes + (len(rows) - 1) * 240),

@@ -11,7 +11,8 @@ from abcd_ns.engine.layers.compositing import over
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scene import ChangedScene, MemoryScene
+from abcd_ns.engine.store.derived_scenes import ChangedScene
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.viewer.pictures import (
     FAR,
     MOST_PIXELS,

@@ -26,8 +26,6 @@ class Clocks:
     forget as n steps of one would."""
     visits: int = 0
     """Visits that have ended."""
-    resets: int = 0
-    """Times that its opacities were due to be reset, and were."""
     refined: int = 0
     """`steps` when it was last refined."""
 
@@ -111,7 +109,8 @@ class BlockState:
     @staticmethod
     def clocks_of(meta: dict[str, Any]) -> Clocks:
         """Those in the JSON of `packed`."""
-        return Clocks(**meta["clocks"])
+        known = vars(Clocks())
+        return Clocks(**{name: count for name, count in meta["clocks"].items() if name in known})
 
 
 def join(states: Sequence[BlockState]) -> BlockState:

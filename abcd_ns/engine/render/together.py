@@ -18,6 +18,7 @@ def runs(
     gaussians: int = 0,
     splats: int = 0,
     kinds: Sequence[Hashable] | None = None,
+    padded: bool = False,
 ) -> Iterator[list[Item]]:
     """The items, a crop each, in runs of neighbours of one kind.
 
@@ -26,15 +27,23 @@ def runs(
         gaussians: that are drawn in each crop, if they are limited, too.
         splats: most of these in all crops of a run of more than one.
         kinds: of each item; None if they are all alike.
+        padded: each crop is drawn as large as the largest of its run.
     """
     run: list[Item] = []
-    drawn, kind = 0, None
+    taken: list[Crop] = []
+    kind = None
     for item, crop, own in zip(items, crops, kinds or [None] * len(items), strict=True):
-        drawn += crop.pixels
+        taken.append(crop)
+        drawn = _padded(taken) if padded else sum(each.pixels for each in taken)
         if run and (own != kind or drawn > pixels or (len(run) + 1) * gaussians > splats):
             yield run
-            run, drawn = [], crop.pixels
+            run, taken = [], [crop]
         kind = own
         run.append(item)
     if run:
         yield run
+
+
+def _padded(crops: Sequence[Crop]) -> int:
+    """Pixels of so many crops, as wide and as high as any of them."""
+    return len(crops) * max(crop.width for crop in crops) * max(crop.height for crop in crops)

@@ -103,27 +103,6 @@ class MemoryScene(BlockScene):
         return self._bounds[block]
 
 
-class ChangedScene(BlockScene):
-    """A scene of which others see something else.
-
-    Args:
-        change: gives what is seen of a block, by its number and its Gaussians: as many or fewer, none of them
-            farther out, for numbers and bounds stay those of all.
-    """
-
-    def __init__(self, scene: BlockScene, change: Callable[[int, Gaussians], Gaussians]) -> None:
-        self.tree, self._scene, self._change = scene.tree, scene, change
-
-    def gaussians(self, block: int) -> Gaussians:
-        return self._change(block, self._scene.gaussians(block))
-
-    def count(self, block: int) -> int:
-        return self._scene.count(block)
-
-    def bounds(self, block: int) -> Box | None:
-        return self._scene.bounds(block)
-
-
 class StoredScene(VisitScene):
     """A scene at rest in a ParameterStore, read block by block, with the live block laid over it.
 

@@ -8,7 +8,7 @@ from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.visit_layers import PARTS_BYTES, VisitLayers
 from abcd_ns.engine.store.scene import BlockScene
-from abcd_ns.engine.train.memory import needs_of
+from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.types import View
@@ -78,4 +78,5 @@ class LayerSource:
     def _parts_bytes(self, views: Iterable[View]) -> int:
         if self._run.device.type == "cpu":  # where a block is loaded from RAM to RAM
             return PARTS_BYTES
-        return needs_of(self._run.config, max(view.full.pixels for view in views), 2).parts_bytes
+        needs = needs_of(self._run.config, max(view.full.pixels for view in views), 2)
+        return min(needs.parts_bytes, max(PARTS_BYTES, free_bytes(self._run.device) // 2))

@@ -9,7 +9,8 @@ from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in, normals_of
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scene import ChangedScene, MemoryScene
+from abcd_ns.engine.store.derived_scenes import ChangedScene
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.viewer.pictures import BlockPictures
 from tests.reference.naive_rasterizer import rotation

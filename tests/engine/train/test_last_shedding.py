@@ -199,7 +199,7 @@ def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian
     coordinator, _ = completed(tmp_path, ring, pictured, steps=5, density=replace(STILL, price=0.0))
     everything, draw, view = whole_scene(coordinator), coordinator.run.rasterizer, ring[0]
     whole = coordinator._last._whole
-    probed = _Probe(coordinator.scene, coordinator.device)
+    probed = _Probe(coordinator.scene)
     pictures, signs = whole.pictures([view], probed.scene), random_signs(0)
     times = 400
     for _ in range(times):

@@ -174,7 +174,7 @@ def _a_few(
     kinds = [(view.width, view.height, view.near) for view, _ in seen]
     crops = [crop for _, crop in seen]
     limits = {"gaussians": len(gaussians), "splats": DEVICE_SPLATS}
-    return runs(items, crops, DEVICE_PIXELS, **limits, kinds=kinds)
+    return runs(items, crops, DEVICE_PIXELS, **limits, kinds=kinds, padded=True)
 
 
 Seen = TypeVar("Seen", Projected, Packed)

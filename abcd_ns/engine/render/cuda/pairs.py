@@ -251,8 +251,11 @@ class Drawing:
         ]
 
     def layers(self) -> list[Layer]:
-        """What each crop looks like."""
-        return [Layer(features[..., :3], transmittance) for features, transmittance in self.draw()]
+        """What each crop looks like; each is its own memory, not a part of all that were drawn with it."""
+        return [
+            Layer(features[..., :3].contiguous(), transmittance.contiguous())
+            for features, transmittance in self.draw()
+        ]
 
     def windows(self, visible: float) -> list[ZWindow]:
         """Where the splats show in each crop; see z_window.showing."""

@@ -30,8 +30,8 @@ BEFORE_RESET, AFTER_RESET = 7, 4
 
 GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
-REFINE_UNTIL, RESET_UNTIL = 0.5, 0.25
-"""Shares of a visit after which a block among others is neither refined nor reset."""
+REFINE_UNTIL, RESET_UNTIL = 0.5, 0.5
+"""Shares of a visit, and of the warm-up, after which there are no refinements, and no resets of opacities."""
 CULL_SCALE = 0.5
 """Standard deviation, in scene units, over which a Gaussian is pruned once opacities were reset."""
 SPLIT_SCALE = 0.01
@@ -65,7 +65,8 @@ class DensityConfig:
     """Views drawn to train a block between its refinements; never fewer than show the block, but half of a
     first visit's at most."""
     reset_every: int = 3000
-    """Views drawn to train a block between opacity resets (`default` strategy); 0 means never."""
+    """Views drawn between opacity resets of a block without others, and in the first half of a warm-up
+    (`default` strategy); 0 means never."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
     densify_grad_thresh: float = 0.0008
@@ -115,13 +116,11 @@ class DensityClock:
     """Of the random numbers drawn in this step."""
     refined: int | None = None
     """`steps` when the block was last refined; None refines at the very step that it is due."""
-    resets: int | None = None
-    """Resets of the opacities that the block has had; None resets at the very step that one is due."""
     first: bool = False
     """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
     spent: float = 0.0
-    """Share of the visit that is done, for what is left must make good what growing and resets upset before
-    others see the block; 0 where there are no others."""
+    """Share of the visit or of the warm-up that is done, for what is left must make good what growing and
+    resets upset before others see the block; 0 where there are no others."""
     visit: int | None = None
     """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
     show it."""
@@ -186,13 +185,12 @@ class DensityControl:
         return self.is_due(clock) and (self.config.strategy != "default" or bool(_with_gradient(infos)))
 
     def resets(self, clock: DensityClock) -> bool:
-        """Whether this step resets opacities (`default` strategy); that needs no gradients."""
+        """Whether this step resets opacities (`default` strategy), without gradients too. Among others never:
+        the longest visit leaves its pictures worse than it found them (stability A6)."""
         every = self.config.reset_every
         if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
             return False
-        if clock.resets is None:
-            return clock.reached(every)
-        return clock.spent <= RESET_UNTIL and clock.steps // every > clock.resets
+        return clock.refined is None and clock.spent <= RESET_UNTIL and clock.reached(every)
 
     def count(self, means: Tensor, infos: Infos, views: int) -> dict[str, Tensor]:
         """What drawings add to a block's statistics, after backward; by name, each [n].

@@ -21,8 +21,10 @@ from torch import Tensor
 
 from abcd_ns.engine.events import ShedAtEnd, Shedding
 from abcd_ns.engine.layers.whole_pictures import WholePicture
-from abcd_ns.engine.store.scene import BlockScene, ChangedScene
+from abcd_ns.engine.store.derived_scenes import ChangedScene, HeldScene
+from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail
+from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -47,19 +49,18 @@ LEAST_ERROR = 1e-10
 
 
 class _Probe:
-    """Opacities of a scene as leaves on a device: of what comes back it keeps what Gaussians are worth."""
+    """Opacities of a scene as leaves: of what comes back it keeps what Gaussians are worth."""
 
-    def __init__(self, scene: BlockScene, device: torch.device) -> None:
+    def __init__(self, scene: BlockScene) -> None:
         self.scene = ChangedScene(scene, self._with_leaf)
-        self._rest, self._device = scene, device
+        self._rest = scene
         self._leaves: dict[int, Tensor] = {}
         self._worth: dict[int, Tensor] = {}
 
     def _with_leaf(self, block: int, gaussians: Gaussians) -> Gaussians:
-        found = gaussians.to(self._device)
         if block not in self._leaves:
-            self._leaves[block] = found.opacities.detach().clone().clamp_(max=OPAQUE).requires_grad_()
-        return replace(found, opacities=self._leaves[block])
+            self._leaves[block] = gaussians.opacities.detach().clone().clamp_(max=OPAQUE).requires_grad_()
+        return replace(gaussians, opacities=self._leaves[block])
 
     def take_note(self) -> None:
         """A view has been drawn backward, or what a unit shows in it: a pixel has each Gaussian in one."""
@@ -86,6 +87,7 @@ class LastShedding:
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
         self._run, self._whole = run, WholeViews(run, target)
+        self._scene: BlockScene | None = None
 
     @property
     def is_wanted(self) -> bool:
@@ -97,37 +99,46 @@ class LastShedding:
         """Do it; tells listeners how many went, and at what cost."""
         run = self._run
         views, step = self._whole.views(), run.state.step
+        self._scene = HeldScene(run.scene, run.device, self._room(views))
         worth = self._worth(views)
         ranked = torch.cat(worth)
         ranked = ranked[ranked.isfinite()].sort().values
         costs = ranked.double().cumsum(0)
         views = evenly(views, min(max(step // STEPS_EACH, FEWEST), MOST))
-        before = after = self._psnr(views, worth, -1.0)
+        before = after = self._psnr(views, worth, -1.0, 0)
         few, many, price, guess = 0, len(ranked) + 1, -1.0, LOSS
         for taken in range(ROUNDS):
-            run.announce(Shedding(taken + 1, ROUNDS + 1))
             suggested = min(int(torch.searchsorted(costs, guess)), len(ranked))
             number = suggested if many > len(ranked) else (few + many) // 2
             if number <= few:
                 break
             tried = float(ranked[number - 1])
-            found = self._psnr(views, worth, tried)
+            found = self._psnr(views, worth, tried, taken + 1)
             if before - found <= LOSS:
                 few, price, after, guess = number, tried, found, 2 * guess
             else:
                 many = number
+        self._scene = None
         gone = sum(self._take_out(block, of_block, price) for block, of_block in enumerate(worth))
         run.announce(ShedAtEnd(gone, run.count(), len(views), before, after))
+
+    def _room(self, views: Sequence[View]) -> int:
+        """Of a device, for blocks that are held there while none is live: half of what a live one has."""
+        run, limit = self._run, self._run.config.limits.block_limit
+        if run.device.type == "cpu":  # their RAM has a budget of its own
+            return 0
+        needs = needs_of(run.config, max(view.full.pixels for view in views), run.blocks)
+        free = free_bytes(run.device)
+        return min(free, limit * needs.gaussian_bytes if limit else free) // 2
 
     def _worth(self, views: list[View]) -> list[Float[Tensor, "_n"]]:
         """By block, what those that are drawn are worth in these views, dB of the mean PSNR; infinite for who
         shows in none of them, unless they are all."""
         run = self._run
-        run.announce(Shedding(0, ROUNDS + 1))
         blocks = range(run.scene.tree.num_blocks)
         trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
         chosen = evenly(views, max(trained // RANKING, FEWEST))
-        probe = _Probe(run.scene, run.device)
+        probe = _Probe(self._scene)
         pictures = self._whole.pictures(chosen, probe.scene)
         drawn = random_signs(run.config.seed)
 
@@ -137,18 +148,25 @@ class LastShedding:
             return signs * counts / square.clamp_min(LEAST_ERROR * picture.color.numel()).sqrt()
 
         for group in pictures.groups(chosen):
+            run.announce(Shedding(0, ROUNDS + 1))
             pictures.backward(group, gradient, probe.take_note)
         nowhere = 0.0 if len(chosen) == len(views) else torch.inf
         worth = [PER_NEPER / len(chosen) * probe.worth(block) for block in blocks]
         return [torch.where(of_block > 0, of_block, nowhere) for of_block in worth]
 
     @torch.no_grad()
-    def _psnr(self, views: list[View], worth: Sequence[Tensor], price: float) -> float:
-        """Mean over views without who is worth no more than a price, dB."""
-        left = ChangedScene(self._run.scene, lambda block, found: found[worth[block] > price])
+    def _psnr(self, views: list[View], worth: Sequence[Tensor], price: float, taken: int) -> float:
+        """Mean over views without who is worth no more than a price, dB.
+
+        Args:
+            taken: rounds.
+        """
+        device = self._run.device
+        left = ChangedScene(self._scene, lambda block, found: found[(worth[block] > price).to(device)])
         pictures = self._whole.pictures(views, left)
         found = []
         for view, picture in zip(views, pictures.draw(views), strict=True):
+            self._run.announce(Shedding(taken, ROUNDS + 1))
             square, counts = self._square(view, picture)
             error = square / (3 * counts.sum()).clamp_min(1.0)
             found.append(-10 * error.clamp_min(LEAST_ERROR).log10())

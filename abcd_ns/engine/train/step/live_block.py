@@ -92,8 +92,6 @@ class LiveBlock:
             scales, means = run.params["scales"], run.params["means"]
             wide = wider_than(WIDE_ANGLE, scales, means, run.views.values())[0].any(dim=1)
         self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock, wide)
-        if run.density.resets(clock):
-            self.clocks = replace(self.clocks, resets=clock.steps // run.config.density.reset_every)
         if run.density.refines(clock, infos):
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.hold_back_giants()
@@ -140,6 +138,7 @@ class LiveBlock:
         run, active = self._run, self._run.active
         blocks = run.blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
+        warming = run.progress / run.config.warmup if active.is_whole else 0.0
         return DensityClock(
             progress=run.share,
             steps=self.clocks.steps,
@@ -149,9 +148,8 @@ class LiveBlock:
             room=room,
             seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
             refined=self.clocks.refined if among_others else None,
-            resets=self.clocks.resets if among_others else None,
             first=among_others and not active.is_whole and self.clocks.visits == 0,
-            spent=active.done / active.steps if among_others else 0.0,
+            spent=active.done / active.steps if among_others else warming,
         )
 
     @property

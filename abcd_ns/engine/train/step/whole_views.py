@@ -11,7 +11,7 @@ from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.whole_pictures import LAYERS_BYTES, WholePictures
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.capture.light import lit
-from abcd_ns.engine.train.memory import needs_of
+from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.types import View
@@ -64,7 +64,8 @@ class WholeViews:
         room = LAYERS_BYTES
         if run.device.type != "cpu":  # half of what a visit's have: here a view is drawn backward beside them
             largest = max(view.full.pixels for view in views)
-            room = max(room, needs_of(run.config, largest, 2).parts_bytes // 2)
+            parts = needs_of(run.config, largest, run.blocks).parts_bytes
+            room = max(room, min(parts, free_bytes(run.device) // 2) // 2)
         return WholePictures(painter, PaintSettings(run.sh_degree, run.config.antialiased), room)
 
     def beside(self, view: View, shown: Float[Tensor, "h w 3"]) -> Beside:

@@ -20,8 +20,8 @@ PASSES, VIEWS = TrainingConfig().first_passes, TrainingConfig().visit_views
 CAMERAS = (1, 2, 3, 10, 100, 1000, 2900, 15_000)
 EVERY = DensityConfig().refine_every
 """Steps between refinements, splatfacto's, too."""
-RESET_EVERY = 150
-"""A block's own views between resets: in the midst of visits and at their ends."""
+RESET_EVERY = 60
+"""Views between resets: in the warm-up and, if there were any among blocks, in each of their visits."""
 ALLOWED_RISE = 0.02
 """Of the mean absolute error over all training photos, by one visit."""
 

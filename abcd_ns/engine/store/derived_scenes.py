@@ -1,0 +1,57 @@
+"""Scenes that show another one: with something changed, or held on a device."""
+
+from collections.abc import Callable
+
+import torch
+
+from abcd_ns.engine.space.tree import Box
+from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.types import Gaussians
+
+
+class ChangedScene(BlockScene):
+    """A scene of which others see something else.
+
+    Args:
+        change: gives what is seen of a block, by its number and its Gaussians: as many or fewer, none of them
+            farther out, for numbers and bounds stay those of all.
+    """
+
+    def __init__(self, scene: BlockScene, change: Callable[[int, Gaussians], Gaussians]) -> None:
+        self.tree, self._scene, self._change = scene.tree, scene, change
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._change(block, self._scene.gaussians(block))
+
+    def count(self, block: int) -> int:
+        return self._scene.count(block)
+
+    def bounds(self, block: int) -> Box | None:
+        return self._scene.bounds(block)
+
+
+class HeldScene(BlockScene):
+    """A scene's blocks on a device: read once, as far as there is room, while none of them changes.
+
+    Args:
+        room: bytes of those that are held.
+    """
+
+    def __init__(self, scene: BlockScene, device: torch.device, room: int) -> None:
+        self.tree, self._scene, self._device, self._room = scene.tree, scene, device, room
+        self._held: dict[int, Gaussians] = {}
+
+    def gaussians(self, block: int) -> Gaussians:
+        if block in self._held:
+            return self._held[block]
+        found = self._scene.drawn(block, self._device)
+        if found.nbytes <= self._room:
+            self._room -= found.nbytes
+            self._held[block] = found
+        return found
+
+    def count(self, block: int) -> int:
+        return self._scene.count(block)
+
+    def bounds(self, block: int) -> Box | None:
+        return self._scene.bounds(block)
