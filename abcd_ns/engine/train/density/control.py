@@ -23,17 +23,14 @@ from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.density.shedding import LAST, WEIGHED, faded, may_grow, price_at, weigh, worthless
 
-# Step numbers as gsplat sees them. It refines on multiples of REFINE, resets opacities on multiples of
-# `reset_every` (never, with these numbers) and prunes by size where step > reset_every.
-GATHER, REFINE = 1, 6
-BEFORE_RESET, AFTER_RESET = 7, 4
+# Step numbers as gsplat sees them. It refines on multiples of REFINE; resets of opacities and pruning by size
+# in scene units, which takes backgrounds, begin when NEVER steps are over.
+GATHER, REFINE, NEVER = 1, 6, 7
 
 GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.5
 """Shares of a visit, and of the warm-up, after which there are no refinements, and no resets of opacities."""
-CULL_SCALE = 0.5
-"""Standard deviation, in scene units, over which a Gaussian is pruned once opacities were reset."""
 SPLIT_SCALE = 0.01
 """Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
 PLAIN_GRADIENT = 0.25
@@ -287,15 +284,13 @@ class DensityControl:
         wide: Bool[Tensor, "n"] | None,
     ) -> dict[str, Tensor]:
         config = self.config
-        has_reset = 0 < config.reset_every < clock.steps
         strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
             grow_grad2d=config.densify_grad_thresh,
             grow_scale3d=SPLIT_SCALE,
-            prune_scale3d=CULL_SCALE,
             refine_start_iter=0,
             refine_every=REFINE,
-            reset_every=AFTER_RESET if has_reset else BEFORE_RESET,
+            reset_every=NEVER,
             absgrad=config.use_absgrad,
         )
         state: dict[str, Any] = {"scene_scale": 1.0, **growth}
