@@ -3,7 +3,8 @@
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Literal, get_args
 
 from rich.console import Console
 
@@ -31,6 +32,10 @@ class Finding:
     """What was found and what follows from it, in one or two sentences."""
     fix: str = ""
     """What to do about it; empty where `what` says so, or where there is nothing to be done."""
+
+
+error, warning, note = (partial(Finding, level) for level in get_args(Level))
+"""A finding of that level."""
 
 
 def by_level(findings: Iterable[Finding]) -> list[Finding]:

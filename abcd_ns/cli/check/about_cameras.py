@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
-from abcd_ns.cli.findings import Finding
+from abcd_ns.cli.findings import Finding, note, warning
 from abcd_ns.cli.words import few, many
 
 SMALL_BASELINE = 0.02
@@ -24,8 +24,7 @@ def one_place(survey: Survey) -> Iterator[Finding]:
     extent = float(np.ptp(survey.centers, axis=0).max())
     depths = survey.seen.depth[np.isfinite(survey.seen.depth)]
     if len(depths) and extent < SMALL_BASELINE * np.median(depths):
-        yield Finding(
-            "warning",
+        yield warning(
             "one-place",
             f"The cameras lie within {extent:.3g} units, and what they show is {np.median(depths):.3g} units "
             "away. From one place no depth can be told.",
@@ -39,8 +38,7 @@ def far_cameras(survey: Survey) -> Iterator[Finding]:
     usual = float(np.quantile(away, 0.75, method="lower"))
     rows = np.flatnonzero(away > FAR_OFF * usual) if usual > 0 else []
     if len(rows):
-        yield Finding(
-            "warning",
+        yield warning(
             "far-cameras",
             f"{many(len(rows), 'camera is', 'cameras are')} far from the others, up to "
             f"{away[rows].max() / usual:.0f} times as far from the middle: "
@@ -56,8 +54,7 @@ def unlike_fields(survey: Survey) -> Iterator[Finding]:
     ratio = fields.max() / fields.min()
     if ratio > FIELDS:
         wide, narrow = survey.names[int(fields.argmax())], survey.names[int(fields.argmin())]
-        yield Finding(
-            "warning",
+        yield warning(
             "unlike-focal-lengths",
             f"By the model, {wide} is {ratio:.1f} times as wide as {narrow}. If both are of one lens, the "
             "model is wrong.",
@@ -77,8 +74,7 @@ def distortion(survey: Survey) -> Iterator[Finding]:
             f"{many(n, 'photo', 'photos')}{' of a fisheye' if fisheye else ''}, {a} x {b} to {c} x {d}"
             for ((a, b), (c, d), fisheye), n in changes.most_common(3)
         ]
-        yield Finding(
-            "note",
+        yield note(
             "distortion",
             f"Lenses with distortion: photos are undistorted in memory and cropped to what all of them show "
             f"({few(listed, len(changes))} px). Nothing is written.",
@@ -92,8 +88,7 @@ def blind_views(survey: Survey) -> Iterator[Finding]:
     in_view, names = survey.seen.in_view, survey.names
     blind = np.flatnonzero(in_view == 0)
     if len(blind) == len(names):
-        yield Finding(
-            "warning",
+        yield warning(
             "no-view-sees-points",
             f"None of the {len(survey.points):,} points lies in any picture: points and cameras are not of "
             "one model, or not in the same coordinates.",
@@ -102,8 +97,7 @@ def blind_views(survey: Survey) -> Iterator[Finding]:
         )
         return
     if len(blind):
-        yield Finding(
-            "warning",
+        yield warning(
             "views-without-points",
             f"{many(len(blind), 'view shows', 'views show')} no point: {few([names[row] for row in blind])}. "
             "Their poses are doubtful, and nothing is there to begin with.",
@@ -112,8 +106,7 @@ def blind_views(survey: Survey) -> Iterator[Finding]:
     meagre = np.flatnonzero((in_view > 0) & (in_view < FEW_POINTS))
     if len(meagre):
         listed = [f"{names[row]} {in_view[row]:.0f}" for row in meagre]
-        yield Finding(
-            "warning",
+        yield warning(
             "views-with-few-points",
             f"{many(len(meagre), 'view shows', 'views show')} fewer than {FEW_POINTS} points: {few(listed)}. "
             "Their poses may be inexact.",

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
-from abcd_ns.cli.findings import Finding
+from abcd_ns.cli.findings import Finding, error, note, warning
 from abcd_ns.cli.words import few, many
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.prepare import DOWNSCALE, MAX_AUTO_SIDE
@@ -25,15 +25,14 @@ def damaged(survey: Survey) -> Iterator[Finding]:
     """Photos that begin and end as they should, with damage between; training would stop at them."""
     for look in survey.looks:
         if look.error is not None:
-            yield Finding("error", "damaged-photo", look.error)
+            yield error("damaged-photo", look.error)
 
 
 def few_photos(survey: Survey) -> Iterator[Finding]:
     """Too few photos."""
     count = len(survey.names)
     if count < FEW_PHOTOS:
-        yield Finding(
-            "warning",
+        yield warning(
             "few-photos",
             f"There are only {count} photos. What few photos show can be explained by many wrong scenes: new "
             "views will look torn.",
@@ -47,8 +46,7 @@ def mixed_sizes(survey: Survey) -> Iterator[Finding]:
     sizes = Counter(source.size for source in survey.sources)
     if len(sizes) > 1:
         listed = [f"{many(n, 'photo', 'photos')} of {w} x {h}" for (w, h), n in sizes.most_common(3)]
-        yield Finding(
-            "note",
+        yield note(
             "mixed-sizes",
             f"Photos differ in size: {few(listed, len(sizes))}. That is no fault.",
         )
@@ -58,8 +56,7 @@ def large_photos(survey: Survey) -> Iterator[Finding]:
     """Photos that will make training slow."""
     width, height = max((source.size for source in survey.sources), key=lambda size: size[0] * size[1])
     if width * height > MANY_PIXELS:
-        yield Finding(
-            "note",
+        yield note(
             "large-photos",
             f"Photos of up to {width} x {height} px are trained on, which takes long.",
             f"For a first result leave out {DOWNSCALE}: photos are then reduced to {MAX_AUTO_SIDE} px.",
@@ -70,8 +67,7 @@ def memory(survey: Survey) -> Iterator[Finding]:
     """Photos that do not fit into their share of RAM."""
     needed, budget = photo_bytes(survey), default_budget()
     if needed > budget:
-        yield Finding(
-            "note",
+        yield note(
             "photos-beyond-ram",
             f"Decoded photos take {needed / 2**30:.1f} GiB, and {budget / 2**30:.1f} GiB of them are kept in "
             "RAM; the others are decoded again whenever they are needed, which takes time.",
@@ -99,7 +95,7 @@ def duplicates(survey: Survey) -> Iterator[Finding]:
     if leaks:
         both = many(leaks, "of them is", "of them are")
         what += f" {both} both trained on and held out, so scores are too good."
-    yield Finding("warning", "duplicate-photos", what, "Keep one of each, and make the model again.")
+    yield warning("duplicate-photos", what, "Keep one of each, and make the model again.")
 
 
 def exposure(survey: Survey) -> Iterator[Finding]:
@@ -110,8 +106,7 @@ def exposure(survey: Survey) -> Iterator[Finding]:
         return
     low, high = np.quantile(lumas, [0.05, 0.95])
     if high > EXPOSURES * low:
-        yield Finding(
-            "warning",
+        yield warning(
             "exposure",
             f"Photos differ in brightness by a factor of {high / low:.1f}. If that is the camera's exposure "
             "and not what they show, Gaussians before single cameras will imitate it as fog.",
@@ -124,8 +119,7 @@ def blank(survey: Survey) -> Iterator[Finding]:
     names = survey.chosen(lambda look: look.error is None and not DARK <= look.brightness <= BRIGHT)
     if names:
         count = many(len(names), "photo is", "photos are")
-        yield Finding(
-            "warning",
+        yield warning(
             "blank-photos",
             f"{count} black or white nearly all over: {few(names)}.",
             "Look at them, and leave out what shows nothing.",
@@ -137,8 +131,7 @@ def orientation(survey: Survey) -> Iterator[Finding]:
     names = survey.chosen(lambda look: look.orientation != 1)
     if names:
         count = many(len(names), "photo has", "photos have")
-        yield Finding(
-            "note",
+        yield note(
             "exif-orientation",
             f"{count} an EXIF orientation ({few(names)}). It is not applied, as COLMAP does not: pixels are "
             "used as they are stored.",
@@ -152,8 +145,7 @@ def alpha(survey: Survey) -> Iterator[Finding]:
     names = survey.chosen(lambda look: look.alpha)
     if names:
         count = many(len(names), "photo has", "photos have")
-        yield Finding(
-            "note",
+        yield note(
             "alpha",
             f"{count} an alpha channel: photo and rendering are put onto the same background, by default a "
             "new random colour in every step, so that transparent parts become empty.",
@@ -165,14 +157,13 @@ def masks(survey: Survey) -> Iterator[Finding]:
     masked = sum(source.mask_path is not None for source in survey.sources)
     if masked:
         count = many(masked, "photo has", "photos have")
-        yield Finding("note", "masks", f"{count} a mask: what is black in it is not trained on, the rest is.")
+        yield note("masks", f"{count} a mask: what is black in it is not trained on, the rest is.")
 
 
 def split(survey: Survey) -> Iterator[Finding]:
     """A split that leaves little on one side."""
     if len(survey.train) < 2:
-        yield Finding(
-            "warning",
+        yield warning(
             "few-training-views",
             f"Only {len(survey.train)} view is trained on, {len(survey.held_out)} held out.",
             "Hold out fewer: --pipeline.datamanager.dataparser.eval-interval, or eval-mode all.",

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
-from abcd_ns.cli.findings import Finding
+from abcd_ns.cli.findings import Finding, note, warning
 from abcd_ns.cli.words import many
 
 FEW = 500
@@ -21,8 +21,7 @@ def few_points(survey: Survey) -> Iterator[Finding]:
     """Too few to begin with."""
     count = len(survey.points)
     if 0 < count < FEW:
-        yield Finding(
-            "warning",
+        yield warning(
             "few-points",
             f"There are only {many(count, 'point', 'points')}. Gaussians begin at points, so most surfaces "
             "begin with none.",
@@ -38,8 +37,7 @@ def far_points(survey: Survey) -> Iterator[Finding]:
     usual = float(np.quantile(away, 0.9))
     far = away > FAR_OFF * usual
     if usual > 0 and far.any():
-        yield Finding(
-            "warning",
+        yield warning(
             "far-points",
             f"{many(int(far.sum()), 'point lies', 'points lie')} far from the others, up to "
             f"{away.max() / usual:,.0f} times as far from the middle as nine tenths of them. Each becomes a "
@@ -54,8 +52,7 @@ def unseen_points(survey: Survey) -> Iterator[Finding]:
     if not count or not survey.seen.in_view.any() or seen.in_none <= UNSEEN * count:
         return
     behind = f", {seen.behind_all / count:.0%} behind every camera" if seen.behind_all else ""
-    yield Finding(
-        "warning",
+    yield warning(
         "unseen-points",
         f"{seen.in_none / count:.0%} of the points lie in no picture{behind}. No photo can correct what "
         "begins there. In a sound model each point was found in pictures.",
@@ -68,8 +65,7 @@ def far_origin(survey: Survey) -> Iterator[Finding]:
     extent = float(np.ptp(survey.centers, axis=0).max())
     away = float(np.linalg.norm(survey.centers.mean(axis=0)))
     if away > DIGITS * extent:
-        yield Finding(
-            "note",
+        yield note(
             "far-origin",
             f"The scene is {away:,.0f} units from the origin and {extent:,.3g} wide, as geo-referenced ones "
             "are. It is moved to the origin with full digits; programs that compute in float32 throughout "

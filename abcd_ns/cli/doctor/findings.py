@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from abcd_ns.cli.doctor.facts import Facts
 from abcd_ns.cli.doctor.packages import EXPORT
-from abcd_ns.cli.findings import Finding
+from abcd_ns.cli.findings import Finding, error, note, warning
 
 TESTED = {"nerfstudio": "1.1.5", "gsplat": "1.4.0"}
 """Versions whose insides are relied on."""
@@ -21,8 +21,7 @@ def missing_packages(facts: Facts) -> Iterator[Finding]:
     """Packages that are not installed."""
     missing = [name for name, version in facts.packages.versions.items() if version is None]
     if missing:
-        yield Finding(
-            "error",
+        yield error(
             "missing-packages",
             f"Not installed: {', '.join(missing)}.",
             "In the checkout of abcd_ns: pip install .",
@@ -31,26 +30,23 @@ def missing_packages(facts: Facts) -> Iterator[Finding]:
 
 def broken_packages(facts: Facts) -> Iterator[Finding]:
     """Packages that do not start."""
-    for module, error in facts.packages.broken.items():
+    for module, why in facts.packages.broken.items():
         if module == EXPORT:
-            yield Finding(
-                "warning",
+            yield warning(
                 "broken-export",
-                f"ns-export and abcd mesh cannot start, as {module} does not: {error}",
+                f"ns-export and abcd mesh cannot start, as {module} does not: {why}",
                 f"On Debian and Ubuntu: {SYSTEM_LIBRARIES}",
             )
-        elif "torchvision::nms" in error:
-            yield Finding(
-                "error",
+        elif "torchvision::nms" in why:
+            yield error(
                 "broken-package",
-                f"torch and torchvision do not belong together: {error}",
+                f"torch and torchvision do not belong together: {why}",
                 "Install both from the same place, of versions that match.",
             )
         else:
-            yield Finding(
-                "error",
+            yield error(
                 "broken-package",
-                f"{module} does not start: {error}",
+                f"{module} does not start: {why}",
                 f"Install it again; if a lib*.so is missing, {SYSTEM_LIBRARIES}",
             )
 
@@ -58,15 +54,13 @@ def broken_packages(facts: Facts) -> Iterator[Finding]:
 def not_registered(facts: Facts) -> Iterator[Finding]:
     """An environment in which `ns-train abcd` is unknown."""
     if not facts.packages.registered:
-        yield Finding(
-            "error",
+        yield error(
             "not-registered",
             "nerfstudio does not know the methods of abcd_ns: it is not installed in this environment.",
             "In its checkout: pip install .",
         )
     if not facts.packages.has_ns_train:
-        yield Finding(
-            "error",
+        yield error(
             "no-ns-train",
             "There is no command ns-train beside this Python.",
             "Install nerfstudio into this environment, or activate the one that has it.",
@@ -78,8 +72,7 @@ def untested_versions(facts: Facts) -> Iterator[Finding]:
     for name, tested in TESTED.items():
         version = facts.packages.versions.get(name)
         if version is not None and version.split("+")[0] != tested:
-            yield Finding(
-                "warning",
+            yield warning(
                 "untested-version",
                 f"{name} is {version}; abcd_ns was tested with {tested} and relies on its insides.",
                 f"If something fails, try pip install {name}=={tested}",
@@ -90,8 +83,7 @@ def viewer(facts: Facts) -> Iterator[Finding]:
     """viser's hole."""
     version = facts.packages.versions.get("viser")
     if version is not None and _numbers(version) < VISER_MENDED:
-        yield Finding(
-            "note",
+        yield note(
             "viewer-hole",
             f"viser {version} sends every file that you can read to whoever reaches the viewer's port, and "
             "nerfstudio listens on all networks unless told. `ns-train abcd` listens on this machine alone.",
@@ -105,15 +97,13 @@ def disk(facts: Facts) -> Iterator[Finding]:
     if facts.hardware is None:
         return
     if not facts.hardware.may_write:
-        yield Finding(
-            "error",
+        yield error(
             "read-only-folder",
             "You may not write into this folder, where ns-train makes `outputs`.",
             "Go to another folder, or give ns-train --output-dir FOLDER",
         )
     if facts.hardware.disk_free_bytes < LITTLE_DISK:
-        yield Finding(
-            "warning",
+        yield warning(
             "little-disk",
             f"Only {facts.hardware.disk_free_bytes / GIB:.1f} GiB of disk are free here. A run's blocks "
             "take six times the size of the scene, and each checkpoint once that.",
@@ -125,8 +115,7 @@ def ram(facts: Facts) -> Iterator[Finding]:
     """Little RAM."""
     free = facts.hardware.ram_free_bytes if facts.hardware else LITTLE_RAM
     if free < LITTLE_RAM:
-        yield Finding(
-            "warning",
+        yield warning(
             "little-ram",
             f"Only {free / GIB:.1f} GiB of RAM are free. By default photos, blocks and layers take up "
             "to 8 GB of it, or 40% of all.",
@@ -140,22 +129,19 @@ def gpu(facts: Facts) -> Iterator[Finding]:
     if hardware is None or hardware.gpu is not None:
         return
     if hardware.driver is None:
-        yield Finding(
-            "note",
+        yield note(
             "no-gpu",
             "No CUDA device: training runs on the CPU with the torch rasterizer. That is meant for small "
             "pictures, some 160 to 320 px wide.",
         )
     elif hardware.torch_cuda is None:
-        yield Finding(
-            "warning",
+        yield warning(
             "torch-without-cuda",
             f"There is an NVIDIA device (driver {hardware.driver}), but torch is built for the CPU only.",
             "Install torch and torchvision as built for CUDA.",
         )
     else:
-        yield Finding(
-            "warning",
+        yield warning(
             "cuda-unavailable",
             f"There is an NVIDIA device (driver {hardware.driver}), but torch, built for CUDA "
             f"{hardware.torch_cuda}, does not get at it.",
@@ -169,15 +155,13 @@ def cpu_kernels(facts: Facts) -> Iterator[Finding]:
     if kernels is None or hardware is None or hardware.gpu is not None or kernels.built == kernels.wanted:
         return
     if kernels.compiler:
-        yield Finding(
-            "note",
+        yield note(
             "kernels-not-built",
             f"{kernels.built} of {kernels.wanted} CPU kernels are built; the first training on this machine "
             "builds them, in two or three minutes.",
         )
     else:
-        yield Finding(
-            "warning",
+        yield warning(
             "no-compiler",
             "There is no C++ compiler, so the CPU kernels cannot be built: training works, some four times "
             "slower.",
@@ -193,16 +177,14 @@ def gsplat_extension(facts: Facts) -> Iterator[Finding]:
     tools = {"nvcc": kernels.nvcc, "ninja": kernels.ninja, "a C++ compiler": kernels.compiler}
     missing = [name for name, there in tools.items() if not there]
     if missing:
-        yield Finding(
-            "error",
+        yield error(
             "gsplat-cannot-be-built",
             f"gsplat's CUDA kernels are neither built nor can be: not on the PATH are {', '.join(missing)}.",
             f"Install the CUDA toolkit {hardware.torch_cuda or ''} (nvcc), g++ and ninja; or train slowly, "
             "with --pipeline.model.rasterizer torch",
         )
     elif _numbers(kernels.nvcc)[:1] != _numbers(hardware.torch_cuda or "")[:1]:
-        yield Finding(
-            "error",
+        yield error(
             "gsplat-cannot-be-built",
             f"gsplat's CUDA kernels are not built, and nvcc is of CUDA {kernels.nvcc}, but torch is built "
             f"for {hardware.torch_cuda} and refuses to compile with another.",
@@ -210,8 +192,7 @@ def gsplat_extension(facts: Facts) -> Iterator[Finding]:
             f"{kernels.nvcc}.",
         )
     else:
-        yield Finding(
-            "note",
+        yield note(
             "gsplat-not-built",
             "gsplat's CUDA kernels are not built; the first training compiles them, once: some 20 minutes of "
             "CPU time, spread over up to 10 processes.",
@@ -221,20 +202,19 @@ def gsplat_extension(facts: Facts) -> Iterator[Finding]:
 
 def self_check(facts: Facts) -> Iterator[Finding]:
     """Rasterizers that compute something else than the reference."""
-    for name, error in facts.kernels.failed.items() if facts.kernels else ():
+    for name, why in facts.kernels.failed.items() if facts.kernels else ():
         if name.startswith("torch"):
             fix = f"Delete {facts.kernels.folder}, so that its kernels are built anew."
         else:
             fix = f"Train with --pipeline.model.rasterizer torch; or delete {facts.kernels.gsplat}: it is "
             fix += "built anew when training begins."
-        yield Finding("error", "self-check", f"{name}: {error}", fix)
+        yield error("self-check", f"{name}: {why}", fix)
 
 
 def lpips(facts: Facts) -> Iterator[Finding]:
     """Weights that are not there."""
     if facts.kernels is not None and facts.kernels.lpips_missing is not None:
-        yield Finding(
-            "note",
+        yield note(
             "no-lpips",
             f"{facts.kernels.lpips_missing}. Nothing is downloaded unasked; until then scores are PSNR and "
             "SSIM only.",
