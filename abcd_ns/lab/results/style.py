@@ -15,25 +15,18 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 P, R = ParamSpec("P"), TypeVar("R")
 
-COLORS = {
-    "abcd-monolithic": "#D55E00",
-    "abcd": "#0072B2",
-    "abcd-ablated": "#8A5A83",
-    "abcd-partition": "#8A6A00",
-    "abcd-exact": "#B3306B",
-    "abcd-paper": "#7A3E00",
-    "splatfacto": "#007A5A",
+LOOKS = {
+    "abcd-monolithic": ("#D55E00", "s"),
+    "abcd": ("#0072B2", "o"),
+    "abcd-ablated": ("#8A5A83", "^"),
+    "abcd-partition": ("#8A6A00", "v"),
+    "abcd-exact": ("#B3306B", "X"),
+    "abcd-paper": ("#7A3E00", "P"),
+    "splatfacto": ("#007A5A", "D"),
 }
+COLORS = {method: color for method, (color, _) in LOOKS.items()}
 """After Okabe and Ito 2008, told apart with every kind of colour blindness; darkened where text needs it."""
-MARKERS = {
-    "abcd-monolithic": "s",
-    "abcd": "o",
-    "abcd-ablated": "^",
-    "abcd-partition": "v",
-    "abcd-exact": "X",
-    "abcd-paper": "P",
-    "splatfacto": "D",
-}
+MARKERS = {method: marker for method, (_, marker) in LOOKS.items()}
 """For print without colour."""
 STYLE = {
     "font.family": "sans-serif",
