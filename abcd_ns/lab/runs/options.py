@@ -6,6 +6,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, Union
 
@@ -102,13 +103,6 @@ def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def value_of(config: Any, path: str) -> Any:
-    """What the option is set to."""
-    for step in path.split("."):
-        config = getattr(config, step)
-    return config
-
-
 def read_value(change: Change, pipeline: Any) -> Any:
     """The value of a change, by the type of its option.
 
@@ -134,7 +128,7 @@ def read_value(change: Change, pipeline: Any) -> Any:
 
 def _set(config: Any, path: str, value: Any) -> None:
     way, _, last = path.rpartition(".")
-    owner = value_of(config, way) if way else config
+    owner = attrgetter(way)(config) if way else config
     if type(owner).__dataclass_params__.frozen:
         _set(config, way, dataclasses.replace(owner, **{last: value}))
     else:

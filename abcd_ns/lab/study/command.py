@@ -4,6 +4,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -153,7 +154,7 @@ class OptionsStudy(Conditions):
             UserError: an option cannot be used, or is none of the method's.
         """
         from abcd_ns.lab.runs.configs import registered
-        from abcd_ns.lab.runs.options import parse_variant, read_value, value_of
+        from abcd_ns.lab.runs.options import parse_variant, read_value
 
         if not self.vary:
             raise UserError("Give at least one change of an option with --vary NAME=VALUE.")
@@ -166,7 +167,7 @@ class OptionsStudy(Conditions):
             if folders.count(variant.folder) > 1:
                 raise UserError(f"--vary {variant.name!r} is given twice.")
             paths = [change.path for change in variant.changes]
-            usual = [shared[path] if path in shared else value_of(pipeline, path) for path in paths]
+            usual = [shared[path] if path in shared else attrgetter(path)(pipeline) for path in paths]
             if usual == [read_value(change, pipeline) for change in variant.changes]:
                 shows = "its difference shows how well a run repeats itself."
                 notes.append(f"{variant.name} is the default: {shows}")
