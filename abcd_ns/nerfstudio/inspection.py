@@ -7,19 +7,10 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.prepare import check_masks
+from abcd_ns.errors import IMPORT_TROUBLE
 from abcd_ns.nerfstudio.datamanager import reader_name
 
-TROUBLE = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    ImportError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
+TROUBLE = (*IMPORT_TROUBLE, ArithmeticError, AssertionError, LookupError)
 """What readers end with where data is not what they expect."""
 
 
