@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -38,17 +37,6 @@ Pair = tuple[PictureArray, PictureArray]
 
 class StepFailed(Exception):
     """A command that the demo started came to nothing; the message says which and where its output is."""
-
-
-@dataclass(frozen=True)
-class Trained:
-    """What training left behind."""
-
-    config: Path
-    """config.yml, by which nerfstudio's other commands find the run."""
-    seconds: float
-    """Of the whole command."""
-    peak_rss_bytes: int
 
 
 class Steps:
@@ -134,12 +122,14 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     flags = [word for name, value in SCENE.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     steps.run("synth", [*_abcd("synth"), str(scene), *flags, "--overwrite"])
     steps.begin(f"2/5  Training in {blocks} blocks for {seconds:g} s")
-    trained = _train(steps, out, scene, seconds, blocks)
+    began = steps.seconds
+    config, peak = _train(steps, out, scene, seconds, blocks)
+    trained = steps.seconds - began
     steps.begin("3/5  Held-out views: scores and pictures")
-    scores = _evaluate(steps, out, trained)
+    scores = _evaluate(steps, out, config)
     steps.begin("4/5  Export for other viewers")
     ply = out / "splat.ply"
-    export = [_tool("ns-export"), "gaussian-splat", "--load-config", str(trained.config)]
+    export = [_tool("ns-export"), "gaussian-splat", "--load-config", str(config)]
     steps.run("ns-export", [*export, "--output-dir", str(out), "--output-filename", ply.name])
     pairs = _pairs(out)
     how = f"{blocks} blocks, {seconds:g} s of training on this machine"
@@ -147,24 +137,25 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     steps.begin("5/5  A report about the run")
     page = out / "report.html"
     where = ["--data", str(scene), "--out", str(page)]
-    steps.run("report", [*_abcd("report"), str(trained.config.parent), *where])
+    steps.run("report", [*_abcd("report"), str(config.parent), *where])
     steps.begin("Done")
     facts = {
         "held-out PSNR": f"{scores['psnr']:.2f} dB",
         "held-out SSIM": f"{scores['ssim']:.3f}",
         "Gaussians": f"{count_vertices(ply):,}",
-        "peak RAM of training": f"{trained.peak_rss_bytes / 2**30:.2f} GiB",
-        "time": f"{steps.seconds:.0f} s, training {trained.seconds:.0f} s of it",
+        "peak RAM of training": f"{peak / 2**30:.2f} GiB",
+        "time": f"{steps.seconds:.0f} s, training {trained:.0f} s of it",
         "the picture": str(pictures[0]),
         "with its errors": "\n".join(map(str, pictures[1:])),
         "Gaussians for viewers": str(ply),
         "all about the run": str(page),
     }
     print_facts(facts, console)
-    _print_next(trained.config, console)
+    _print_next(config, console)
 
 
-def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) -> Trained:
+def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) -> tuple[Path, int]:
+    """The run's config.yml, by which nerfstudio's other commands find it, and its peak RAM in bytes."""
     stamp = time.strftime("%Y-%m-%d_%H%M%S")
     words = ["abcd", "--data", scene.resolve(), "--output-dir", out / "training", "--experiment-name", "demo"]
     words += ["--timestamp", stamp, "--vis", "tensorboard", "--viewer.quit-on-train-completion", True]
@@ -172,16 +163,14 @@ def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) ->
     # The seconds end the run; evaluations meanwhile would only make the demo longer.
     words += ["--max-num-iterations", 10**9, "--steps-per-save", 10**9]
     words += ["--steps-per-eval-image", 0, "--steps-per-eval-all-images", 0]
-    began = time.monotonic()
     peak = steps.run("ns-train", [_tool("ns-train"), *map(str, words)], quiet=False)
-    config = out / "training" / "demo" / "abcd" / stamp / "config.yml"
-    return Trained(config, time.monotonic() - began, peak)
+    return out / "training" / "demo" / "abcd" / stamp / "config.yml", peak
 
 
-def _evaluate(steps: Steps, out: Path, trained: Trained) -> dict[str, float]:
+def _evaluate(steps: Steps, out: Path, config: Path) -> dict[str, float]:
     """Mean scores of the held-out views; ns-eval leaves their pictures in `out`/eval."""
     found = out / "eval" / "results.json"
-    words = ["--load-config", trained.config, "--output-path", found, "--render-output-path", found.parent]
+    words = ["--load-config", config, "--output-path", found, "--render-output-path", found.parent]
     steps.run("ns-eval", [_tool("ns-eval"), *map(str, words)])
     return json.loads(found.read_text(encoding="utf-8"))["results"]
 
