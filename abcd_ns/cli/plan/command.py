@@ -17,7 +17,7 @@ from torch import Tensor
 from abcd_ns import methods
 from abcd_ns.cli.plan.forecast import (
     Forecast,
-    Share,
+    Shares,
     device_shares,
     disk_shares,
     ram_shares,
@@ -160,11 +160,10 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     spread = [view.to(device) for view in views[:: max(1, len(views) // batch)]]
     with console.status("Timing a step"):
         seconds = time_steps(gaussians, spread, training, batch)
+    photo_bytes = sum(3 * view.full.pixels for view in views)
     shares = {
         "device": device_shares(fit, needs),
-        "ram": ram_shares(
-            fit, needs, sum(3 * view.full.pixels for view in views), default_budget(), wanted.workers
-        ),
+        "ram": ram_shares(fit, needs, photo_bytes, default_budget(), wanted.workers),
         "disk": disk_shares(fit, needs),
     }
     return Forecast(
@@ -192,30 +191,16 @@ def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:
     return replace(fit, blocks=blocks_to_begin_with(fit, wanted.workers if wanted.workers > 1 else 0))
 
 
-def warnings_of(
-    fit: Fit,
-    seen: tuple[int, ...],
-    device: tuple[Share, ...],
-    ram: tuple[Share, ...],
-    disk: tuple[Share, ...],
-) -> list[str]:
+def warnings_of(fit: Fit, seen: tuple[int, ...], device: Shares, ram: Shares, disk: Shares) -> list[str]:
     """What would not fit, each with what to do about it."""
-    lines = []
-    if (needed := _total(device)) > fit.budget:
-        lines.append(
-            f"{needed / GB:.1f} GB on the device, but {fit.budget / GB:.1f} GB may be taken: leave --blocks "
-            "out, or give more of them."
-        )
-    if (needed := _total(ram)) > (free := psutil.virtual_memory().available):
-        lines.append(
-            f"{needed / GB:.1f} GB of RAM, but {free / GB:.1f} GB are free: limit the scene by "
-            "--max-gaussians, or free memory."
-        )
-    if (needed := _total(disk)) > (free := shutil.disk_usage(Path.cwd()).free):
-        lines.append(
-            f"{needed / GB:.1f} GB of disk, but {free / GB:.1f} GB are free in this folder: use `ns-train "
-            "--output-dir` on another disk."
-        )
+    lines, in_ram, on_disk = [], psutil.virtual_memory().available, shutil.disk_usage(Path.cwd()).free
+    for shares, free, where, how, cure in (
+        (device, fit.budget, "on the device", "may be taken", "leave --blocks out, or give more of them"),
+        (ram, in_ram, "of RAM", "are free", "limit the scene by --max-gaussians, or free memory"),
+        (disk, on_disk, "of disk", "are free in this folder", "use `ns-train --output-dir` on another disk"),
+    ):
+        if (needed := _total(shares)) > free:
+            lines.append(f"{needed / GB:.1f} GB {where}, but {free / GB:.1f} GB {how}: {cure}.")
     if few := sum(count <= FEW_VIEWS for count in seen):
         lines.append(
             f"{few} of {len(seen)} blocks are seen by fewer than {FEW_VIEWS + 1} views: use fewer blocks."
@@ -259,7 +244,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         console.print("\nAll of it fits. What takes the room: abcd plan --verbose", highlight=False)
 
 
-def _total(shares: tuple[Share, ...]) -> int:
+def _total(shares: Shares) -> int:
     return sum(share.nbytes for share in shares)
 
 

@@ -34,6 +34,9 @@ class Share:
     nbytes: int
 
 
+Shares = tuple[Share, ...]
+
+
 @dataclass(frozen=True)
 class Forecast:
     """All that `abcd plan` prints."""
@@ -44,15 +47,15 @@ class Forecast:
     views_of_block: tuple[int, ...]
     """By block, the training views in which one of its points is."""
     points_of_block: tuple[int, ...]
-    device: tuple[Share, ...]
-    ram: tuple[Share, ...]
-    disk: tuple[Share, ...]
+    device: Shares
+    ram: Shares
+    disk: Shares
     steps: int
     seconds_per_step: float
     """Measured with the initial points."""
     warnings: tuple[str, ...]
     workers: int = 1
-    sent: tuple[Share, ...] = ()
+    sent: Shares = ()
     """What a visit by a worker moves; nothing without workers."""
 
     @property
@@ -75,7 +78,7 @@ def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple
     return tuple(counts.tolist())
 
 
-def device_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
+def device_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
     """What a visit to a block of the expected size takes on the device."""
     largest = _largest(fit)
     trained = largest * needs.gaussian_bytes
@@ -93,7 +96,7 @@ def _largest(fit: Fit) -> int:
     return min(share, limit) if limit else share
 
 
-def sent_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
+def sent_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
     """What a visit by a worker moves: at most, for a machine keeps what it was sent until it changes."""
     block = _largest(fit) * needs.parameter_bytes
     return (
@@ -102,9 +105,7 @@ def sent_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
     )
 
 
-def ram_shares(
-    fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int, workers: int = 1
-) -> tuple[Share, ...]:
+def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int, workers: int) -> Shares:
     """What the rest takes in RAM, beside Python and torch."""
     scene = fit.gaussians * needs.parameter_bytes
     out = 2 * SLACK * workers * STATES * _largest(fit) * needs.parameter_bytes
@@ -117,7 +118,7 @@ def ram_shares(
     )
 
 
-def disk_shares(fit: Fit, needs: DeviceNeeds) -> tuple[Share, ...]:
+def disk_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
     """What a run leaves and holds on disk."""
     scene = fit.gaussians * needs.parameter_bytes
     return (
