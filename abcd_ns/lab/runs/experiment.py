@@ -30,14 +30,14 @@ def carry_out(
     overwrite: bool = False,
     leave_out: LeaveOut = lambda *_: None,
 ) -> int:
-    """Do all jobs of the plan and write what came of them; exit code 1 if a run failed.
-
-    Args:
-        overwrite: drop the runs that the plan's folder holds.
-    """
+    """Do all jobs of the plan and write what came of them, or drop the runs that its folder holds if
+    `overwrite`; exit code 1 if a run failed."""
     for results in run_jobs(plan, console, overwrite, leave_out):
         write_json(plan.out / RESULTS_FILE, encode(results))  # each time: a long one may be interrupted
-    report(results, plan.out, console, draw)
+    paths = write_report(results, plan.out, draw)
+    if results.arms:
+        print_table(results, console)
+    print_paths(paths, console)
     return 1 if results.failures else 0
 
 
@@ -94,14 +94,6 @@ def write_report(results: Results, out: Path, draw: Draw) -> list[Path]:
     write_json(out / RESULTS_FILE, encode(results))
     write_table(results, out / TABLE_FILE)
     return [out / RESULTS_FILE, out / TABLE_FILE, *draw(results, out)]
-
-
-def report(results: Results, out: Path, console: Console, draw: Draw) -> None:
-    """The same, with the table and the paths in the terminal too."""
-    paths = write_report(results, out, draw)
-    if results.arms:
-        print_table(results, console)
-    print_paths(paths, console)
 
 
 def print_paths(paths: Sequence[Path], console: Console) -> None:
