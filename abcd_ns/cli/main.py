@@ -41,23 +41,13 @@ COMMANDS = (
     Command("synth", "abcd_ns.lab.synth.command:synth", "render a synthetic scene to train on"),
     Command("train", "abcd_ns.cli.train:train", "ns-train, with options from a TOML file", hands_on=True),
     Command("plan", "abcd_ns.cli.plan.command:plan", "say what a run will need, before it begins"),
-    Command(
-        "report",
-        "abcd_ns.cli.report.command:report",
-        "show all about a training run on one HTML page",
-    ),
+    Command("report", "abcd_ns.cli.report.command:report", "show all about a training run on one HTML page"),
     Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
     Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as a mesh of triangles"),
     Command(
-        "compare",
-        "abcd_ns.lab.compare.command:compare",
-        "train ABCD and its peers on one scene and compare",
+        "compare", "abcd_ns.lab.compare.command:compare", "train ABCD and its peers on one scene and compare"
     ),
-    Command(
-        "study",
-        "abcd_ns.lab.study.command:study",
-        "vary one thing: blocks, Gaussians, or any options",
-    ),
+    Command("study", "abcd_ns.lab.study.command:study", "vary one thing: blocks, Gaussians, or any options"),
     Command("scale", "abcd_ns.lab.scale.command:scale", "memory and time as the scene grows"),
     Command(
         "stability",

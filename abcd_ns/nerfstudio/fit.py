@@ -9,13 +9,7 @@ import torch
 from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import (
-    DeviceNeeds,
-    drawings_of,
-    fewest_blocks,
-    free_on_gpu,
-    levels_of,
-)
+from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, fewest_blocks, free_on_gpu, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 

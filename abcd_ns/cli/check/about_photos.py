@@ -46,10 +46,7 @@ def mixed_sizes(survey: Survey) -> Iterator[Finding]:
     sizes = Counter(source.size for source in survey.sources)
     if len(sizes) > 1:
         listed = [f"{many(n, 'photo', 'photos')} of {w} x {h}" for (w, h), n in sizes.most_common(3)]
-        yield note(
-            "mixed-sizes",
-            f"Photos differ in size: {few(listed, len(sizes))}. That is no fault.",
-        )
+        yield note("mixed-sizes", f"Photos differ in size: {few(listed, len(sizes))}. That is no fault.")
 
 
 def large_photos(survey: Survey) -> Iterator[Finding]:

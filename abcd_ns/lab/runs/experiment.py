@@ -24,11 +24,7 @@ LeaveOut = Callable[[Job, Run | Failure | None], LeftOut | None]
 
 
 def carry_out(
-    plan: Plan,
-    console: Console,
-    draw: Draw,
-    overwrite: bool = False,
-    leave_out: LeaveOut = lambda *_: None,
+    plan: Plan, console: Console, draw: Draw, overwrite: bool = False, leave_out: LeaveOut = lambda *_: None
 ) -> int:
     """Do all jobs of the plan and write what came of them, or drop the runs that its folder holds if
     `overwrite`; exit code 1 if a run failed."""

@@ -46,12 +46,7 @@ class SparsePoints:
 
 
 def court_points(
-    world: SunlitWorld,
-    views: list[View],
-    own: range,
-    nearby: list[int],
-    count: int,
-    rng: np.random.Generator,
+    world: SunlitWorld, views: list[View], own: range, nearby: list[int], count: int, rng: np.random.Generator
 ) -> SparsePoints:
     """About `count` points that the cameras `own` of one court see, each in at least two cameras.
 
