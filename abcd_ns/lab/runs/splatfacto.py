@@ -1,6 +1,5 @@
 """Splatfacto as a peer: on the photos and cameras that ABCD reads, without what its own scores alone need."""
 
-from typing import Any
 from unittest import mock
 
 import torch
@@ -11,19 +10,12 @@ from torchmetrics.image import lpip
 from abcd_ns.data.dataset import AbcdDataset
 
 
-class _NoLpips(torch.nn.Module):
-    """In the place of a measure whose weights, 233 MiB, nerfstudio would fetch from the network."""
-
-    def __init__(self, **_options: Any) -> None:
-        super().__init__()
-
-
 class Splatfacto(SplatfactoModel):
     """Splatfacto, of which only pictures are asked: they are scored as all others are."""
 
     def populate_modules(self) -> None:
-        """As splatfacto's, without LPIPS."""
-        with mock.patch.object(lpip, "LearnedPerceptualImagePatchSimilarity", _NoLpips):
+        """As splatfacto's, without LPIPS, whose weights, 233 MiB, nerfstudio would fetch from the network."""
+        with mock.patch.object(lpip, "LearnedPerceptualImagePatchSimilarity", torch.nn.Identity):
             super().populate_modules()
 
 
