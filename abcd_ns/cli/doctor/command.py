@@ -103,12 +103,10 @@ def _hardware(hardware: Hardware, verbose: bool) -> dict[str, str]:
         "RAM": f"{_gib(hardware.ram_bytes)}, {_gib(hardware.ram_free_bytes)} free",
         "disk": f"{_gib(hardware.disk_free_bytes)} free",
     }
-    more = {
-        "OS": hardware.os,
-        "driver": hardware.driver or "none",
-        "torch's CUDA": hardware.torch_cuda or "none",
-    }
-    return {**rows, **more} if verbose else rows
+    if verbose:
+        rows |= {"OS": hardware.os, "driver": hardware.driver or "none"}
+        rows |= {"torch's CUDA": hardware.torch_cuda or "none"}
+    return rows
 
 
 def _workers(hardware: Hardware, ray: str | None) -> str:

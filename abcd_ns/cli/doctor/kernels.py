@@ -62,7 +62,7 @@ def look_at_kernels(on_gpu: bool) -> Kernels:
         built=sum(kernel.path.is_file() for kernel in kernels),
         wanted=len(kernels),
         folder=str(kernels_folder()),
-        compiler=_compiler(),
+        compiler=next(filter(shutil.which, (os.environ.get("CXX", ""), *COMPILERS)), None),
         gsplat=None if extension is None else str(extension),
         nvcc=_nvcc(),
         ninja=shutil.which("ninja") is not None,
@@ -132,11 +132,6 @@ def _use(extension: Path) -> None:
     backend._C = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(backend._C)
     sys.modules[backend.__name__] = backend
-
-
-def _compiler() -> str | None:
-    names = (os.environ.get("CXX", ""), *COMPILERS)
-    return next((name for name in names if name and shutil.which(name)), None)
 
 
 def _nvcc() -> str | None:

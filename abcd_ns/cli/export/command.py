@@ -71,7 +71,9 @@ def export(
         counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
         if not sum(counts.values()):
             raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
-        _tell_ram(suffix, max(counts.values()) if by_block else sum(counts.values()))
+        if suffix in PACKED:
+            needed = (max if by_block else sum)(counts.values()) * BYTES_AT_ONCE / 2**20
+            print(f"{suffix} is packed at once, in about {needed:,.0f} MiB of RAM; .ply and .glb are not.")
         write = _write_parts if by_block else _write
         written = write(scene, counts, out, suffix)
     _report(written, counts, scene, suffix)
@@ -124,12 +126,6 @@ def stored(run: Path, out: Path) -> Iterator[ParameterStore]:
         raise UserError(f"{error} If the run is training, wait until it has ended.") from None
     except OSError as error:
         raise UserError(f"{out} cannot be written: {error.strerror}.") from None
-
-
-def _tell_ram(suffix: str, count: int) -> None:
-    if suffix in PACKED:
-        needed = count * BYTES_AT_ONCE / 2**20
-        print(f"{suffix} is packed at once, in about {needed:,.0f} MiB of RAM; .ply and .glb are not.")
 
 
 def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:

@@ -86,14 +86,10 @@ def _quality(story: Story, held_out: HeldOut | None) -> list[Fact]:
         more = "" if also is None else f"composited {also:.{digits}f}"
         facts.append(Fact(name, NOTHING if value is None else f"{value:.{digits}f}", unit, more))
     if composited:
-        facts.append(Fact("ordering gap", *_number_and_rest(held_out.gap)))
+        number, _, unit = held_out.gap.partition(" ")  # or the reason why there is none
+        known = (number, unit, "merged against composited") if unit == "dB" else (NOTHING, "", held_out.gap)
+        facts.append(Fact("ordering gap", *known))
     return facts
-
-
-def _number_and_rest(gap: str) -> tuple[str, str, str]:
-    """Value, unit and remark of an ordering gap, or of the reason why there is none."""
-    number, _, unit = gap.partition(" ")
-    return (number, unit, "merged against composited") if unit == "dB" else (NOTHING, "", gap)
 
 
 def _memory(run: RunFolder) -> list[Fact]:

@@ -123,17 +123,12 @@ def short(count: float) -> str:
     return f"{count / 1e3:.3g}k" if count >= 1000 else f"{count:g}"
 
 
-def name_and_score(name: str, psnr: float) -> str:
-    """What stands at the end of a curve of PSNR."""
-    return f"{name}  {psnr:.2f}"
-
-
 def label_ends(
     axes: Axes,
     ends: dict[str, tuple[float, float]],
     right: float,
     colors: Mapping[str, str] = COLORS,
-    write: Callable[[str, float], str] = name_and_score,
+    write: Callable[[str, float], str] = "{}  {:.2f}".format,
     gap: float = LABEL_GAP,
 ) -> None:
     """Each curve's name and last value beside its end, in its colour.

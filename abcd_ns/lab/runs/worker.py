@@ -78,18 +78,12 @@ def set_up(job: Job, out: Path) -> Training:
     config = trainer_config(job, out)
     if isinstance(config, AbcdTrainerConfig):
         config.check()
-    seed_everything(job.seed)
+    for seed in (random.seed, np.random.seed, torch.manual_seed):  # as `ns-train` does
+        seed(job.seed)
     trainer = config.setup(local_rank=0, world_size=1)
     config.save_config()
     trainer.setup()
     return Training(trainer, job.settings)
-
-
-def seed_everything(seed: int) -> None:
-    """As nerfstudio's `ns-train` does before it sets a trainer up."""
-    random.seed(seed)
-    np.random.seed(seed)
-    torch.manual_seed(seed)
 
 
 def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[ViewScore], list[float]]:

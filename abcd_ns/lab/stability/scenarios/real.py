@@ -5,7 +5,6 @@ from pathlib import Path
 
 import torch
 
-from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.lab.stability.lab import BUDGET, PAIR, Lab, Stage
 from abcd_ns.lab.stability.outcome import Finding, Scenario, against_one_block, db
@@ -61,12 +60,9 @@ def read_stage(data: Path, downscale: int, most_points: int | None = None) -> St
 
 def repeated(stage: Stage, count: int) -> Stage:
     """`count` views: every one again and again, each time under a number of its own."""
-    views: list[View] = []
-    photos = {}
-    for number in range(count):
-        view = stage.views[number % len(stage.views)]
-        views.append(replace(view, index=number))
-        photos[number] = stage.photos[view.index]
+    shown = {number: stage.views[number % len(stage.views)] for number in range(count)}
+    views = [replace(view, index=number) for number, view in shown.items()]
+    photos = {number: stage.photos[view.index] for number, view in shown.items()}
     return replace(stage, views=views, photos=photos)
 
 
