@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import viser
 import viser.transforms as vtf
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.space.tree import Box
@@ -121,14 +121,5 @@ def views_that_see(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[
     """The views in whose image at least SEEN_SHARE of the points lie, occluded or not."""
     if len(points) == 0:
         return []
-    return [view for view in views if float(in_image(points, view).double().mean()) >= SEEN_SHARE]
-
-
-def in_image(points: Float[Tensor, "n 3"], view: View) -> Bool[Tensor, "n"]:
-    """Which points lie in a view's image, occluded or not; on the CPU."""
-    matrix, K = view.viewmat.double().cpu(), view.K.double().cpu()
-    camera = points.double().cpu() @ matrix[:3, :3].T + matrix[:3, 3]
-    z = camera[:, 2]
-    pixels = camera @ K.T
-    x, y = pixels[:, 0] / z, pixels[:, 1] / z
-    return (z > view.near) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+    points = points.double().cpu()
+    return [view for view in views if float(view.depths_of(points)[1].double().mean()) >= SEEN_SHARE]

@@ -15,7 +15,6 @@ from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.fit import Fit, ram_budget, share_out
-from abcd_ns.viewer.scenery import in_image
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
@@ -74,7 +73,7 @@ def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple
     """
     owner, counts = tree.assign(points), torch.zeros(tree.num_blocks, dtype=torch.int64)
     for view in views:
-        counts[owner[in_image(points, view)].unique()] += 1
+        counts[owner[view.depths_of(points.double())[1]].unique()] += 1
     return tuple(counts.tolist())
 
 
