@@ -240,10 +240,10 @@ class Lab:
         degree = gaussians.sh_degree
         return [self.rasterizer(gaussians, view, sh_degree=degree).color.clamp(0, 1) for view in views]
 
-    def score(self, coordinator: Coordinator, stage: Stage) -> float:
-        """Mean PSNR of merged pictures of the held-out views, dB."""
+    def score(self, coordinator: Coordinator, stage: Stage, measure: Callable = psnr) -> float:
+        """Mean PSNR, or another measure, of merged pictures of the held-out views, dB."""
         drawn = self.pictures(merged(coordinator), stage.held_out)
-        return sum(float(psnr(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
+        return sum(float(measure(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
 
     def corrected(self, stage: Stage, method: Method, **options) -> float:
         """As `compared`, each picture warped to its photo's colours before it is scored.
@@ -252,8 +252,7 @@ class Lab:
             options: of `coordinator`.
         """
         trained = self.train_limited(stage, method, **options)
-        drawn = self.pictures(trained.gaussians, stage.held_out)
-        return sum(corrected_psnr(a, b) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
+        return self.score(trained.coordinator, stage, corrected_psnr)
 
     def error(self, coordinator: Coordinator, stage: Stage) -> float:
         """The full objective, near enough: the mean absolute error over all training photos."""
