@@ -68,8 +68,8 @@ def export(
     to = to_data(run) if frame == "data" else None
     with stored(run, out) as store:
         scene = Shown(store, to, box)
-        counts = {block: scene.count(block) for block in _steps(scene.blocks, "counting")}
-        if not sum(counts.values()):
+        counts = {block: n for block in _steps(scene.blocks, "counting") if (n := scene.count(block))}
+        if not counts:
             raise UserError("There is no Gaussian to export" + (" in this box." if box else "."))
         if suffix in PACKED:
             needed = (max if by_block else sum)(counts.values()) * BYTES_AT_ONCE / 2**20
@@ -130,7 +130,7 @@ def stored(run: Path, out: Path) -> Iterator[ParameterStore]:
 
 def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
     with scene_file(out, suffix, sum(counts.values()), scene.sh_degree, _up(scene)) as append:
-        for block in _steps([block for block, count in counts.items() if count], "writing"):
+        for block in _steps(counts, "writing"):
             append(scene.gaussians(block))
         rounding(suffix, scene.largest)
     return [out]
@@ -140,7 +140,7 @@ def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -
     out.mkdir()
     written = []
     try:
-        for block in _steps([block for block, count in counts.items() if count], "writing"):
+        for block in _steps(counts, "writing"):
             written += _write(scene, {block: counts[block]}, out / f"block-{block:04d}{suffix}", suffix)
     except BaseException:  # a full disk, or Ctrl-C: a part of the scene is of no use
         shutil.rmtree(out)
