@@ -36,7 +36,9 @@ class UnavailableConfig(TrainerConfig):
 
     def print_to_terminal(self) -> None:
         """Say so and end; it is the first that `ns-train` calls."""
-        CONSOLE.print(f"error: {self.trouble}", style="red", markup=False, soft_wrap=True, highlight=False)
+        CONSOLE.print(
+            f"error: {self.trouble}", style="red", markup=False, emoji=False, soft_wrap=True, highlight=False
+        )
         raise SystemExit(2)
 
 

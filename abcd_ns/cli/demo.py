@@ -66,7 +66,7 @@ class Steps:
             StepFailed: it exited with another code than 0.
         """
         typed = ["abcd", *command[3:]] if command[1:2] == ["-m"] else [name, *command[1:]]
-        self._console.print(f"$ {' '.join(typed)}", style="dim", markup=False, soft_wrap=True)
+        self._console.print(f"$ {' '.join(typed)}", style="dim", markup=False, emoji=False, soft_wrap=True)
         log = self._logs / f"{name}.log"
         with open(log if quiet else os.devnull, "wb") as stream:
             output = {"stdout": stream, "stderr": subprocess.STDOUT} if quiet else {}
@@ -111,7 +111,7 @@ def demo(
     try:
         _carry_out(Steps(console, logs), out, seconds, blocks, console)
     except StepFailed as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        print_plain(f"error: {error}", console, style="bold red")
         return 1
     return 0
 

@@ -1,7 +1,7 @@
 """Trains single visits of somebody else's run, on parameters of its own."""
 
 import copy
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -75,7 +75,7 @@ class VisitWorker:
 
     Args:
         target: gives what a sample is trained on.
-        expect: is told the views of a step, and of those to come.
+        read_ahead: is told of the photos that are wanted soon.
     """
 
     def __init__(
@@ -84,10 +84,10 @@ class VisitWorker:
         rasterizer: Rasterizer,
         target: Callable[[Sample], Target],
         device: torch.device | str = "cpu",
-        expect: Callable[[Iterable[int]], None] = lambda _: None,
+        read_ahead: Callable[[Event], None] = lambda _: None,
     ) -> None:
         self._setup, self._rasterizer = setup, rasterizer
-        self._target, self._device, self._expect = target, torch.device(device), expect
+        self._target, self._device, self._read_ahead = target, torch.device(device), read_ahead
 
     def visit(
         self,
@@ -111,6 +111,7 @@ class VisitWorker:
                 listen(event)
 
         run.announce.subscribe(hear)
+        run.announce.subscribe(self._read_ahead)
         run.stopwatch.start()
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
         training = VisitTraining(run, OnLease(run, task, len(state)), LayerSource(run, layers))
@@ -164,7 +165,6 @@ class VisitWorker:
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:
         batch = training.next_batch()
-        self._expect([*(sample.view.index for sample in batch.samples), *batch.coming])
         targets = [self._target(sample) for sample in batch.samples]
         rendered = training.render(batch)
         pictures, photos, wanted = [], [], []

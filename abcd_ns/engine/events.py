@@ -118,6 +118,13 @@ class WorkerSeen:
 
 
 @dataclass(frozen=True)
+class PhotosWanted:
+    """Photos of these views, by index, will be asked for soon, in this order: they may be read ahead."""
+
+    views: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class WorkersSeen:
     """The driver has looked at its workers; it does so about once a second."""
 
@@ -176,6 +183,7 @@ Event = (
     | BlockSplit
     | Mended
     | VisitUndone
+    | PhotosWanted
     | WorkersSeen
     | WorkerLost
     | Shedding

@@ -1,7 +1,7 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from torch.utils.data import DataLoader
 
 from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.engine.events import Event, PhotosWanted
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
@@ -139,6 +140,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def follow(self, coordinator: Trainer) -> None:
         """Serve what this coordinator asks for from now on."""
         self._coordinator = coordinator
+        coordinator.announce.subscribe(self.read_ahead)
 
     def take_poses(self, poses: Mapping[int, torch.Tensor]) -> None:
         """Put training cameras where they were refined to, and held-out ones of the same photos with them.
@@ -167,10 +169,11 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         shot = sample.view.index, sample.source
         return sample.reduced(self.photo(*shot)), sample.reduced_mask(self.mask(*shot))
 
-    def expect(self, rows: Iterable[int]) -> None:
-        """Begin to read training photos that are not on the device; a CPU has its threads busy."""
-        if torch.device(self.device).type != "cpu":
-            self.train_dataset.photos.expect(row for row in rows if ("photo", row) not in self._on_device)
+    def read_ahead(self, event: Event) -> None:
+        """Begin to read photos that are wanted soon and not on the device; a CPU has its threads busy."""
+        if isinstance(event, PhotosWanted) and torch.device(self.device).type != "cpu":
+            rows = (row for row in event.views if ("photo", row) not in self._on_device)
+            self.train_dataset.photos.expect(rows)
 
     def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
         """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""
@@ -198,7 +201,6 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         rows = [sample.view.index for sample in samples.samples]
         camera = self.train_dataset.cameras[rows[0] : rows[0] + 1]  # the model asks for its metadata alone
         camera.metadata = {"cam_idx": rows[0], BATCH: samples}
-        self.expect([*rows, *samples.coming])
         photos, masks = map(list, zip(*map(self.shown, samples.samples), strict=True))
         batch: dict[str, Any] = {"image": photos, "image_idx": rows[0]}
         if any(mask is not None for mask in masks):

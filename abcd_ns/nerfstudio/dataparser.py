@@ -135,7 +135,7 @@ class AbcdDataParser(DataParser):
 
     def tell(self, note: str) -> None:
         """Say what the user should know but need not repair."""
-        CONSOLE.print(one_line(note), style="yellow", markup=False, soft_wrap=True)
+        CONSOLE.print(one_line(note), style="yellow", markup=False, emoji=False, soft_wrap=True)
 
     def rows(self, split: str) -> list[int]:
         """Rows of the prepared scene's lists that belong to a split; see `split_rows`.

@@ -57,7 +57,8 @@ UNUSED_OF_MODEL = {
     **dict.fromkeys(("densify_size_thresh", "n_split_samples"), _FIXED),
     "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",
     **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),
-    **dict.fromkeys(("cull_screen_size", "split_screen_size", "stop_screen_size_at"), _GIANTS),
+    **dict.fromkeys(("cull_screen_size", "stop_screen_size_at"), _GIANTS),
+    "split_screen_size": "what is over a twentieth of a picture wide is split, whenever a block grows",
     **dict.fromkeys(("cull_scale_thresh", "use_scale_regularization", "max_gauss_ratio"), _GIANTS),
     "grid_shape": _GRIDS,
     "camera_optimizer": "set --pipeline.training.poses SO3xR3 instead",
@@ -79,7 +80,7 @@ NOT_CLIPPED = "steps whose gradients are no numbers are skipped, and others are 
 UNUSED_OF_OPTIMIZERS = {
     "camera_opt": "poses are refined by steps of their own, see --pipeline.training.poses",
     "bilateral_grid": _GRIDS,
-    "*.scheduler.*": "--pipeline.training.means-lr-decay is the means' rate at the end, and other rates stay",
+    "*.scheduler.*": "rates follow the run: see --pipeline.training.means-lr-decay",
     "*.optimizer.max_norm": NOT_CLIPPED,
 }
 """Options of splatfacto's optimizers that ABCD has no use for, and why."""

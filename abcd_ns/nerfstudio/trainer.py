@@ -227,7 +227,7 @@ class AbcdTrainer(Trainer):
             self._say(f"To go on:\n  {command}")
 
     def _say(self, text: str) -> None:
-        CONSOLE.print(text, highlight=False, markup=False, soft_wrap=True)
+        CONSOLE.print(text, highlight=False, markup=False, emoji=False, soft_wrap=True)
 
     # -- checkpoints ---------------------------------------------------------------------------------
 
@@ -248,7 +248,9 @@ class AbcdTrainer(Trainer):
         try:
             super()._update_viewer_state(step)
         except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError) as error:
-            CONSOLE.print(f"The viewer failed at step {step} ({error!r}); training goes on.", markup=False)
+            CONSOLE.print(
+                f"The viewer failed at step {step} ({error!r}); training goes on.", markup=False, emoji=False
+            )
 
     def save_checkpoint(self, step: int) -> None:
         """Save the merged scene for nerfstudio's tools, and everything else in the store.

@@ -162,4 +162,4 @@ def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int)
 
     drawn_by, primitive = config.pipeline.model.rasterizer, setup.config.primitive
     rasterizer = make_rasterizer(drawn_by, device, primitive=primitive)
-    return VisitWorker(setup, rasterizer, data.target, device, data.expect)
+    return VisitWorker(setup, rasterizer, data.target, device, data.read_ahead)

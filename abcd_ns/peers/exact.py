@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from abcd_ns.engine.events import StepTaken
+from abcd_ns.engine.events import PhotosWanted, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
@@ -101,13 +101,14 @@ class ExactTrainer(Trainer):
         step, views = self.state.step, self.run.views_at(self.run.reduction)
         rows, samples, first = tuple(sorted(views)), [], step * self.batch
         order = [endless_order(rows, first + k, self.config.seed) for k in range(self.batch + COMING)]
+        self.announce(PhotosWanted(tuple(order)))
         for place in range(self.batch):
             view = views[order[place]]
             behind = background(self.config, step, place).to(self.device, view.viewmat.dtype)
             crop = part_to_draw(self.config, view.full, step, place)
             share = crop.pixels / view.full.pixels
             samples.append(Sample(view, crop, None, None, behind, share))
-        return Batch(step, tuple(samples), tuple(order[self.batch :]))
+        return Batch(step, tuple(samples))
 
     def render(self, batch: Batch) -> Rendered:
         """Pass 1: all blocks' layers, folded; differentiable in the pictures alone."""

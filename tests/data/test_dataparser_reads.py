@@ -15,6 +15,7 @@ from PIL import Image
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.ply import read_points
+from abcd_ns.engine.events import PhotosWanted
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
 from tests.data.dataparser_scenes import (
@@ -251,7 +252,7 @@ def test_photos_of_the_next_steps_are_read_ahead_of_a_device(scene, monkeypatch,
     manager.device, manager._on_device["photo", 1] = device, torch.empty(0)
     expected: list[int] = []
     monkeypatch.setattr(manager.train_dataset.photos, "expect", expected.extend)
-    manager.expect([0, 1, 2])
+    manager.read_ahead(PhotosWanted((0, 1, 2)))
     assert expected == read
 
 

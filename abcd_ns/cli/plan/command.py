@@ -53,13 +53,15 @@ class Wanted:
     blocks: Number = 0
     """number of blocks; 0 takes as few as the device's budget allows."""
     device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0
-    """memory of the device that training may take; 0 takes what is free."""
+    """memory of the device that training may take; 0 takes 0.9 of what is free on a GPU, or a quarter of
+    the RAM on a CPU, as in training."""
     max_gaussians: Number = 0
     """limit on Gaussians in the whole scene; 0 is none, and five for each point are expected."""
     steps: Number = 30_000
     """of the run."""
     workers: Number = 1
-    """blocks trained at once, each by a process on a GPU of its own or on a part of the cores."""
+    """blocks trained at once, each by a process on a GPU of its own or on a part of the cores; ns-train's
+    default is one, and all cores where there is no GPU."""
 
 
 @tyro.conf.configure(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)

@@ -31,7 +31,8 @@ class TrainingConfig:
     warmup: float = 0.35
     """Share of the run for which a scaffold is trained before blocks are: Gaussians all over the scene, which
     grow to as many as take no more memory than a visit to the largest block. Twice as long, if need be, for
-    each view to be used 24 times; but no longer than that where not all points have room. 0 for none."""
+    each view to be used 24 times. Where not all points have room it ends after this share or 24 uses of each
+    view, whichever comes first. 0 for none."""
     batch: int = 0
     """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and in the
     warm-up, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
@@ -57,7 +58,7 @@ class TrainingConfig:
     ssim_lambda: float = 0.2
     """Weight of 1 - SSIM in the loss; the rest is the difference of pixels."""
     normal_consistency: float = 0.0
-    """Weight of 2DGS's normal consistency in the loss of surfels, from a quarter of the run on: smoother
+    """Weight of 2DGS's normal consistency in the loss of surfels, from 7/30 of the run on: smoother
     surfaces, worse pictures. 2DGS has 0.05; 0 for none."""
     antialiased: bool = False
     """Scale opacities by gsplat's compensation for its low-pass filter."""
@@ -73,7 +74,7 @@ class TrainingConfig:
     each camera turns and where it is. Held-out views keep the poses that were given. With `workers` poses are
     refined in the warm-up only."""
     means_lr_decay: float = 0.01
-    """Learning rate of the means at the end, as a share of the start's; exponential over the run."""
+    """What the means' learning rate falls to over the run, exponentially, as a share; besides what all do."""
     point_pixels: float = 2.0
     """Points of the cloud that lie in a cube so many pixels wide, in the view that sees them from nearest,
     begin as one Gaussian; 0 begins with all."""

@@ -212,7 +212,7 @@ def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: 
     console.print(shown)
     console.width = width
     for remark in remarks:
-        console.print(f"- {remark}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"- {remark}", highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 
 def _difference(arm: Arm, results: Results) -> str:

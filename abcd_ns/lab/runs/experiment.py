@@ -95,4 +95,4 @@ def write_report(results: Results, out: Path, draw: Draw) -> list[Path]:
 def print_paths(paths: Sequence[Path], console: Console) -> None:
     """What was written."""
     for path in paths:
-        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
+        console.print(str(path), highlight=False, markup=False, emoji=False, soft_wrap=True)

@@ -84,7 +84,9 @@ def finish_job(job: Job, out: Path, console: Console, head: str) -> Run | Failur
     outcome, how = finished_run(job, out), "reused, "
     if outcome is None:
         outcome, how = run_job(job, out, console, head), ""
-    console.print(f"{head}: {how}{_short(outcome)}", markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"{head}: {how}{_short(outcome)}", markup=False, emoji=False, highlight=False, soft_wrap=True
+    )
     return outcome
 
 
@@ -139,7 +141,7 @@ def _wait(process: subprocess.Popen, log: Path, console: Console, head: str) -> 
             status.update(text.replace("[", r"\["))
             if not console.is_terminal and now - told > SECONDS_BETWEEN_LINES:
                 told = now
-                console.print(text, markup=False, highlight=False, soft_wrap=True)
+                console.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def _reason(code: int, log: Path) -> str:

@@ -186,7 +186,9 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
     head = f"{outcome.id:>4}  {word}  {outcome.fails}  ({outcome.seconds:.0f} s)"
     console.print(head, highlight=False, soft_wrap=True)
     for method, said in outcome.said.items():
-        console.print(f"            {method}: {said}", highlight=False, markup=False, soft_wrap=True)
+        console.print(
+            f"            {method}: {said}", highlight=False, markup=False, emoji=False, soft_wrap=True
+        )
 
 
 def _bar(console: Console) -> Progress:

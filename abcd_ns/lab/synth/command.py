@@ -13,6 +13,7 @@ import torch
 import tyro
 from PIL import Image
 from rich.console import Console
+from rich.text import Text
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_json, write_json
@@ -99,17 +100,14 @@ def synth(
     settings.check()
     console = Console(stderr=True)
     if not _prepare(out, settings, overwrite):
-        console.print(f"{out} already holds this scene; nothing to do.", highlight=False, soft_wrap=True)
+        console.print(Text(f"{out} already holds this scene; nothing to do."), soft_wrap=True)
         return
     write_json(out / MARKER, _marker(settings, complete=False))
     pictures, points = _draw(out, settings, console)
     (out / "SOURCE.md").write_text(_source(settings, pictures, points), encoding="utf-8")
     write_json(out / MARKER, _marker(settings, complete=True))
-    console.print(
-        f"{out}: {pictures} pictures and {points} points of {settings.courts} courts.",
-        highlight=False,
-        soft_wrap=True,
-    )
+    drawn = f"{pictures} pictures and {points} points of {settings.courts} courts"
+    console.print(Text(f"{out}: {drawn}."), soft_wrap=True)
 
 
 def _draw(out: Path, settings: Settings, console: Console) -> tuple[int, int]:

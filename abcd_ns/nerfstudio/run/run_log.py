@@ -198,7 +198,7 @@ class RunLog:
                 file.write(text)
         except OSError as error:
             what = f"{self._path} cannot be written ({error.strerror}); the run's log ends here."
-            CONSOLE.print(what, style="yellow", markup=False, soft_wrap=True)
+            CONSOLE.print(what, style="yellow", markup=False, emoji=False, soft_wrap=True)
             self._path = None
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from abcd_ns.engine.events import SweepEnded, VisitBegan
+from abcd_ns.engine.events import PhotosWanted, SweepEnded, VisitBegan
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import LOOK_AGAIN
@@ -32,22 +32,22 @@ def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(tmp_path, vie
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_a_batch_tells_the_views_of_the_steps_to_come(tmp_path, views, start, blocks):
+def test_photos_of_a_step_and_of_those_to_come_are_wanted(tmp_path, views, start, blocks):
     coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=24)
+    wanted = listen(coordinator, PhotosWanted)
     told: dict[int, list[tuple[int, ...]]] = {}
     drawn: dict[int, list[int]] = {}
     while not coordinator.finished:
         batch = coordinator.next_batch()
         visit = coordinator.run.active.number
-        told.setdefault(visit, []).append(batch.coming)
+        told.setdefault(visit, []).append(wanted[-1].views)
         drawn.setdefault(visit, []).extend(sample.view.index for sample in batch.samples)
-        rendered = coordinator.render(batch)
-        coordinator.after_step(rendered)
+        coordinator.after_step(coordinator.render(batch))
     for visit, order in drawn.items():
-        for step, coming in enumerate(told[visit], start=1):
-            follows = order[step * coordinator.batch :][:COMING]
-            assert list(coming[: len(follows)]) == follows
-    assert any(any(coming) for coming in told.values())
+        for step, views_told in enumerate(told[visit]):
+            follows = order[step * coordinator.batch :][: coordinator.batch + COMING]
+            assert list(views_told[: len(follows)]) == follows
+    assert any(len(views_told) > coordinator.batch for views_told in told[0])
 
 
 def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(

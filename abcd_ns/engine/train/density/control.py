@@ -30,7 +30,7 @@ GATHER, REFINE, NEVER = 1, 6, 7
 GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.5
-"""Shares of a visit, and of the warm-up, after which there are no refinements, and no resets of opacities."""
+"""Share of a visit among others after which none is refined; of a warm-up after which no opacity is reset."""
 SPLIT_SCALE = 0.01
 """Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
 PLAIN_GRADIENT = 0.25
@@ -49,7 +49,7 @@ Infos = tuple[dict[str, Any], ...]
 
 @dataclass
 class DensityConfig:
-    """When and how the number of Gaussians changes. Thresholds are splatfacto's, times are relative."""
+    """When and how the number of Gaussians changes. Thresholds are splatfacto's, but opacities'; times are relative."""
 
     strategy: Literal["default", "mcmc", "off"] = "default"
     """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""

@@ -25,7 +25,7 @@ Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
 BACKGROUNDS = 1024
 """Steps whose backgrounds are copied to a device together."""
 COMING = 8
-"""Views of which is known that they are next."""
+"""Views of the next steps, whose photos are wanted soon."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,6 @@ class Batch:
 
     step: int
     samples: tuple[Sample, ...]
-    coming: tuple[int, ...] = ()
-    """Views of the next steps, COMING of them as far as they are known: photos may be read ahead."""
 
     def losses(
         self,

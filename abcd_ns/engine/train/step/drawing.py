@@ -6,6 +6,7 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.events import PhotosWanted
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.space.influence import share_shown
@@ -71,11 +72,12 @@ class StepDrawing:
     # -- a step --------------------------------------------------------------------------------------
 
     def next_batch(self) -> Batch:
-        """What to draw next."""
+        """What to draw next; listeners are told the views of the steps to come, too."""
         step, first = self._run.state.step, self._run.active.done * self.batch
-        views = enumerate(self._views_of(range(first, first + self.batch)))
-        coming = self._views_of(range(first + self.batch, first + self.batch + COMING))
-        return Batch(step, tuple(self._sample(view, place, step) for place, view in views), coming)
+        views = self._views_of(range(first, first + self.batch + COMING))
+        self._run.announce(PhotosWanted(views))
+        now = enumerate(views[: self.batch])
+        return Batch(step, tuple(self._sample(view, place, step) for place, view in now))
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""

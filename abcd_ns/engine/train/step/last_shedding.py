@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import ShedAtEnd, Shedding
+from abcd_ns.engine.events import PhotosWanted, ShedAtEnd, Shedding
 from abcd_ns.engine.layers.whole_pictures import WholePicture
 from abcd_ns.engine.store.derived_scenes import ChangedScene, HeldScene
 from abcd_ns.engine.store.scene import BlockScene
@@ -149,6 +149,7 @@ class LastShedding:
 
         for group in pictures.groups(chosen):
             run.announce(Shedding(0, ROUNDS + 1))
+            run.announce(PhotosWanted(tuple(view.index for view in group)))
             pictures.backward(group, gradient, probe.take_note)
         nowhere = 0.0 if len(chosen) == len(views) else torch.inf
         worth = [PER_NEPER / len(chosen) * probe.worth(block) for block in blocks]
@@ -165,6 +166,7 @@ class LastShedding:
         left = ChangedScene(self._scene, lambda block, found: found[(worth[block] > price).to(device)])
         pictures = self._whole.pictures(views, left)
         found = []
+        self._run.announce(PhotosWanted(tuple(view.index for view in views)))
         for view, picture in zip(views, pictures.draw(views), strict=True):
             self._run.announce(Shedding(taken, ROUNDS + 1))
             square, counts = self._square(view, picture)

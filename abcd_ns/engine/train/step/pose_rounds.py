@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.events import PhotosWanted
 from abcd_ns.engine.layers.whole_pictures import WholePicture
 from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
 from abcd_ns.engine.train.run import TrainingRun
@@ -57,6 +58,7 @@ class PoseRounds:
         steps: dict[int, Tensor] = {}
         pictures = self._whole.pictures(views, run.scene)
         for group in pictures.groups(views):
+            run.announce(PhotosWanted(tuple(view.index for view in group)))
             judged: dict[int, tuple[WholePicture, Tensor]] = {}
 
             def gradient(view: View, picture: WholePicture, judged=judged) -> Tensor:
