@@ -49,7 +49,7 @@ Infos = tuple[dict[str, Any], ...]
 
 @dataclass
 class DensityConfig:
-    """When and how the number of Gaussians changes. Thresholds are splatfacto's, but opacities'; times are relative."""
+    """When and how the number of Gaussians changes. Thresholds are splatfacto's but that of opacities."""
 
     strategy: Literal["default", "mcmc", "off"] = "default"
     """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""
