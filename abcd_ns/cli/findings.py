@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
+from typing import Literal
 
 from rich.console import Console
 
@@ -34,7 +34,7 @@ class Finding:
     """What to do about it; empty where `what` says so, or where there is nothing to be done."""
 
 
-error, warning, note = (partial(Finding, level) for level in get_args(Level))
+error, warning, note = partial(Finding, "error"), partial(Finding, "warning"), partial(Finding, "note")
 """A finding of that level."""
 
 

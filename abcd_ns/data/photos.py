@@ -5,6 +5,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -22,8 +23,8 @@ from abcd_ns.data.undistort import Undistortion
 
 READERS = 4
 """Threads that decode what is expected."""
-EXPECTED = 32
-"""Pictures that may be decoded, beyond the budget, before anybody asks for them."""
+FEWEST_AHEAD = 12
+"""Photos that are read ahead of whoever asks for them, beyond the budget: a step's, and those of the next."""
 _MASK_USED = 255
 
 
@@ -67,7 +68,10 @@ class Photos:
 
     def __init__(self, sources: Sequence[PhotoSource], budget_bytes: int | None = None):
         self.sources = tuple(sources)
-        self._cache = _ByteCache(default_budget() if budget_bytes is None else budget_bytes)
+        budget = default_budget() if budget_bytes is None else budget_bytes
+        largest = max((3 * source.size[0] * source.size[1] for source in self.sources), default=1)
+        self._ahead = max(FEWEST_AHEAD, budget // (8 * largest))
+        self._cache = _ByteCache(budget, 2 * self._ahead)  # each may have a mask
 
     def __len__(self) -> int:
         return len(self.sources)
@@ -91,8 +95,9 @@ class Photos:
         return self._cache.get(("image", index), self._read)
 
     def expect(self, indices: Iterable[int]) -> None:
-        """Begin to decode these photos and their masks, if they are not kept, for whoever asks next."""
-        for index in indices:
+        """Begin to decode the first of these photos and their masks, if they are not kept, for whoever asks
+        next: as many as take an eighth of the budget, and a few in any case."""
+        for index in islice(indices, self._ahead):
             self._cache.expect(("image", index), self._read)
             if self.sources[index].mask_path is not None:
                 self._cache.expect(("mask", index), self._read)
@@ -180,10 +185,14 @@ _Read = Callable[[_Key], Tensor]
 
 
 class _ByteCache:
-    """Least recently used tensors go first. Two threads may both make one."""
+    """Least recently used tensors go first. Two threads may both make one.
 
-    def __init__(self, budget: int):
-        self.budget = budget
+    Args:
+        ahead: how many are made, at most, before anybody asks for them.
+    """
+
+    def __init__(self, budget: int, ahead: int):
+        self.budget, self._ahead = budget, ahead
         self.used = 0
         self._lock = threading.Lock()
         self._kept: OrderedDict[_Key, Tensor] = OrderedDict()
@@ -200,7 +209,7 @@ class _ByteCache:
             if self._readers is None:
                 self._readers = ThreadPoolExecutor(READERS, "photos")
             self._expected[key] = self._readers.submit(make, key)
-            while len(self._expected) > EXPECTED:  # nobody asked for it: its visit is over
+            while len(self._expected) > self._ahead:  # nobody asked for it: its visit is over
                 self._expected.popitem(last=False)[1].cancel()
 
     def get(self, key: _Key, make: _Read) -> Tensor:

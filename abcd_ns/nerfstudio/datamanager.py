@@ -49,7 +49,7 @@ UNUSED = {
     "cache_images_type": "photos are kept as they are stored, 8 bits a channel",
     "images_on_gpu": "photos are kept on the device as far as --pipeline.device-budget-gb allows",
     "masks_on_gpu": "masks are kept on the device as far as --pipeline.device-budget-gb allows",
-    "max_thread_workers": "photos are decoded when they are needed, beside the training",
+    "max_thread_workers": "photos are read ahead of the steps on a GPU, and on a CPU when they are needed",
     "train_cameras_sampling_strategy": "each block takes its views in shuffled turns",
     "train_cameras_sampling_seed": "the order of views follows --pipeline.training.seed",
     "fps_reset_every": "each block takes its views in shuffled turns",

@@ -156,10 +156,11 @@ def test_kept_photo_is_not_read_again_because_it_is_expected(sources, monkeypatc
 
 
 def test_expected_photos_that_nobody_asks_for_are_let_go(sources, monkeypatch):
-    monkeypatch.setattr("abcd_ns.data.photos.EXPECTED", 2)
+    monkeypatch.setattr("abcd_ns.data.photos.FEWEST_AHEAD", 1)
     photos = Photos(sources, 0)
-    photos.expect(range(len(sources)))
-    assert len(photos._cache._expected) == 2
+    for i in range(len(sources)):
+        photos.expect([i, 0])  # the first alone
+    assert [index for _, index in photos._cache._expected] == [4, 5]
     assert all(np.array_equal(photos.image(i).numpy(), noise(i)) for i in range(len(sources)))
 
 

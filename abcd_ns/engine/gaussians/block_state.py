@@ -108,7 +108,7 @@ class BlockState:
 
     @staticmethod
     def clocks_of(meta: dict[str, Any]) -> Clocks:
-        """Those in the JSON of `packed`."""
+        """Those in the JSON of `packed`; what older versions counted besides is passed over."""
         known = vars(Clocks())
         return Clocks(**{name: count for name, count in meta["clocks"].items() if name in known})
 

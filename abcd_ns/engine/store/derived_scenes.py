@@ -31,7 +31,7 @@ class ChangedScene(BlockScene):
 
 
 class HeldScene(BlockScene):
-    """A scene's blocks on a device: read once, as far as there is room, while none of them changes.
+    """A scene's blocks on a device, whole: read once, as far as there is room, while none of them changes.
 
     Args:
         room: bytes of those that are held.

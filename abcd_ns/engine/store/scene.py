@@ -141,7 +141,8 @@ class StoredScene(VisitScene):
             blocks: on the CPU, by number or special name, and tables of the run's under names of their own;
                 they belong to the scene from now on, as `state` does.
             within: this is written so many seconds after the last write began. With 0 all is durable when
-                this returns, and also where what waits to be written exceeds `ram_bytes`.
+                this returns, and also where what waits to be written exceeds `ram_bytes`; where that is the
+                live block, training goes on while it is written.
 
         Raises:
             StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
@@ -161,7 +162,10 @@ class StoredScene(VisitScene):
             self._memory.shrink(unsaved)
             self._rested = time.monotonic()
             self._writer.put(Snapshot(packed, header, state), within or math.inf)
-        if within <= 0 or unsaved > self.ram_bytes:
+        live = blocks.get(LIVE)
+        if within > 0 and live is not None and len(live) and unsaved > self.ram_bytes:
+            self._writer.begin()
+        elif within <= 0 or unsaved > self.ram_bytes:
             self.flush()
         self._writer.check()
 
@@ -185,6 +189,13 @@ class StoredScene(VisitScene):
                     if isinstance(block, Packed) and name not in (LIVE, INBOX):  # nobody reads them here
                         self._memory.put(name, block)
             self._memory.shrink(self.unsaved_bytes)
+
+    def make_room(self) -> None:
+        """Before a copy of the live block is made: wait for the last, if that is large and unwritten."""
+        with self._writer.lock:
+            unsaved = self.unsaved_bytes
+        if unsaved > self.ram_bytes:
+            self.flush()
 
     def is_due(self, within: float) -> bool:
         """Whether something should be put to rest again: nothing was for so many seconds; 0 is no limit."""

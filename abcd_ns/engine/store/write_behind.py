@@ -88,6 +88,15 @@ class WriteBehind:
             self._chore = chore
             self._wake()
 
+    def begin(self) -> None:
+        """Return when all that waits is being written, or could not be."""
+        with self.lock:
+            if self._waiting is not None:
+                self._due = -math.inf
+                self._wake()
+            while self._error is None and self._waiting is not None:
+                self.lock.wait()
+
     def flush(self) -> None:
         """Write all that waits, and return when it is durable; what failed before is tried again.
 
@@ -126,6 +135,7 @@ class WriteBehind:
                 if self._waiting is not None and left <= 0:
                     job = partial(self._write, self._waiting)
                     self._waiting, self._due, self._began = None, math.inf, time.monotonic()
+                    self.lock.notify_all()
                 elif self._chore is not None:
                     job, self._chore = partial(_try, self._chore), None
                 elif self._waiting is not None and left < math.inf:

@@ -33,10 +33,9 @@ LAYER_SHARE = 0.1
 SHORTER = 4
 """Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
 others have made of themselves meanwhile."""
-SETTLES, SETTLED = 0.6, 0.1
-"""From this share of a run on learning rates fall, to this share of them ..."""
-WAY = 1000
-"""... where a block was trained on so many views: one that saw fewer is on its way yet."""
+SETTLES, SETTLED, SETTLING_VIEWS = 0.6, 0.1, 1000
+"""From this share of a run on learning rates fall, to this share of them where a block was trained on so many
+views, the warm-up's included: one that saw fewer is on its way yet."""
 FROZEN_COST, WINDOW_COST = 0.3, 0.4
 """Of drawing a Gaussian into a layer, and of finding its block's window; a training step draws one for 1."""
 
@@ -58,8 +57,14 @@ def warm_up_is_over(progress: float, uses: float, share: float, waiting: int) ->
         waiting: Gaussians that had no room in the scaffold.
     """
     if waiting:
-        return uses >= SCAFFOLD_PASSES or progress >= share
+        return warmed(progress, uses, share, waiting) >= 1
     return progress >= share and (uses >= SCAFFOLD_PASSES or progress >= LONGER * share)
+
+
+def warmed(progress: float, uses: float, share: float, waiting: int) -> float:
+    """The share of the shortest warm-up that there may be which is done; see `warm_up_is_over`."""
+    done = progress / share if share > 0 else 1.0
+    return max(done, uses / SCAFFOLD_PASSES) if waiting else done
 
 
 def passes_of_sweep(sweep: int, first: int, last: int, used: int) -> int:
@@ -181,12 +186,13 @@ def view_order(views: tuple[int, ...], steps: int, visit: int, seed: int) -> tup
 def endless_order(views: tuple[int, ...], index: int, seed: int) -> int:
     """The view of step `index` where nobody knows how many there will be: shuffled passes over all views."""
     number, place = divmod(index, len(views))
-    return _one_pass(views, number, seed)[place]
+    return views[_one_pass(len(views), number, seed)[place]]
 
 
-@lru_cache(maxsize=2)
-def _one_pass(views: tuple[int, ...], number: int, seed: int) -> tuple[int, ...]:
-    shuffled = list(views)
+@lru_cache(maxsize=16)
+def _one_pass(count: int, number: int, seed: int) -> tuple[int, ...]:
+    """An order of so many places."""
+    shuffled = list(range(count))
     random.Random(f"scaffold {seed} {number}").shuffle(shuffled)
     return tuple(shuffled)
 
@@ -198,8 +204,8 @@ def exponential_decay(progress: float, initial: float, final: float) -> float:
 
 def settling(progress: float, views: int) -> float:
     """The share of learning rates that is left, see SETTLES, to a block that was trained on so many views."""
-    settled = SETTLED ** min(views / WAY, 1.0)
-    return exponential_decay((progress - SETTLES) / (1 - SETTLES), 1.0, settled)
+    fallen = exponential_decay((progress - SETTLES) / (1 - SETTLES), 1.0, SETTLED)
+    return fallen ** min(views / SETTLING_VIEWS, 1.0)
 
 
 def reduction_at(progress: float, coarse: float, shortest: int) -> int:

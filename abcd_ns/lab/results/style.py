@@ -24,10 +24,10 @@ LOOKS = {
     "abcd-paper": ("#7A3E00", "P"),
     "splatfacto": ("#007A5A", "D"),
 }
+"""Colours after Okabe and Ito 2008, told apart with every kind of colour blindness, darkened where text needs
+it; and markers, for print without colour."""
 COLORS = {method: color for method, (color, _) in LOOKS.items()}
-"""After Okabe and Ito 2008, told apart with every kind of colour blindness; darkened where text needs it."""
 MARKERS = {method: marker for method, (_, marker) in LOOKS.items()}
-"""For print without colour."""
 STYLE = {
     "font.family": "sans-serif",
     "font.size": 9,

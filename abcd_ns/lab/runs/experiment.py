@@ -26,8 +26,8 @@ LeaveOut = Callable[[Job, Run | Failure | None], LeftOut | None]
 def carry_out(
     plan: Plan, console: Console, draw: Draw, overwrite: bool = False, leave_out: LeaveOut = lambda *_: None
 ) -> int:
-    """Do all jobs of the plan and write what came of them, or drop the runs that its folder holds if
-    `overwrite`; exit code 1 if a run failed."""
+    """Do all jobs of the plan, if `overwrite` after dropping the runs that its folder holds, and write what
+    came of them; exit code 1 if a run failed."""
     for results in run_jobs(plan, console, overwrite, leave_out):
         write_json(plan.out / RESULTS_FILE, encode(results))  # each time: a long one may be interrupted
     paths = write_report(results, plan.out, draw)

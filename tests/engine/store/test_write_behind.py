@@ -157,6 +157,25 @@ def test_what_waits_never_takes_more_ram_than_there_is(scene):
     assert disk.commits == [({0, 1}, {"step": 2})]
 
 
+def test_a_large_live_block_is_written_beside_the_training_and_a_second_one_waits(scene):
+    disk = Disk(scene.store)
+    scene.ram_bytes = 1
+    disk.free.clear()
+    scene.rest(scene.tree, {LIVE: scene.state(0)}, {"step": 1}, within=1e-3)
+    assert disk.asked.wait(PATIENCE)
+    assert disk.commits == []
+    more = (scene.tree, {LIVE: scene.state(1)}, {"step": 2}, 1e-3)
+    rests = threading.Thread(target=scene.rest, args=more, daemon=True)
+    rests.start()
+    rests.join(0.2)
+    assert rests.is_alive()
+    disk.free.set()
+    rests.join(PATIENCE)
+    assert not rests.is_alive()
+    scene.flush()
+    assert disk.commits == [({LIVE}, {"step": 1}), ({LIVE}, {"step": 2})]
+
+
 def test_with_no_seconds_to_wait_all_is_durable_at_once(scene):
     scene.rest(scene.tree, {0: moved(scene.state(0), 2)}, {"step": 1}, within=0.0)
     assert on_disk(scene) == {"step": 1}

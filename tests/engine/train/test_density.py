@@ -7,7 +7,7 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, make_adam
 from abcd_ns.engine.render.primitive import SPLATS, SURFELS
 from abcd_ns.engine.train.config import TrainingConfig
@@ -288,6 +288,12 @@ def test_what_gsplats_surfels_lack_is_refused(option):
     TrainingConfig(**option).check()
     with pytest.raises(UserError, match=f"{next(iter(option))} is for 3dgs"):
         TrainingConfig(primitive="2dgs", **option).check()
+
+
+def test_clocks_of_older_versions_are_read():
+    """They counted resets, too."""
+    meta = {"clocks": {**vars(Clocks(steps=2, visits=1)), "resets": 3}}
+    assert BlockState.clocks_of(meta) == Clocks(steps=2, visits=1)
 
 
 def test_a_reset_needs_no_gradients():

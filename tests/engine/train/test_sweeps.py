@@ -53,7 +53,7 @@ def test_photos_of_a_step_and_of_those_to_come_are_wanted(tmp_path, views, start
 def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(
     tmp_path, views, photos, start, monkeypatch
 ):
-    monkeypatch.setattr("abcd_ns.engine.train.schedule.WAY", 1)  # these blocks see a few dozen views
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.SETTLING_VIEWS", 1)  # these see a few dozen
     still = DensityConfig(strategy="off")
     options = {"steps": 55, "density": still, "visit_steps": 5, "fast_start": True}
     coordinator = make_coordinator(tmp_path, start, views, blocks=7, **options)

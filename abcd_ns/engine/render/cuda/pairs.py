@@ -251,11 +251,9 @@ class Drawing:
         ]
 
     def layers(self) -> list[Layer]:
-        """What each crop looks like; each is its own memory, not a part of all that were drawn with it."""
-        return [
-            Layer(features[..., :3].contiguous(), transmittance.contiguous())
-            for features, transmittance in self.draw()
-        ]
+        """What each crop looks like."""
+        # Its own memory: else each would keep that of all that were drawn with it.
+        return [Layer(features[..., :3].contiguous(), seen) for features, seen in self.draw()]
 
     def windows(self, visible: float) -> list[ZWindow]:
         """Where the splats show in each crop; see z_window.showing."""

@@ -23,8 +23,8 @@ from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.density.shedding import LAST, WEIGHED, faded, may_grow, price_at, weigh, worthless
 
-# Step numbers as gsplat sees them. It refines on multiples of REFINE; resets of opacities and pruning by size
-# in scene units, which takes backgrounds, begin when NEVER steps are over.
+# Step numbers as gsplat sees them. It refines on multiples of REFINE; it resets opacities on multiples of
+# NEVER and prunes by size in scene units, which takes backgrounds, after it.
 GATHER, REFINE, NEVER = 1, 6, 7
 
 GRADIENTS = ("grad2d", "count")
@@ -112,7 +112,8 @@ class DensityClock:
     seed: int
     """Of the random numbers drawn in this step."""
     refined: int | None = None
-    """`steps` when the block was last refined; None refines at the very step that it is due."""
+    """`steps` when the block was last refined; None where there are no others: it is then refined at the very
+    step that it is due, and may be reset."""
     first: bool = False
     """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
     spent: float = 0.0
@@ -182,8 +183,8 @@ class DensityControl:
         return self.is_due(clock) and (self.config.strategy != "default" or bool(_with_gradient(infos)))
 
     def resets(self, clock: DensityClock) -> bool:
-        """Whether this step resets opacities (`default` strategy), without gradients too. Among others never:
-        the longest visit leaves its pictures worse than it found them (stability A6)."""
+        """Whether this step resets opacities (`default` strategy); that needs no gradients. Among others
+        never: however long a visit, it leaves pictures worse than it found them (docs/results/history.md)."""
         every = self.config.reset_every
         if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
             return False

@@ -25,7 +25,7 @@ Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
 BACKGROUNDS = 1024
 """Steps whose backgrounds are copied to a device together."""
 COMING = 8
-"""Views of the next steps, whose photos are wanted soon."""
+"""So many views of the next steps are told of ahead, for their photos."""
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,6 @@ class LastShedding:
 
     def __init__(self, run: TrainingRun, target: Callable[[Sample], Target]) -> None:
         self._run, self._whole = run, WholeViews(run, target)
-        self._scene: BlockScene | None = None
 
     @property
     def is_wanted(self) -> bool:
@@ -99,13 +98,13 @@ class LastShedding:
         """Do it; tells listeners how many went, and at what cost."""
         run = self._run
         views, step = self._whole.views(), run.state.step
-        self._scene = HeldScene(run.scene, run.device, self._room(views))
-        worth = self._worth(views)
+        scene = HeldScene(run.scene, run.device, self._room(views))
+        worth = self._worth(scene, views)
         ranked = torch.cat(worth)
         ranked = ranked[ranked.isfinite()].sort().values
         costs = ranked.double().cumsum(0)
         views = evenly(views, min(max(step // STEPS_EACH, FEWEST), MOST))
-        before = after = self._psnr(views, worth, -1.0, 0)
+        before = after = self._psnr(scene, views, worth, -1.0, 0)
         few, many, price, guess = 0, len(ranked) + 1, -1.0, LOSS
         for taken in range(ROUNDS):
             suggested = min(int(torch.searchsorted(costs, guess)), len(ranked))
@@ -113,32 +112,32 @@ class LastShedding:
             if number <= few:
                 break
             tried = float(ranked[number - 1])
-            found = self._psnr(views, worth, tried, taken + 1)
+            found = self._psnr(scene, views, worth, tried, taken + 1)
             if before - found <= LOSS:
                 few, price, after, guess = number, tried, found, 2 * guess
             else:
                 many = number
-        self._scene = None
+        del scene
         gone = sum(self._take_out(block, of_block, price) for block, of_block in enumerate(worth))
         run.announce(ShedAtEnd(gone, run.count(), len(views), before, after))
 
     def _room(self, views: Sequence[View]) -> int:
-        """Of a device, for blocks that are held there while none is live: half of what a live one has."""
+        """Of a device, for blocks that are held there while none is live: a third of what a live one has."""
         run, limit = self._run, self._run.config.limits.block_limit
         if run.device.type == "cpu":  # their RAM has a budget of its own
             return 0
         needs = needs_of(run.config, max(view.full.pixels for view in views), run.blocks)
         free = free_bytes(run.device)
-        return min(free, limit * needs.gaussian_bytes if limit else free) // 2
+        return min(free, limit * needs.gaussian_bytes if limit else free) // 3
 
-    def _worth(self, views: list[View]) -> list[Float[Tensor, "_n"]]:
+    def _worth(self, scene: BlockScene, views: list[View]) -> list[Float[Tensor, "_n"]]:
         """By block, what those that are drawn are worth in these views, dB of the mean PSNR; infinite for who
         shows in none of them, unless they are all."""
         run = self._run
         blocks = range(run.scene.tree.num_blocks)
         trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
         chosen = evenly(views, max(trained // RANKING, FEWEST))
-        probe = _Probe(self._scene)
+        probe = _Probe(scene)
         pictures = self._whole.pictures(chosen, probe.scene)
         drawn = random_signs(run.config.seed)
 
@@ -156,19 +155,21 @@ class LastShedding:
         return [torch.where(of_block > 0, of_block, nowhere) for of_block in worth]
 
     @torch.no_grad()
-    def _psnr(self, views: list[View], worth: Sequence[Tensor], price: float, taken: int) -> float:
+    def _psnr(
+        self, scene: BlockScene, views: list[View], worth: Sequence[Tensor], price: float, rounds: int
+    ) -> float:
         """Mean over views without who is worth no more than a price, dB.
 
         Args:
-            taken: rounds.
+            rounds: that are done; listeners are told.
         """
         device = self._run.device
-        left = ChangedScene(self._scene, lambda block, found: found[(worth[block] > price).to(device)])
+        left = ChangedScene(scene, lambda block, found: found[(worth[block] > price).to(device)])
         pictures = self._whole.pictures(views, left)
         found = []
         self._run.announce(PhotosWanted(tuple(view.index for view in views)))
         for view, picture in zip(views, pictures.draw(views), strict=True):
-            self._run.announce(Shedding(taken, ROUNDS + 1))
+            self._run.announce(Shedding(rounds, ROUNDS + 1))
             square, counts = self._square(view, picture)
             error = square / (3 * counts.sum()).clamp_min(1.0)
             found.append(-10 * error.clamp_min(LEAST_ERROR).log10())

@@ -8,6 +8,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
+from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.density.control import DensityClock, Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import PASSES
@@ -16,6 +17,7 @@ from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
+from abcd_ns.engine.train.schedule import warmed
 from abcd_ns.engine.types import Gaussians
 
 
@@ -138,7 +140,10 @@ class LiveBlock:
         run, active = self._run, self._run.active
         blocks = run.blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
-        warming = run.progress / run.config.warmup if active.is_whole else 0.0
+        warming = 0.0
+        if active.is_whole:
+            uses = active.done * batch / len(active.views)
+            warming = warmed(run.progress, uses, run.config.warmup, run.scene.rows(RESERVE))
         return DensityClock(
             progress=run.share,
             steps=self.clocks.steps,
