@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import DRAWN
 from abcd_ns.engine.space.partition import build_kd
@@ -21,10 +21,10 @@ from abcd_ns.engine.store.special_blocks import INBOX, LIVE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
+from tests.engine.store.disks import PATIENCE, Disk, on_disk
 from tests.reference.scenes import listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")
-PATIENCE = 20.0
 
 
 @pytest.fixture
@@ -55,33 +55,9 @@ def test_what_is_not_on_disk_yet_is_counted_under_the_lock(scene):
     assert scene.cached_bytes > 0
 
 
-class Disk:
-    """Stands before a store's commits: notes them, and holds them up or refuses them."""
-
-    def __init__(self, store: ParameterStore) -> None:
-        self.commits: list[tuple[set[int], dict]] = []
-        self.refuses = False
-        self.free, self.asked = threading.Event(), threading.Event()
-        self.free.set()
-        self._commit, store.commit = store.commit, self
-
-    def __call__(self, blocks, header=None, state=None) -> int:
-        self.asked.set()
-        assert self.free.wait(PATIENCE)
-        if self.refuses:
-            raise StoreError("the disk is full")
-        found = self._commit(blocks, header=header, state=state)
-        self.commits.append((set(blocks), state))
-        return found
-
-
 def moved(state: BlockState, step: int) -> BlockState:
     """Another content for the same block."""
     return BlockState.fresh(state.gaussians[: len(state) - step])
-
-
-def on_disk(scene: StoredScene) -> dict:
-    return ParameterStore.open(scene.store.folder, read_only=True).state
 
 
 def equal(a: BlockState, b: BlockState) -> bool:
@@ -368,42 +344,3 @@ def test_those_in_the_inbox_are_drawn_survive_a_stop_and_join(tmp_path, views, p
         train_step(again, photos)
     assert again.scene.mail(block) is None
     assert again.scene.clocks(block).visits == expected.clocks.visits + 1
-
-
-# One block
-
-
-def test_one_block_is_one_visit(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=50, commit_seconds=60.0)
-    disk, events = Disk(coordinator.scene.store), []
-    coordinator.announce.subscribe(events.append)
-    train(coordinator, photos)
-    (begun,) = (event for event in events if isinstance(event, VisitBegan))
-    (ended,) = (event for event in events if isinstance(event, VisitEnded))
-    assert (begun.steps, begun.views, ended.block) == (50, 5, 0)
-    assert [event.sweep for event in events if isinstance(event, SweepEnded)] == [0]
-    assert [(written, state["step"]) for written, state in disk.commits] == [({0}, 50)]
-
-
-def test_a_long_visit_is_saved_by_the_clock(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=50, commit_seconds=1e-6)
-    train(coordinator, photos, steps=10)
-    coordinator.scene.flush()
-    assert on_disk(coordinator.scene)["step"] == 10
-    assert coordinator.scene.rows(LIVE) == coordinator.count()
-    coordinator.close()
-    again = make_coordinator(tmp_path, start, views, resume=True, steps=50)
-    assert again.state.step == 10
-
-
-def test_what_a_long_visit_puts_to_rest_waits_for_no_clock(tmp_path, views, photos, start):
-    """Though the last write has only just begun, of something older: else a kill would lose twice as much."""
-    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=50, commit_seconds=60.0)
-    train(coordinator, photos, steps=3)
-    assert on_disk(coordinator.scene).get("step", 0) == 0
-    coordinator.scene._rested -= 61.0
-    train(coordinator, photos, steps=1)
-    deadline = time.monotonic() + PATIENCE
-    while on_disk(coordinator.scene).get("step") != 4 and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert on_disk(coordinator.scene)["step"] == 4
