@@ -184,7 +184,7 @@ class DensityControl:
 
     def resets(self, clock: DensityClock) -> bool:
         """Whether this step resets opacities (`default` strategy); that needs no gradients. Among others
-        never: however long a visit, it leaves pictures worse than it found them (docs/results/history.md)."""
+        never: shedding finds there what resets are made to find."""
         every = self.config.reset_every
         if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
             return False
