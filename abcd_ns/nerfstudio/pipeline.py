@@ -94,7 +94,7 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     workers: int = 0
     """Blocks that are trained at once, each by a process of its own: on a core each, or on a GPU each, which
     needs Ray (pip install 'abcd-ns[cluster]'). 0 takes all cores where there is no GPU, as far as there are
-    two blocks for each, and else one; so it is with light, poses or `ram_budget_gb` set."""
+    two blocks for each; and else, or with `ram_budget_gb`, light or poses set, one."""
     cluster: str | None = None
     """Address (host:port) of the head of a Ray cluster that is to have the workers, instead of this machine;
     --data and --output-dir must be paths that all its machines see."""

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -250,7 +251,8 @@ def test_masks_are_measured_before_they_are_decoded(scene, size, monkeypatch):
 def test_a_deep_mask_is_a_mask(scene):
     mask = write_masks(scene)[0]
     Image.fromarray(np.full(Image.open(mask).size[::-1], 40_000, np.uint16)).save(mask)
-    parser(scene).check()
+    outputs = parser(scene, eval_mode="all").get_dataparser_outputs()
+    assert bool(AbcdDataset(outputs).photos.mask(0).all())
 
 
 def test_mask_that_is_a_pipe_does_not_block(scene):

@@ -221,6 +221,7 @@ def test_what_ns_render_sets_is_let_be():
     config = copy.deepcopy(METHODS["abcd"])
     config.pipeline.model.eval_num_rays_per_chunk = 1
     mirror(config.pipeline.training, config.pipeline.model)
+    assert config.pipeline.training == METHODS["abcd"].pipeline.training
 
 
 def test_checkpoints_are_as_far_apart_as_splatfactos():

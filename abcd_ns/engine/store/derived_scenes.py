@@ -9,19 +9,11 @@ from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Gaussians
 
 
-class ChangedScene(BlockScene):
-    """A scene of which others see something else.
+class _Derived(BlockScene):
+    """Blocks as many and as far out as another scene's."""
 
-    Args:
-        change: gives what is seen of a block, by its number and its Gaussians: as many or fewer, none of them
-            farther out, for numbers and bounds stay those of all.
-    """
-
-    def __init__(self, scene: BlockScene, change: Callable[[int, Gaussians], Gaussians]) -> None:
-        self.tree, self._scene, self._change = scene.tree, scene, change
-
-    def gaussians(self, block: int) -> Gaussians:
-        return self._change(block, self._scene.gaussians(block))
+    def __init__(self, scene: BlockScene) -> None:
+        self.tree, self._scene = scene.tree, scene
 
     def count(self, block: int) -> int:
         return self._scene.count(block)
@@ -30,7 +22,23 @@ class ChangedScene(BlockScene):
         return self._scene.bounds(block)
 
 
-class HeldScene(BlockScene):
+class ChangedScene(_Derived):
+    """A scene of which others see something else.
+
+    Args:
+        change: gives what is seen of a block, by its number and its Gaussians: as many or fewer, none of them
+            farther out, for numbers and bounds stay those of all.
+    """
+
+    def __init__(self, scene: BlockScene, change: Callable[[int, Gaussians], Gaussians]) -> None:
+        super().__init__(scene)
+        self._change = change
+
+    def gaussians(self, block: int) -> Gaussians:
+        return self._change(block, self._scene.gaussians(block))
+
+
+class HeldScene(_Derived):
     """A scene's blocks on a device, whole: read once, as far as there is room, while none of them changes.
 
     Args:
@@ -38,7 +46,8 @@ class HeldScene(BlockScene):
     """
 
     def __init__(self, scene: BlockScene, device: torch.device, room: int) -> None:
-        self.tree, self._scene, self._device, self._room = scene.tree, scene, device, room
+        super().__init__(scene)
+        self._device, self._room = device, room
         self._held: dict[int, Gaussians] = {}
 
     def gaussians(self, block: int) -> Gaussians:
@@ -49,9 +58,3 @@ class HeldScene(BlockScene):
             self._room -= found.nbytes
             self._held[block] = found
         return found
-
-    def count(self, block: int) -> int:
-        return self._scene.count(block)
-
-    def bounds(self, block: int) -> Box | None:
-        return self._scene.bounds(block)
