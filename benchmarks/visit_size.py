@@ -1,13 +1,13 @@
 """What a visit costs by the size of its block and pictures: survey, layers, steps, and its end.
 
     python -m benchmarks.visit_size --gaussians 20000 --width 160
-    python -m benchmarks.visit_size --gaussians 1000000 --width 1600 --views 2 --steps 1
+    python -m benchmarks.visit_size --gaussians 1000000 --width 1600 --blocks 4 --steps 4
 
-The second does not fit into 24 GB of RAM on a CPU. A ball of random Gaussians, seen from a ring of cameras,
-cut into blocks; one block is visited, after another one whose visit warms everything up. Photos are noise:
-what is measured does not depend on what is learnt. The last lines say what a visit comes to when it is as
-long as the program makes it: layers drawn once, and each view used as often as leaves a tenth of the time
-for that, by `passes_for_layers`.
+Four such blocks fit into 24 GB of RAM on a CPU, eight do not. A ball of random Gaussians, seen from a
+ring of cameras, cut into blocks; one block is visited, after another one whose visit warms everything up.
+Photos are noise: what is measured does not depend on what is learnt. The last lines say what a visit comes
+to when it is as long as the program makes it: layers drawn once, and each view used as often as leaves a
+tenth of the time for that, by `passes_for_layers`.
 """
 
 import tempfile

@@ -20,6 +20,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render.primitive import Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
+from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
 from abcd_ns.engine.train.density.shedding import LAST, WEIGHED, faded, may_grow, price_at, weigh, worthless
 
@@ -31,6 +32,9 @@ GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.5
 """Share of a visit among others after which none is refined; of a warm-up after which no opacity is reset."""
+WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
+"""A warm-up is refined whenever this share has been drawn of the views that the run would draw at its pace,
+or so many views if these are more: also a short one is to fill its room."""
 SPLIT_SCALE = 0.01
 """Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
 PLAIN_GRADIENT = 0.25
@@ -60,7 +64,7 @@ class DensityConfig:
     unless that is in the last third. Who fills less than the `price` goes later, too."""
     refine_every: int = 100
     """Views drawn to train a block between its refinements; never fewer than show the block, but half of a
-    first visit's at most."""
+    first visit's at most, and in the warm-up a sixtieth of the run's."""
     reset_every: int = 3000
     """Views drawn between opacity resets of a block without others, and in the first half of a warm-up
     (`default` strategy); 0 means never."""
@@ -93,39 +97,6 @@ def for_primitive(config: DensityConfig, primitive: Primitive) -> DensityConfig:
         return config
     plain = config.densify_grad_thresh * PLAIN_GRADIENT
     return replace(config, use_absgrad=False, densify_grad_thresh=plain)
-
-
-@dataclass(frozen=True)
-class DensityClock:
-    """Where the run and the active block stand; all that decides whether to refine."""
-
-    progress: float
-    """Share of the run that is done: 0..1."""
-    steps: int
-    """Views that were drawn to train the block so far, this step's included."""
-    taken: int
-    """This step's."""
-    views: int
-    """Views that the block is trained on."""
-    room: int | None
-    """Gaussians that may still be added to the scene; None for no limit."""
-    seed: int
-    """Of the random numbers drawn in this step."""
-    refined: int | None = None
-    """`steps` when the block was last refined; None where there are no others: it is then refined at the very
-    step that it is due, and may be reset."""
-    first: bool = False
-    """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
-    spent: float = 0.0
-    """Share of the visit or of the warm-up that is done, for what is left must make good what growing and
-    resets upset before others see the block; 0 where there are no others."""
-    visit: int | None = None
-    """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
-    show it."""
-
-    def reached(self, every: int) -> bool:
-        """Whether `steps` has come to a multiple of `every` in this step."""
-        return self.steps // every > (self.steps - self.taken) // every
 
 
 class DensityControl:
@@ -172,7 +143,11 @@ class DensityControl:
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         if clock.refined is None:
             return clock.reached(every)
-        return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= every
+        if clock.warm_up:
+            every = min(every, max(LEAST_EVERY, round(WARM_UP_EVERY * clock.pace)))
+        elif clock.spent > REFINE_UNTIL:
+            return False
+        return clock.steps - clock.refined >= every
 
     def refines(self, clock: DensityClock, infos: Infos) -> bool:
         """Whether this step refines: it is due, and where gradients decide there are any.
@@ -188,7 +163,8 @@ class DensityControl:
         every = self.config.reset_every
         if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
             return False
-        return clock.refined is None and clock.spent <= RESET_UNTIL and clock.reached(every)
+        alone = clock.refined is None or clock.warm_up
+        return alone and clock.spent <= RESET_UNTIL and clock.reached(every)
 
     def count(self, means: Tensor, infos: Infos, views: int) -> dict[str, Tensor]:
         """What drawings add to a block's statistics, after backward; by name, each [n].

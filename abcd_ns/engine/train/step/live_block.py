@@ -9,7 +9,8 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
 from abcd_ns.engine.store.special_blocks import RESERVE
-from abcd_ns.engine.train.density.control import DensityClock, Infos
+from abcd_ns.engine.train.density.clock import DensityClock
+from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.density.splitting import is_full
@@ -152,7 +153,8 @@ class LiveBlock:
             visit=active.steps * batch if blocks > 1 else None,
             room=room,
             seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
-            refined=self.clocks.refined if among_others else None,
+            refined=self.clocks.refined if among_others or active.is_whole else None,
+            warm_up=active.is_whole,
             first=among_others and not active.is_whole and self.clocks.visits == 0,
             spent=active.done / active.steps if among_others else warming,
         )

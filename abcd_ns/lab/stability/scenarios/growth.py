@@ -8,7 +8,8 @@ import torch
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.control import DensityClock, DensityConfig, DensityControl
+from abcd_ns.engine.train.density.clock import DensityClock
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.schedule import DEFAULT_BATCH, passes_of_sweep, views_per_visit
 from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
