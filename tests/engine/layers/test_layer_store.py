@@ -18,9 +18,12 @@ def kept(height: int = 5, width: int = 7, interleaved: Splats | None = None) -> 
     return Kept(rounded(torch.rand(2, height, width, 4)), interleaved)
 
 
-def test_packing_is_undone_by_unpacking():
-    parts = FrozenLayers(*(Layer(torch.rand(5, 7, 3), torch.rand(5, 7)) for _ in range(2)))
+@pytest.mark.parametrize("planar", [False, True])
+def test_packing_is_undone_by_unpacking(planar):
+    color = (lambda: torch.rand(3, 5, 7).permute(1, 2, 0)) if planar else (lambda: torch.rand(5, 7, 3))
+    parts = FrozenLayers(*(Layer(color(), torch.rand(5, 7)) for _ in range(2)))
     again = unpacked(packed(parts))
+    assert (again.front.color.stride(2) > 1) is planar  # as it was drawn
     for side in ("front", "back"):
         assert torch.equal(getattr(again, side).color, getattr(parts, side).color)
         assert torch.equal(getattr(again, side).transmittance, getattr(parts, side).transmittance)

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
-from abcd_ns.engine.render.cpu.binning import Candidates, find_candidates
+from abcd_ns.engine.render.cpu.binning import Candidates, find_candidates, sorted_keys
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.render.cpu.compositing_function import Composite, Job, deepen, pair_weights
 from abcd_ns.engine.render.image_size import image_size
-from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
+from abcd_ns.engine.render.primitive import PRIMITIVES, Primitive, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree, pack, project_packed
 from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
@@ -113,23 +113,21 @@ class TorchRasterizer(Rasterizer):
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
         check_degree(gaussians, sh_degree)
-        packed, graded_rows = pack(gaussians), self.primitive.graded
+        packed = pack(gaussians)
         seen = [self._project(packed, shot.view, sh_degree, antialiased) for shot in shots]
         own = torch.stack([splats.planes for splats in seen])
-        info = _info(own, shots, center := self.primitive.center)
-        # Through info's tensor, so that it is in the graph.
-        depths = own[:, DEPTH]
+        rows, center, depth = _graded(own, self.primitive)
+        info = _info(rows[center].transpose(1, 2), own, shots)
+        rows[center] = info["means2d"].transpose(1, 2)  # through info's tensor, so that it is in the graph
         if weigh:
-            info["weights"] = depths = torch.zeros_like(depths, requires_grad=True)
-        graded = torch.cat((own[:, :DEPTH], depths[:, None], own[:, DEPTH + 1 : graded_rows]), dim=1)
-        rows = (graded[:, :center], info["means2d"].transpose(1, 2), graded[:, center + 2 :])
-        graded = torch.cat(rows, dim=1)
-        graded, bounds = _side_by_side(graded), _side_by_side(own.detach())
+            info["weights"] = torch.zeros_like(own[:, DEPTH], requires_grad=True)
+            rows[depth] = info["weights"][:, None]
+        graded, bounds = _side_by_side(torch.cat(rows, dim=1)), _side_by_side(own.detach())
         grid_of = torch.arange(len(shots), device=own.device).repeat_interleave(own.shape[2])
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
         if frozen:
             others = [_without_depths(planes) if weigh else planes for _, planes in frozen]
-            graded = torch.cat((graded, *(planes[:graded_rows] for planes in others)), dim=1)
+            graded = torch.cat((graded, *(planes[: self.primitive.graded] for planes in others)), dim=1)
             bounds = torch.cat((bounds, *(planes for _, planes in frozen)), dim=1)
             grid_of = torch.cat((grid_of, *(grid_of.new_full((p.shape[1],), k) for k, p in frozen)))
         sheet = TileSheet(tuple(TileGrid(shot.crop, self.tile_side) for shot in shots))
@@ -140,7 +138,9 @@ class TorchRasterizer(Rasterizer):
         sums_absolute = absgrad and self.primitive.has_absgrad
         job = self._job(candidates, bounds, info["means2d"] if sums_absolute else None)
         images = sheet.to_images(Composite.apply(_TakeColumns.apply(graded, candidates.rows), job))
-        return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
+        # See _graded.
+        parts = [image.split((1, 3, 1)) for image in images]
+        return tuple(Raster(color.permute(1, 2, 0), left[0], depth[0], info) for left, color, depth in parts)
 
     @torch.no_grad()
     def cuts(
@@ -188,7 +188,7 @@ class TorchRasterizer(Rasterizer):
         drawn = splats.planes[: self.primitive.graded].index_select(1, candidates.rows)
         weight = pair_weights(drawn, self._job(candidates, splats.planes))
         # Pairs come by depth, so that sorting by tile alone keeps them in order.
-        tile, order = candidates.pairs.tile.int().sort(stable=True)
+        tile, order = sorted_keys(candidates.pairs.tile.int())
         z, weight = candidates.z.index_select(0, order), weight.index_select(0, order)
         firsts = candidates.sheet.starts
         ends = torch.searchsorted(tile, tile.new_tensor(firsts)).tolist()
@@ -278,10 +278,21 @@ def _masked(shots: Sequence[Shot], grid_of: Int[Tensor, "n"], own: int) -> Bool[
     return is_frozen == masks_frozen[grid_of]
 
 
-def _info(own: Float[Tensor, "v r n"], shots: Sequence[Shot], center: int) -> dict[str, Any]:
+def _graded(own: Float[Tensor, "v r n"], primitive: Primitive) -> tuple[list[Tensor], int, int]:
+    """The rows of planes that take gradients, in five parts, and which of these are centers and depths. It is
+    one split, whose gradients are put together once; those of slices are added up, each as large as all."""
+    (first, wide), (second, narrow) = sorted({primitive.center: 2, DEPTH: 1}.items())
+    sizes = (first, wide, second - first - wide, narrow, primitive.graded - second - narrow)
+    rows = list(own.split((*sizes, own.shape[1] - primitive.graded), dim=1))[:-1]
+    return rows, *((1, 3) if primitive.center < DEPTH else (3, 1))
+
+
+def _info(
+    means2d: Float[Tensor, "v n 2"], own: Float[Tensor, "v r n"], shots: Sequence[Shot]
+) -> dict[str, Any]:
     """What gsplat's densification strategies read."""
     return {
-        "means2d": own[:, center : center + 2].transpose(1, 2),
+        "means2d": means2d,
         "radii": own[:, -1].detach().int(),
         **image_size([shot.view for shot in shots], own.device),
         "n_cameras": len(shots),

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
 
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
@@ -22,6 +23,8 @@ from abcd_ns.engine.render.z_window import ZWindow, ends_of
 
 SHRINK = 0.875
 """A level is narrowed once fewer than this share of its tiles still have Gaussians to draw."""
+WORTH_RADIX, RADIX = 4096, 32_768
+"""Keys that are padded to so many before they are sorted, see `sorted_keys`."""
 TILES_AT_ONCE = 2400
 """Tiles side by side in a level, at most: what the kernels hold of more would not fit into a core's cache."""
 
@@ -148,8 +151,7 @@ def _groups(n_chunks: list[int], chunk: int) -> tuple[int, tuple[tuple[Level, ..
 
 def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], sheet: TileSheet, chunk: int) -> TileLists:
     n_tiles, n_pairs, device = sheet.tiles, pairs.tile.numel(), rows.device
-    # int32 keys take torch's radix sort, several times faster than comparing int64.
-    sorted_tile, order = pairs.tile.int().sort(stable=True)
+    sorted_tile, order = sorted_keys(pairs.tile.int())
     counts = torch.bincount(pairs.tile, minlength=n_tiles)
     n_chunks, tiles = ((counts + chunk - 1) // chunk).sort(descending=True, stable=True)
     used = int((n_chunks > 0).sum())
@@ -173,6 +175,27 @@ def _lay_out(pairs: _Pairs, rows: Int[Tensor, "m"], sheet: TileSheet, chunk: int
     ranks.index_copy_(0, slot, pairs.rank.index_select(0, order))
     slots = torch.empty_like(slot).index_copy_(0, order, slot)
     return TileLists(sheet, chunk, rows, ranks, tiles[:used], groups, slots, pairs.bags)
+
+
+def sorted_keys(keys: Int32[Tensor, "n"]) -> tuple[Int32[Tensor, "n"], Int[Tensor, "n"]]:
+    """The keys in ascending order, and where each was; ties stay as they were.
+
+    On a CPU torch sorts that many int32 by radix, ten times faster than it compares fewer or floats.
+    """
+    count = len(keys)
+    if keys.device.type == "cpu" and WORTH_RADIX < count < RADIX:
+        keys = F.pad(keys, (0, RADIX - count), value=torch.iinfo(torch.int32).max)
+    found, order = keys.sort(stable=True)
+    return found[:count], order[:count]
+
+
+def by_depth(depths: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+    """The depths in ascending order, and where each was; ties stay as they were."""
+    if depths.dtype != torch.float32:
+        return tuple(depths.sort(stable=True))
+    # In front of a camera they are positive: floats in the order of their bits.
+    found, order = sorted_keys(depths.view(torch.int32))
+    return found.view(torch.float32), order
 
 
 @dataclass(frozen=True)
@@ -243,8 +266,8 @@ def find_candidates(
     planes = splats.planes.detach()
     spans, bands = primitive.tile_rows(planes, sheet.numbers(planes).index_select(1, grid_of), built=built)
     rows = (spans[1] > 0).nonzero()[:, 0]
-    depths = planes[DEPTH].index_select(0, rows).sort(stable=True)
-    rows = rows.index_select(0, depths.indices)
+    depths, order = by_depth(planes[DEPTH].index_select(0, rows))
+    rows = rows.index_select(0, order)
     spans, bands = spans.index_select(1, rows).long(), bands.index_select(1, rows)
     places = sheet.places(planes.device).index_select(1, grid_of.index_select(0, rows))
-    return Candidates(sheet, rows, depths.values, _pairs(spans, bands, places, built))
+    return Candidates(sheet, rows, depths, _pairs(spans, bands, places, built))
