@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
-from abcd_ns.engine.render.cpu.binning import Candidates, find_candidates, sorted_keys
+from abcd_ns.engine.render.cpu.binning import Candidates, by_tile, find_candidates
 from abcd_ns.engine.render.cpu.chunk_kernels import ChunkKernels, CompilePolicy
 from abcd_ns.engine.render.cpu.compositing_function import Composite, Job, deepen, pair_weights
 from abcd_ns.engine.render.image_size import image_size
@@ -188,7 +188,7 @@ class TorchRasterizer(Rasterizer):
         drawn = splats.planes[: self.primitive.graded].index_select(1, candidates.rows)
         weight = pair_weights(drawn, self._job(candidates, splats.planes))
         # Pairs come by depth, so that sorting by tile alone keeps them in order.
-        tile, order = sorted_keys(candidates.pairs.tile.int())
+        tile, order = by_tile(candidates.pairs.tile, candidates.sheet.tiles)
         z, weight = candidates.z.index_select(0, order), weight.index_select(0, order)
         firsts = candidates.sheet.starts
         ends = torch.searchsorted(tile, tile.new_tensor(firsts)).tolist()
