@@ -30,7 +30,7 @@ from abcd_ns.cluster.lease import (
 from abcd_ns.cluster.shared_residual import shown_beside
 from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, WorkerLost, WorkersSeen
 from abcd_ns.engine.store.lent_scene import Outlines
-from abcd_ns.engine.store.settle import has_scaffold, settle, state_for_visit
+from abcd_ns.engine.store.settle import has_scaffold, settle, with_mail
 from abcd_ns.engine.train.coordinator import Coordinator, rest_after_visit
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import BlocksBusyError
@@ -197,7 +197,7 @@ class Dispatcher(Trainer):
         )
         state.active = None
         state.in_flight.append(active)
-        own = self.workers.share(state_for_visit(scene, block))
+        own = self.workers.share(with_mail(scene, block))
         lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks}))
         return Lent(active, lease, len(mail or ()), self._ended + active.steps)
 

@@ -11,6 +11,8 @@ from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
 from abcd_ns.viewer.guard.rules import THIS_MACHINE
 
+ALONE = 0.01
+"""3DGS's share that the rate of means falls to, where no other rate falls."""
 PAPER = TrainingConfig(
     recipe=Recipe(
         ownership="means",
@@ -27,6 +29,7 @@ PAPER = TrainingConfig(
     visit_views=10**6,
     heal=False,
     ssim_lambda=0.0,
+    means_lr_decay=ALONE,
     point_pixels=0.0,
     coarse=0.0,
     density=DensityConfig(price=0.0),
@@ -74,6 +77,7 @@ abcd_partition = _method(
     training=TrainingConfig(
         recipe=Recipe(layers=False, overlap=0.2, migrate=False),
         warmup=0.0,
+        means_lr_decay=ALONE,
         density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
     ),
 )
@@ -81,7 +85,7 @@ abcd_exact = _method(
     "abcd-exact",
     "Exact joint training over blocks, one on the device at a time: slow, the reference.",
     blocks=PEER_BLOCKS,
-    training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0),
+    training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0, means_lr_decay=ALONE),
 )
 abcd_paper = _method(
     "abcd-paper",

@@ -110,6 +110,18 @@ def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, 
         assert steady.state.to_json() | {"seconds": 0} == shaken.state.to_json() | {"seconds": 0}
 
 
+def test_who_waited_for_an_undone_visit_is_not_seen_before_the_next(make, photos, monkeypatch):
+    """As where the block is trained at home."""
+    monkeypatch.setattr("abcd_ns.engine.train.health.health.loss_rise", lambda _: (1.0, 2.0, 0.0))
+    monkeypatch.setattr("abcd_ns.engine.train.health.health.is_worse", lambda *_: True)
+    run = make(workers=2, density=STILL, scaffold=40, warmup=0.3)
+    ended = listen(run, VisitEnded)
+    while not any(event.block is not None for event in ended) and not run.finished:
+        train(run, photos, steps=1)
+    block = ended[-1].block
+    assert 0 < len(run.scene.gaussians(block)) < run.scene.count(block)
+
+
 def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(make, photos):
     run = make(workers=3, density=STILL)
     out, most, ended = set(), 0, []
