@@ -82,7 +82,7 @@ def begin(
     tree = build_kd(start.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     keep = None if blocks == 1 else len(start) // blocks
-    store.commit(blocks_at_rest(tree, start, keep=keep, seed=seed))
+    store.commit(blocks_at_rest(tree, start, keep, seed))
     config = TrainingConfig(seed=seed, antialiased=antialiased)
     run = TrainingRun(
         config,

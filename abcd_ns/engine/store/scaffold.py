@@ -19,6 +19,9 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.special_blocks import RESERVE, BlockName
 from abcd_ns.engine.types import Gaussians
 
+BEGINS = 0.6
+"""Of what has room in a scaffold, as a share, where there is more: what grows where it is needed is worth more
+than points at random."""
 REVEALED_OPACITY = 0.02
 """Of a Gaussian from the reserve, once it is seen: enough to be drawn and to learn, too little to spoil what
 is there."""
@@ -40,17 +43,19 @@ def split_by_block(state: BlockState, owner: Tensor) -> dict[int, BlockState]:
 
 
 def blocks_at_rest(
-    tree: BlockTree, gaussians: Gaussians, keep: int | None = None, seed: int = 0
+    tree: BlockTree, gaussians: Gaussians, room: int | None = None, seed: int = 0
 ) -> dict[BlockName, tuple[dict[str, Tensor], dict[str, Any]]]:
     """The first content of a store: `gaussians` parted by `tree`, nothing trained yet.
 
     Args:
-        keep: begin with a scaffold of so many, the others, if any, in reserve; None for no warm-up.
+        room: for Gaussians in the scaffold. If not all have room, it begins with `BEGINS` of as many, so that
+            it can grow; the others are in reserve. None for no warm-up.
     """
-    if keep is None:
+    if room is None:
         at_rest = split_by_block(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
         return {b: at_rest.get(b, nobody).packed() for b in range(tree.num_blocks)}
-    scaffold, waiting = split_off(gaussians, keep, seed)
+    begins = len(gaussians) if len(gaussians) <= room else int(BEGINS * room)
+    scaffold, waiting = split_off(gaussians, begins, seed)
     reserve = BlockState.fresh(waiting).packed()
     return {**blocks_at_rest(tree, scaffold), RESERVE: reserve}

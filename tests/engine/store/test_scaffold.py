@@ -8,7 +8,7 @@ import torch
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.initialize import split_off
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.store.scaffold import REVEALED_OPACITY, blocks_at_rest
+from abcd_ns.engine.store.scaffold import BEGINS, REVEALED_OPACITY, blocks_at_rest
 from abcd_ns.engine.store.special_blocks import RESERVE, in_order
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -45,7 +45,7 @@ def test_scaffold_and_reserve_are_all_there_is(start):
 def test_without_a_scaffold_nothing_waits(start):
     tree = build_kd(start.means, 4)
     assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
-    assert in_order(blocks_at_rest(tree, start, keep=30)) == [0, 1, 2, 3, RESERVE]
+    assert in_order(blocks_at_rest(tree, start, room=30)) == [0, 1, 2, 3, RESERVE]
 
 
 def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(tmp_path, views, photos, start):
@@ -67,7 +67,7 @@ def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, ph
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=40, scaffold=30)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
-    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == 30
+    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == int(BEGINS * 30)
     batch = coordinator.next_batch()
     assert [sample.crop for sample in batch.samples] == [views[0].full]
     assert all(sample.layers is None for sample in batch.samples)
@@ -105,7 +105,7 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, 
     )
     scene, visited = coordinator.scene, set()
     train(coordinator, photos, steps=10)
-    assert len(whole_scene(coordinator)) == 30
+    assert len(whole_scene(coordinator)) == int(BEGINS * 30)
     for name, value in whole_scene(coordinator).items():
         assert torch.equal(getattr(scene.everything("cpu"), name), value), name
     while len(visited) < 4:
