@@ -67,7 +67,12 @@ def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, ph
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=40, scaffold=30)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
-    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == int(BEGINS * 30)
+    assert (
+        len(coordinator.params["means"])
+        == coordinator.count()
+        == len(whole_scene(coordinator))
+        == int(BEGINS * 30)
+    )
     batch = coordinator.next_batch()
     assert [sample.crop for sample in batch.samples] == [views[0].full]
     assert all(sample.layers is None for sample in batch.samples)
