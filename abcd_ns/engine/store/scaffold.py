@@ -20,8 +20,8 @@ from abcd_ns.engine.store.special_blocks import RESERVE, BlockName
 from abcd_ns.engine.types import Gaussians
 
 BEGINS = 0.6
-"""Of what has room in a scaffold, as a share, where there is more: what grows where it is needed is worth more
-than points at random."""
+"""Of what has room in a scaffold, as a share, where there is more: what grows where it is needed is worth
+more than points at random."""
 REVEALED_OPACITY = 0.02
 """Of a Gaussian from the reserve, once it is seen: enough to be drawn and to learn, too little to spoil what
 is there."""

@@ -131,7 +131,8 @@ def test_a_run_goes_on_with_the_pictures_it_stopped_at(tmp_path, small_pictures)
 
 
 @pytest.mark.parametrize("blocks", [1, 3])
-def test_what_fills_a_reduced_picture_fills_as_much_of_the_photo(tmp_path, small_pictures, blocks):
+@pytest.mark.usefixtures("small_pictures")
+def test_what_fills_a_reduced_picture_fills_as_much_of_the_photo(tmp_path, blocks):
     """Whoever is judged by the photo's pixels, and what is known of blocks from the warm-up."""
     views, found = ring_of_views(1, width=96, height=72), {}
     gaussians = random_gaussians(60, size=0.2)
