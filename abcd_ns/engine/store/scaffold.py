@@ -55,7 +55,7 @@ def blocks_at_rest(
         at_rest = split_by_block(BlockState.fresh(gaussians), tree.assign(gaussians.means))
         nobody = BlockState.fresh(gaussians[:0])
         return {b: at_rest.get(b, nobody).packed() for b in range(tree.num_blocks)}
-    begins = len(gaussians) if len(gaussians) <= room else int(BEGINS * room)
+    begins = len(gaussians) if len(gaussians) <= room else math.ceil(BEGINS * room)
     scaffold, waiting = split_off(gaussians, begins, seed)
     reserve = BlockState.fresh(waiting).packed()
     return {**blocks_at_rest(tree, scaffold), RESERVE: reserve}

@@ -1,5 +1,6 @@
 """The warm-up: bounded, lossless, resumable."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -71,7 +72,7 @@ def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, ph
         len(coordinator.params["means"])
         == coordinator.count()
         == len(whole_scene(coordinator))
-        == int(BEGINS * 30)
+        == math.ceil(BEGINS * 30)
     )
     batch = coordinator.next_batch()
     assert [sample.crop for sample in batch.samples] == [views[0].full]
@@ -110,7 +111,7 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, 
     )
     scene, visited = coordinator.scene, set()
     train(coordinator, photos, steps=10)
-    assert len(whole_scene(coordinator)) == int(BEGINS * 30)
+    assert len(whole_scene(coordinator)) == math.ceil(BEGINS * 30)
     for name, value in whole_scene(coordinator).items():
         assert torch.equal(getattr(scene.everything("cpu"), name), value), name
     while len(visited) < 4:
