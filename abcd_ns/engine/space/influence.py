@@ -137,13 +137,13 @@ class InfluenceTable:
 
         Args:
             means: of all Gaussians; their blocks are looked up when it is another tensor than before.
-            weights: of each in each view, summed over the photo's pixels.
+            weights: of each in each view, summed over pixels.
         """
         if self._means is not means:
             self._means, self._owner = means, self._tree.assign(means.detach())
         sums = weights.new_zeros(len(views), self._tree.num_blocks).index_add_(1, self._owner, weights)
         for view, row in zip(views, sums, strict=True):
-            self._table[self._row[view.index]] = row / (view.full.pixels * view.reduction**2)
+            self._table[self._row[view.index]] = row / view.full.pixels
 
     def found(self) -> tuple[Influence, set[int]]:
         """By now, and the views that it says nothing of."""

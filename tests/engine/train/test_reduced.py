@@ -128,24 +128,3 @@ def test_a_run_goes_on_with_the_pictures_it_stopped_at(tmp_path, small_pictures)
         train(coordinator, photos)
         results.append(whole_scene(coordinator))
     assert all(torch.equal(value, getattr(results[1], name)) for name, value in results[0].items())
-
-
-@pytest.mark.parametrize("blocks", [1, 3])
-@pytest.mark.usefixtures("small_pictures")
-def test_what_fills_a_reduced_picture_fills_as_much_of_the_photo(tmp_path, blocks):
-    """Whoever is judged by the photo's pixels, and what is known of blocks from the warm-up."""
-    views, found = ring_of_views(1, width=96, height=72), {}
-    gaussians = random_gaussians(60, size=0.2)
-    for coarse in (0.0, 1.0):
-        (folder := tmp_path / str(coarse)).mkdir()
-        options = {"blocks": blocks, "scaffold": 100 if blocks > 1 else None, "coarse": coarse, "heal": False}
-        run = make_coordinator(folder, gaussians, views, **options)
-        train(run, Photos(gaussians, views), steps=1)
-        assert run.run.reduction == (4 if coarse else 1)
-        influence = run.visit.influence.found()[0] if blocks > 1 else {}
-        found[coarse] = run.visit.live.growth["weight"], influence
-    (full, known), (reduced, coarsely) = found[0.0], found[1.0]
-    assert float(full.sum()) > 1000
-    assert float(reduced.sum()) == pytest.approx(float(full.sum()), rel=0.1)
-    for block, shares in known.items():
-        assert coarsely[block] == pytest.approx(shares, rel=0.2, abs=0.01)

@@ -43,11 +43,6 @@ class Sample:
     """Of the pixels that might have been drawn in this step, those that are: the crop's."""
 
     @property
-    def share_drawn(self) -> float:
-        """The same of the photo's pixels: a reduced picture draws fewer."""
-        return self.share / self.view.reduction**2
-
-    @property
     def in_front(self) -> Float[Tensor, "h w"] | None:
         """Transmittance of what lies before the block; None for nothing."""
         return None if self.layers is None else self.layers.front.transmittance

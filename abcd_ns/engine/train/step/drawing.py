@@ -148,7 +148,7 @@ class StepDrawing:
         )
         if run.density.weighs:
             pairs = zip(rasters, samples, strict=True)
-            rasters = tuple(weighed(raster, sample.in_front, sample.share_drawn) for raster, sample in pairs)
+            rasters = tuple(weighed(raster, sample.in_front, sample.share) for raster, sample in pairs)
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         run.density.before_backward(infos)
         light = run.light

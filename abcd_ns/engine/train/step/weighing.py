@@ -31,7 +31,7 @@ def weighed(raster: Raster, in_front: Float[Tensor, "h w"] | None, share: float)
     Args:
         raster: drawn with `weigh`.
         in_front: transmittance of what lies before it; None for nothing.
-        share: of the photo's pixels that might have been drawn, those that are.
+        share: of the pixels that might have been drawn, those that are.
     """
     counts = torch.ones_like(raster.depth) if in_front is None else in_front.to(raster.depth)
     return replace(raster, color=_Weigh.apply(raster.color, raster.depth, counts.detach() / share))
