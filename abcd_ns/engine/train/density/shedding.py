@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 WEIGHED = ("weight", "passes")
-"""What is added up for each Gaussian: its weight, px (of pictures as they are drawn: while these are reduced
-it weighs less, so that little grows before they are large), and how often it was drawn in all the views that it is
+"""What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
 trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used: all of a
-scene's in the warm-up, and then those that show its block."""
+scene's in the warm-up, and then those that show its block. A reduced picture's pixel counts as one, though the
+price is in the photo's: so little grows before pictures are large enough to tell."""
 WHOLE = 0.999
 """Of a pass, in sums that are rounded."""
 LAST = 0.7
