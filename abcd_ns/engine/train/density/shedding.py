@@ -18,8 +18,8 @@ from torch import Tensor
 WEIGHED = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
 trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used: all of a
-scene's in the warm-up, and then those that show its block. A reduced picture's pixel counts as one, though the
-price is in the photo's: so little grows before pictures are large enough to tell."""
+scene's in the warm-up, and then those that show its block. A reduced picture's pixel counts as one, though
+the price is in the photo's: so little grows before pictures are large enough to tell."""
 WHOLE = 0.999
 """Of a pass, in sums that are rounded."""
 LAST = 0.7
