@@ -30,7 +30,7 @@ GATHER, REFINE, NEVER = 1, 6, 7
 
 GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
-REFINE_UNTIL, RESET_UNTIL = 0.5, 0.5
+REFINE_UNTIL, RESET_UNTIL = 0.5, 0.4
 """Share of a visit among others after which none is refined; of a warm-up after which no opacity is reset."""
 WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
 """A warm-up is refined whenever this share has been drawn of the views that the run would draw at its pace,
@@ -66,7 +66,7 @@ class DensityConfig:
     """Views drawn to train a block between its refinements; never fewer than show the block, but half of a
     first visit's at most, and in the warm-up a sixtieth of the run's."""
     reset_every: int = 3000
-    """Views drawn between opacity resets of a block without others, and in the first half of a warm-up
+    """Views drawn between opacity resets of a block without others, and in the first part of a warm-up
     (`default` strategy); 0 means never."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
