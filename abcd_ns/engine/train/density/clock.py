@@ -1,4 +1,4 @@
-"""Where the run and the active block stand: all that decides whether to grow."""
+"""The clock that density control goes by: the run's, and the active block's own."""
 
 from dataclasses import dataclass
 
