@@ -17,11 +17,12 @@ import torch
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
+from abcd_ns.cluster.visit_worker import RunSetup
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio import pipeline
-from abcd_ns.nerfstudio.workers import make_worker, setup_of
+from abcd_ns.nerfstudio.workers import make_worker
 from benchmarks.runs import Asked, config_of, runs_of
 from tests.cluster.in_process import InProcessWorkers
 
@@ -54,10 +55,13 @@ class Row:
 
 def run(args: Args, at_once: int, seed: int) -> Row:
     """Train and look at held-out views."""
-    pipeline.dispatcher_for = lambda local, config, *_: Dispatcher(
-        local, InProcessWorkers(make_worker(config, setup_of(local, 1, False), 0), at_once), lag=at_once
-    )
     row, out = Row(at_once, seed), 0
+
+    def dispatcher_for(training, config, _count, _budget, source, target):
+        worker = make_worker(config, RunSetup.of(training, source.room), 0)
+        return Dispatcher(training, InProcessWorkers(worker, at_once), at_once, source, target)
+
+    pipeline.dispatcher_for = dispatcher_for
 
     def hear(event: Event) -> None:
         nonlocal out

@@ -9,11 +9,11 @@ Blocks that are trained at once each make good their share of what is missing (`
 visits. What it still costs was measured (docs/cluster.md).
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.cluster.lease import (
@@ -33,10 +33,11 @@ from abcd_ns.engine.store.lent_scene import Outlines
 from abcd_ns.engine.store.settle import has_scaffold, settle, with_mail
 from abcd_ns.engine.train.coordinator import Coordinator, rest_after_visit
 from abcd_ns.engine.train.health_record import BlockHealth
+from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import BlocksBusyError
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.step.batch import Batch, Rendered
-from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.engine.train.step.batch import Rendered, Sample, Target
 from abcd_ns.engine.types import Gaussians
 
 SLACK = 2
@@ -62,21 +63,27 @@ class Lent:
     outcome: VisitOutcome | None = None
 
 
-class Dispatcher(Trainer):
-    """Lends blocks to workers; what cannot be lent, the warm-up, is trained here.
+class Dispatcher(Coordinator):
+    """Lends blocks to workers; what cannot be lent, the warm-up, it trains as a coordinator does.
 
     Args:
-        local: trains it, and has planner, scene and live parameters.
         lag: see above; None takes SLACK for each worker. Fewer where there are fewer blocks.
+        source, target: see Coordinator.
     """
 
-    def __init__(self, local: Coordinator, workers: Workers, lag: int | None = None) -> None:
-        super().__init__(local.run)
-        self._local, self.workers = local, workers
-        self._lag = lag or SLACK * workers.count
+    def __init__(
+        self,
+        run: TrainingRun,
+        workers: Workers,
+        lag: int | None = None,
+        source: LayerSource | None = None,
+        target: Callable[[Sample], Target] | None = None,
+    ) -> None:
+        super().__init__(run, source=source, target=target)
+        self.workers, self._lag = workers, lag or SLACK * workers.count
         self._lent: list[Lent] = []
         self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}
-        self._leases = self._ended = 0
+        self._numbers, self._ended = itertools.count(1), 0
         self._counted = self.state.step
         self.refused = 0
         """Answers that came after their lease was given up."""
@@ -98,7 +105,7 @@ class Dispatcher(Trainer):
             WorkersError: there are no workers, or a visit lost LOSSES of them.
         """
         self.stopwatch.start()
-        if not self._leases and self.device.type == "cuda":
+        if not self._shown and self.device.type == "cuda":
             torch.cuda.empty_cache()  # of what was trained here: a worker may share this device
         while self._counted >= self.state.step and not self.finished:
             self._lend()
@@ -109,45 +116,19 @@ class Dispatcher(Trainer):
             self.announce(WorkersSeen(tuple(self.workers.seen())))
         self._counted += 1
 
-    def complete(self) -> None:
-        """As the coordinator's."""
-        self._local.complete()
-
     @property
     def finished(self) -> bool:
         """Whether the budget is used up, and all that was lent is taken in."""
-        return not self._lent and self._local.finished
+        return not self._lent and super().finished
 
     def pause(self) -> None:
         """No time counts until the next step, unless workers go on."""
         if not self._lent:
             super().pause()
 
-    @property
-    def batch(self) -> int:
-        """Views in a step."""
-        return self._local.batch
-
-    def next_batch(self) -> Batch:
-        """As the coordinator's."""
-        return self._local.next_batch()
-
-    def render(self, batch: Batch) -> Rendered:
-        """As the coordinator's."""
-        return self._local.render(batch)
-
-    def loss(
-        self,
-        batch: Batch,
-        pictures: Sequence[Float[Tensor, "_h _w 3"]],
-        photos: Sequence[Float[Tensor, "_h _w 3"]],
-    ) -> Float[Tensor, ""]:
-        """As the coordinator's."""
-        return self._local.loss(batch, pictures, photos)
-
     def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
-        """As the coordinator's."""
-        self._local.after_step(rendered, psnrs)
+        """As the coordinator's, for a step that was taken here."""
+        super().after_step(rendered, psnrs)
         self._counted = self.state.step
 
     # -- lending -------------------------------------------------------------------------------------
@@ -163,7 +144,7 @@ class Dispatcher(Trainer):
                 return
             else:
                 try:
-                    active = self._local.visits.begin(self._lag)
+                    active = self.visits.begin(self._lag)
                 except BlocksBusyError:
                     if not self._take_in_first():
                         return
@@ -198,7 +179,7 @@ class Dispatcher(Trainer):
         state.active = None
         state.in_flight.append(active)
         own = self.workers.share(with_mail(scene, block))
-        lease = self._lease(Lease(0, task, own, {b: self._as_drawn(b) for b in blocks}))
+        lease = Lease(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
         return Lent(active, lease, len(mail or ()), self._ended + active.steps)
 
     def _light_of(self, views: Sequence[int]) -> dict[int, Tensor]:
@@ -212,11 +193,6 @@ class Dispatcher(Trainer):
         if block not in self._shown or self._shown[block][0] != version:
             self._shown[block] = version, self.workers.share(self.scene.gaussians(block))
         return self._shown[block][1]
-
-    def _lease(self, lease: Lease) -> Lease:
-        """The same under a new number."""
-        self._leases += 1
-        return replace(lease, number=self._leases)
 
     def _beside(self, active: ActiveVisit) -> dict[int, float]:
         """By view, which part of the other blocks' weight is out at the same time: begun before, or next."""
@@ -270,7 +246,7 @@ class Dispatcher(Trainer):
                 f"The visit to block {block + 1} lost {LOSSES} workers, the last one so: {why}. All that was "
                 "taken in is safe; see to their memory (abcd plan says what a block needs), and go on."
             )
-        lent.lease, lent.submitted = self._lease(lent.lease), False
+        lent.lease, lent.submitted = replace(lent.lease, number=next(self._numbers)), False
 
     def _take_in_first(self) -> bool:
         """Take in the visit that is to end first, if it is done; whether it was."""
@@ -301,25 +277,10 @@ class Dispatcher(Trainer):
 
     # -- at rest -------------------------------------------------------------------------------------
 
-    @property
-    def layer_limit(self) -> int:
-        """As the coordinator's."""
-        return self._local.layer_limit
-
-    @property
-    def layer_bytes(self) -> int:
-        """Here, without workers'."""
-        return self._local.layer_bytes
-
-    def rest(self, within: float) -> None:
-        """Put what is live here to rest, and the run's state. What workers are at is planned again by whoever
-        goes on from there."""
-        self._local.rest(within)
-
     def restore(self) -> None:
-        """As the coordinator's; what workers are at is dropped."""
+        """As the coordinator's; what workers are at is dropped, and planned again."""
         self._lent.clear()
-        self._local.restore()
+        super().restore()
         self._counted = self.state.step
 
     def dismiss(self) -> None:

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch.nn import Parameter
@@ -27,30 +28,25 @@ from abcd_ns.engine.types import Gaussians, View
 
 
 @dataclass(frozen=True)
-class AdamOptions:
-    """Of one parameter's optimizer."""
-
-    lr: float
-    betas: tuple[float, float]
-    eps: float
-
-    @staticmethod
-    def of(optimizer: torch.optim.Optimizer) -> "AdamOptions":
-        """As an optimizer was made."""
-        group = optimizer.param_groups[0]
-        return AdamOptions(group["lr"], tuple(group["betas"]), group["eps"])
-
-
-@dataclass(frozen=True)
 class RunSetup:
     """What all visits of a run have in common."""
 
     config: TrainingConfig
     budget: Budget
     views: list[View]
-    optimizers: dict[str, AdamOptions]
-    """By parameter, as they are before the first step."""
+    optimizers: dict[str, dict[str, Any]]
+    """By parameter, Adam's options before the first step."""
     layer_room: LayerRoom
+    """Of each worker."""
+
+    @staticmethod
+    def of(run: TrainingRun, layer_room: LayerRoom) -> "RunSetup":
+        """Of a run that begins."""
+        groups = {name: optimizer.param_groups[0] for name, optimizer in run.optimizers.items()}
+        options = {
+            name: {key: group[key] for key in ("lr", "betas", "eps")} for name, group in groups.items()
+        }
+        return RunSetup(run.config, run.budget, list(run.views.values()), options, layer_room)
 
 
 class OnLease(Visits):
@@ -135,7 +131,7 @@ class VisitWorker:
         empty = Gaussians.empty(setup.config.sh_degree, self._device)
         params = {name: Parameter(value) for name, value in empty.items()}
         optimizers = {
-            name: torch.optim.Adam([params[name]], fused=True, **vars(options))
+            name: torch.optim.Adam([params[name]], fused=True, **options)
             for name, options in setup.optimizers.items()
         }
         run = TrainingRun(

@@ -230,16 +230,14 @@ class AbcdPipeline(VanillaPipeline):
             return ExactTrainer(run)
         if run.config.recipe.overlap > 0:
             return independent_trainer(run)
-        source = LayerSource(run, self._room_for_layers())
-        coordinator = Coordinator(run, source=source, target=self.datamanager.target)
+        source, target = LayerSource(run, self._room_for_layers()), self.datamanager.target
         blocks = run.scene.tree.num_blocks
         # Where RAM is short, one process: each reads blocks for itself.
         wanted = self.config.workers or int(self.config.ram_budget_gb > 0)
         workers = number_of_workers(wanted, blocks, run.config, self.device)
         if blocks > 1 and (workers > 1 or self.config.cluster is not None):
-            target = self.datamanager.target
-            return dispatcher_for(coordinator, asked.config, workers, self._budget, target)
-        return coordinator
+            return dispatcher_for(run, asked.config, workers, self._budget, source, target)
+        return Coordinator(run, source=source, target=target)
 
     @property
     def _on_cpu(self) -> bool:

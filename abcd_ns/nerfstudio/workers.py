@@ -12,13 +12,13 @@ from abcd_ns.cluster.connect import check_installed, connect
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
 from abcd_ns.cluster.lease import Workers, WorkersError
-from abcd_ns.cluster.visit_worker import AdamOptions, RunSetup, VisitWorker
+from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.render import make_rasterizer
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.layer_source import LayerRoom
+from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.memory import PHOTO_SHARE
 from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import GB, Fit
@@ -91,24 +91,31 @@ def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device:
 
 
 def dispatcher_for(
-    local: Coordinator, config: TrainerConfig, count: int, budget: int, target: Callable[[Sample], Target]
+    run: TrainingRun,
+    config: TrainerConfig,
+    count: int,
+    budget: int,
+    source: LayerSource,
+    target: Callable[[Sample], Target],
 ) -> Dispatcher:
     """Lends the blocks of a run to workers: on the cores of this machine by forking, else by Ray.
 
     Args:
         count: of them.
         budget: bytes of each worker's device that training may take.
-        target: gives what a sample is trained on.
+        source, target: see Coordinator; workers share the room of the one, where they share a device.
 
     Raises:
         WorkersError: they cannot be had.
     """
-    on_gpu, run = config.machine.device_type == "cuda", local.run
-    setup = setup_of(local, count, on_gpu)
+    room, of_device = source.room, 1 if config.machine.device_type == "cuda" else count
+    setup = RunSetup.of(run, LayerRoom(room.device // of_device, room.ram // count))
     if config.pipeline.cluster is None and can_fork(run.device):
-        forked = ForkedWorkers(count, VisitWorker(setup, run.rasterizer, target, run.device))
-        return Dispatcher(local, forked, lag=count)  # nothing is on its way for long: no slack is needed
-    return Dispatcher(local, _ray_workers(setup, config, count, budget))
+        workers = ForkedWorkers(count, VisitWorker(setup, run.rasterizer, target, run.device))
+        lag = count  # nothing is on its way for long: no slack is needed
+    else:
+        workers, lag = _ray_workers(setup, config, count, budget), None
+    return Dispatcher(run, workers, lag, source, target)
 
 
 def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int) -> Workers:
@@ -131,18 +138,6 @@ def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int
     while not on_gpu and workers.idle < count:  # the warm-up, too, wants the cores that they start on
         workers.wait(1.0)
     return workers
-
-
-def setup_of(local: Coordinator, count: int, on_gpu: bool) -> RunSetup:
-    """What each of `count` workers needs to know of a run."""
-    run, room = local.run, local.source.room
-    return RunSetup(
-        run.config,
-        run.budget,
-        list(run.views.values()),
-        {name: AdamOptions.of(optimizer) for name, optimizer in run.optimizers.items()},
-        LayerRoom(room.device if on_gpu else room.device // count, room.ram // count),
-    )
 
 
 def make_worker(config: TrainerConfig, setup: RunSetup, device_photo_bytes: int) -> VisitWorker:

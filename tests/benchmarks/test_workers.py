@@ -6,7 +6,6 @@ import pytest
 
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.lease import Lost
-from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.training_loop import train
 from benchmarks import workers
 from benchmarks.workers import Args, Row, Watch, main, table_of_kills
@@ -50,7 +49,7 @@ def trained(folder, scene, monkeypatch, kills: int, idle: int = 0) -> Row:
     folder.mkdir()
 
     def kind(run):
-        return Dispatcher(Coordinator(run), Mortal(in_process(run, photos, 2), idle))
+        return Dispatcher(run, Mortal(in_process(run, photos, 2), idle))
 
     options = {"blocks": 4, "steps": 40, "visit_steps": 5, "kind": kind}
     run = make_coordinator(folder, random_gaussians(90, seed=2), views, **options)

@@ -3,7 +3,7 @@
 import pytest
 
 from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.visit_worker import AdamOptions, RunSetup, VisitWorker
+from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -28,8 +28,7 @@ def photos(views):
 
 def setup_of(run: TrainingRun) -> RunSetup:
     """What workers need to know of a run."""
-    optimizers = {name: AdamOptions.of(optimizer) for name, optimizer in run.optimizers.items()}
-    return RunSetup(run.config, run.budget, list(run.views.values()), optimizers, LayerRoom())
+    return RunSetup.of(run, LayerRoom())
 
 
 def in_process(run: TrainingRun, photos: Photos, count: int) -> InProcessWorkers:
@@ -42,8 +41,9 @@ def make_run(folder, views, workers_of=None, lag: int | None = None, target=None
     """A run by a coordinator alone, or by a dispatcher and the workers that `workers_of` a run gives."""
 
     def kind(run: TrainingRun):
-        local = Coordinator(run, target=target)
-        return local if workers_of is None else Dispatcher(local, workers_of(run), lag)
+        if workers_of is None:
+            return Coordinator(run, target=target)
+        return Dispatcher(run, workers_of(run), lag, target=target)
 
     folder.mkdir(exist_ok=True)
     options = {"blocks": 6, "steps": 60, **options}
