@@ -12,7 +12,7 @@ import pytest
 
 from abcd_ns.engine.events import HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
 from abcd_ns.nerfstudio.run import run_log
-from abcd_ns.nerfstudio.run.run_log import LOG_FILE, Meter, RunLog
+from abcd_ns.nerfstudio.run.run_log import LOG_FILE, RunLog
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE, flat_options
 from tests.nerfstudio.test_training import STEPS, configure, run
 
@@ -184,7 +184,7 @@ def test_samples_thin_out_so_that_a_long_run_has_a_short_log(tmp_path):
 
 def test_samples_hold_the_mean_psnr_since_the_last_and_pass_over_what_is_no_number(tmp_path):
     coordinator = FakeCoordinator()
-    log = RunLog(coordinator, tmp_path / "log.jsonl", [Meter("photos", lambda: 7, 10)])
+    log = RunLog(coordinator, tmp_path / "log.jsonl", {"photos": (lambda: 7, 10)})
     for psnr in (10.0, math.nan, 20.0, math.inf):
         take_steps(log, coordinator, 1, seconds=0.3, psnr=psnr)
     take_steps(log, coordinator, 4, seconds=0.3, psnr=math.nan)

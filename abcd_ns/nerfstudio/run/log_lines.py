@@ -126,4 +126,10 @@ KINDS: dict[str, type[Line]] = {
     "end": EndLine,
 }
 """By the value of a line's field "kind"."""
-KIND_OF = {cls: kind for kind, cls in KINDS.items()}
+KIND_OF = {
+    VisitBegan: "visit",
+    SweepEnded: "sweep end",
+    WorkerLost: "worker lost",
+    ShedAtEnd: "shed at end",
+}
+"""By what of the engine's events is a line as it is."""

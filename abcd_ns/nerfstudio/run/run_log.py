@@ -2,9 +2,9 @@
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -29,21 +29,7 @@ from abcd_ns.engine.events import (
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
-from abcd_ns.nerfstudio.run.log_lines import (
-    KIND_OF,
-    SCHEMA,
-    EndLine,
-    HeldOutLine,
-    Line,
-    SampleLine,
-    ShedAtEndLine,
-    SweepEndLine,
-    TrainingLine,
-    VisitEndLine,
-    VisitLine,
-    WorkerLine,
-    WorkerLostLine,
-)
+from abcd_ns.nerfstudio.run.log_lines import KIND_OF, KINDS, SCHEMA
 from abcd_ns.nerfstudio.run.resuming import RunRequest
 from abcd_ns.nerfstudio.run.settings import write_settings
 
@@ -56,17 +42,6 @@ LINES_KEPT = 64
 """Lines wait in memory for the end of a visit, but no more than so many."""
 
 
-@dataclass(frozen=True)
-class Meter:
-    """Something that is kept at hand within a budget."""
-
-    name: str
-    used: Callable[[], int]
-    """Bytes in use now."""
-    budget: int
-    """Bytes."""
-
-
 class RunLog:
     """Listens to a coordinator and writes down what it says.
 
@@ -74,13 +49,18 @@ class RunLog:
 
     Args:
         path: of the log; its folder must exist.
+        meters: of what is kept at hand, by name: what tells the bytes in use, and their limit.
         earlier: the log of the run that this one goes on from, as far as that is its past; may be the same.
     """
 
     def __init__(
-        self, coordinator: Trainer, path: Path, meters: Sequence[Meter] = (), earlier: Path | None = None
+        self,
+        coordinator: Trainer,
+        path: Path,
+        meters: Mapping[str, tuple[Callable[[], int], int]] | None = None,
+        earlier: Path | None = None,
     ) -> None:
-        self._coordinator, self._meters = coordinator, tuple(meters)
+        self._coordinator, self._meters = coordinator, meters or {}
         self._path: Path | None = path
         self._psnrs: list[float] = []
         self._visit_psnrs: dict[int, list[float]] = {}
@@ -89,10 +69,10 @@ class RunLog:
         if earlier is not None:
             self._write(past_of(coordinator, earlier), anew=True)
         self._sampled = coordinator.stopwatch.seconds
-        budgets = {meter.name: meter.budget for meter in self._meters}
+        budgets = {name: limit for name, (_, limit) in self._meters.items()}
         limit, blocks = coordinator.config.density.limit, coordinator.scene.tree.num_blocks
         scene = {"blocks": blocks, "gaussians": coordinator.count(), "limit": limit}
-        self._note(TrainingLine, schema=SCHEMA, **scene, budgets=budgets)
+        self._note("training", schema=SCHEMA, **scene, budgets=budgets)
         self._flush()
 
     def __call__(self, event: Event) -> None:
@@ -100,24 +80,15 @@ class RunLog:
         match event:
             case StepTaken():
                 self._take_step(event)
-            case VisitBegan():
-                self._visit_psnrs[event.visit] = []
-                self._note(VisitLine, **vars(event))
-                self._flush()
             case VisitEnded():
                 self._end_visit(event)
-            case SweepEnded():
-                self._note(SweepEndLine, sweep=event.sweep)
             case WorkersSeen():
                 self._workers = event.workers
-            case WorkerLost():
-                self._note(WorkerLostLine, block=event.block, why=event.why)
-                self._flush()
-            case ShedAtEnd():
-                self._note(ShedAtEndLine, **vars(event))
+            case VisitBegan() | SweepEnded() | WorkerLost() | ShedAtEnd():
+                self._note(KIND_OF[type(event)], **vars(event))
                 self._flush()
             case HeldOutScored():
-                self._note(HeldOutLine, psnr=_finite(event.psnr), ssim=_finite(event.ssim))
+                self._note("held out", psnr=_finite(event.psnr), ssim=_finite(event.ssim))
                 self._flush()
 
     def close(self) -> None:
@@ -125,14 +96,14 @@ class RunLog:
         self._sample()
         for worker in self._workers:
             self._note(
-                WorkerLine,
+                "worker",
                 worker=worker.worker,
                 visits=worker.visits,
                 deaths=worker.deaths,
                 waited=round(worker.waited, 3),
             )
         self._note(
-            EndLine,
+            "end",
             gaussians=self._coordinator.count(),
             peak_rss_bytes=peak_rss_bytes(),
             peak_device_bytes=peak_device_bytes()[0],
@@ -151,7 +122,7 @@ class RunLog:
         self._sample()
         psnrs = self._visit_psnrs.pop(event.visit, [])
         self._note(
-            VisitEndLine,
+            "visit end",
             visit=event.visit,
             sweep=event.sweep,
             block=event.block,
@@ -165,20 +136,21 @@ class RunLog:
 
     def _sample(self) -> None:
         self._note(
-            SampleLine,
+            "sample",
             psnr=_mean(self._psnrs),
             gaussians=self._coordinator.count(),
             rss_bytes=psutil.Process().memory_info().rss,
             device_bytes=torch.cuda.memory_allocated() if torch.cuda.is_available() else None,
-            held={meter.name: meter.used() for meter in self._meters},
+            held={name: used() for name, (used, _) in self._meters.items()},
         )
         self._psnrs, self._sampled = [], self._coordinator.stopwatch.seconds
 
-    def _note(self, kind: type[Line], **fields: Any) -> None:
-        coordinator = self._coordinator
-        seconds = round(coordinator.stopwatch.seconds, 3)
-        line = kind(step=coordinator.state.step, seconds=seconds, **fields)
-        self._lines.append(json.dumps({"kind": KIND_OF[kind], **asdict(line)}))
+    def _note(self, kind: str, **fields: Any) -> None:
+        now = {
+            "step": self._coordinator.state.step,
+            "seconds": round(self._coordinator.stopwatch.seconds, 3),
+        }
+        self._lines.append(json.dumps({"kind": kind, **asdict(KINDS[kind](**now | fields))}))
         if len(self._lines) >= LINES_KEPT:
             self._flush()
 
@@ -224,11 +196,11 @@ def keep_log(run: RunRequest, photos: Photos, coordinator: Trainer) -> RunLog:
     """Begin the log of a run, and write its settings beside it."""
     write_settings(run.config, run.options, run.folder)
     scene = coordinator.scene
-    meters = (
-        Meter("photos", lambda: photos.cached_bytes, photos.budget_bytes),
-        Meter("frozen blocks", lambda: scene.cached_bytes, scene.ram_bytes),
-        Meter("layers", lambda: coordinator.layer_bytes, coordinator.layer_limit),
-    )
+    meters = {
+        "photos": (lambda: photos.cached_bytes, photos.budget_bytes),
+        "frozen blocks": (lambda: scene.cached_bytes, scene.ram_bytes),
+        "layers": (lambda: coordinator.layer_bytes, coordinator.layer_limit),
+    }
     earlier = None if run.resumed_from is None else run.resumed_from.store.parent / LOG_FILE
     return RunLog(coordinator, run.folder / LOG_FILE, meters, earlier)
 
