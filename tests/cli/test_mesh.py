@@ -225,6 +225,6 @@ def test_wrong_requests_are_one_line_and_leave_nothing(run, tmp_path, capsys, mo
 
 
 def test_the_photos_of_another_run_are_refused(tmp_path):
-    run = write_run(tmp_path, **MadeFor("0", (0.0, 0.0, 0.0), "in turn", 3, "3dgs").header())
+    run = write_run(tmp_path, **MadeFor("0", [0.0, 0.0, 0.0], "in turn", 3, "3dgs").header())
     with pytest.raises(UserError, match="is not what the run was made for: photos 0, not "):
         mesh(run, data=photos_of(run), out=tmp_path / "new.ply")

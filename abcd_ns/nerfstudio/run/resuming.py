@@ -52,7 +52,7 @@ class MadeFor:
 
     photos: str
     """Digest of the training photos' names and sizes. Not of their folder: it may be moved."""
-    first_camera: tuple[float, float, float]
+    first_camera: list[float]
     """Its position, world units, to three digits."""
     blocks_are_trained: str
     """In turn, jointly, or each alone: what the store holds besides blocks depends on it."""
@@ -65,10 +65,10 @@ class MadeFor:
         digest = hashlib.blake2b(digest_size=8)
         for photo, view in zip(photos, views, strict=True):
             digest.update(f"{photo.name} {view.width} {view.height}\n".encode("utf-8", "surrogateescape"))
-        x, y, z = (round(value, 3) for value in views[0].center.tolist())
+        first_camera = [round(value, 3) for value in views[0].center.tolist()]
         recipe = training.recipe
         how = "jointly" if recipe.exact else "each alone" if recipe.overlap > 0 else "in turn"
-        return MadeFor(digest.hexdigest(), (x, y, z), how, training.sh_degree, training.primitive)
+        return MadeFor(digest.hexdigest(), first_camera, how, training.sh_degree, training.primitive)
 
     def check(self, store: ParameterStore) -> None:
         """See that `store` was made for the same.
@@ -85,7 +85,7 @@ class MadeFor:
 
     def differences(self, store: ParameterStore) -> str:
         """What `store` was made for that is otherwise here, in words; empty where nothing is."""
-        theirs, mine = store.header.get(MADE_FOR), _plain(self)
+        theirs, mine = store.header.get(MADE_FOR), asdict(self)
         if theirs is None:  # made before this was written down
             return ""
         theirs = {"primitive": "3dgs"} | theirs  # nothing else there was
@@ -96,11 +96,7 @@ class MadeFor:
 
     def header(self) -> dict[str, Any]:
         """The entry of a new store's header."""
-        return {MADE_FOR: _plain(self)}
-
-
-def _plain(made_for: MadeFor) -> dict[str, Any]:
-    return {**asdict(made_for), "first_camera": list(made_for.first_camera)}
+        return {MADE_FOR: asdict(self)}
 
 
 def _agree(theirs: Any, mine: Any) -> bool:

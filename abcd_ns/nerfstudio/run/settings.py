@@ -88,9 +88,7 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Plain]]:
                 yield from _leaves(inner, f"{name}.{key}" if name else str(key))
     elif isinstance(value, (tuple, list)):
         yield name, " ".join(map(str, value))
-    elif isinstance(value, float) and not math.isfinite(value):
+    elif isinstance(value, Path) or (isinstance(value, float) and not math.isfinite(value)):
         yield name, str(value)
     elif value is None or isinstance(value, (bool, int, float, str)):
         yield name, value
-    elif isinstance(value, Path):
-        yield name, str(value)
