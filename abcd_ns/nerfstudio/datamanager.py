@@ -166,18 +166,15 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def shown(self, sample: Sample) -> Target:
         """What a sample's crop shows of the photo and of the mask, in the crop's pixels."""
-        shot = sample.view.index, sample.source
-        return sample.reduced(self.photo(*shot)), sample.reduced_mask(self.mask(*shot))
+        row, crop = sample.view.index, sample.source
+        mask = self._pixels("mask", row, self.train_dataset.photos.mask, crop)
+        return sample.reduced(self.photo(row, crop)), sample.reduced_mask(mask)
 
     def read_ahead(self, event: Event) -> None:
         """Begin to read photos that are wanted soon and not on the device; a CPU has its threads busy."""
         if isinstance(event, PhotosWanted) and torch.device(self.device).type != "cpu":
             rows = (row for row in event.views if ("photo", row) not in self._on_device)
             self.train_dataset.photos.expect(rows)
-
-    def mask(self, row: int, crop: Crop) -> torch.Tensor | None:
-        """Which pixels of a training photo count, bool [h, w, 1], on the device; None where all do."""
-        return self._pixels("mask", row, self.train_dataset.photos.mask, crop)
 
     def _pixels(
         self, kind: str, row: int, read: Callable[[int], torch.Tensor | None], crop: Crop

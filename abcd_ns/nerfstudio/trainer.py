@@ -138,19 +138,10 @@ class AbcdTrainer(Trainer):
         with exit_on_user_error():
             super().setup(*args, **kwargs)
         self.pipeline.coordinator.announce.subscribe(self._may_stop)
-
-        def begin_step(step: int) -> None:  # noqa: ARG001 - nerfstudio passes it
-            self._signals.hold()
-
-        def end_step(step: int) -> None:  # noqa: ARG001
-            self._signals.release()
-
-        location = TrainingCallbackLocation
-        self.callbacks = [
-            TrainingCallback([location.BEFORE_TRAIN_ITERATION], begin_step),
-            *self.callbacks,
-            TrainingCallback([location.AFTER_TRAIN_ITERATION], end_step),
-        ]
+        at = TrainingCallbackLocation
+        hold = TrainingCallback([at.BEFORE_TRAIN_ITERATION], lambda step: self._signals.hold())  # noqa: ARG005
+        release = TrainingCallback([at.AFTER_TRAIN_ITERATION], lambda step: self._signals.release())  # noqa: ARG005
+        self.callbacks = [hold, *self.callbacks, release]
 
     def train(self) -> None:
         """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
