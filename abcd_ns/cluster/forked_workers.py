@@ -86,11 +86,6 @@ class ForkedWorkers(Members[Place]):
         self._worker, self._owner, now = worker, os.getpid(), time.monotonic()
         super().__init__([Place(number, since=now, free_since=now) for number in range(count)])
 
-    @property
-    def pids(self) -> list[int]:
-        """Of those that are at work."""
-        return [member.pid for member in self._members if member.lease is not None]
-
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         """The value itself: a fork has it, too, and what is at rest never changes."""
         return lambda: value

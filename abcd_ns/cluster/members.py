@@ -73,6 +73,11 @@ class Members(Generic[M]):
         """How many could take a visit now."""
         return sum(member.is_idle for member in self._members)
 
+    @property
+    def pids(self) -> list[int]:
+        """Processes of those that are at work."""
+        return [member.pid for member in self._members if member.lease is not None]
+
     def seen(self) -> Sequence[WorkerSeen]:
         """What each is doing."""
         return [member.seen() for member in self._members]

@@ -178,11 +178,6 @@ class RayWorkers(Members[Remote]):
             ray.kill(member.actor)
         self._members = []
 
-    @property
-    def pids(self) -> list[int]:
-        """Processes of those that are ready."""
-        return [member.pid for member in self._members if member.ready]
-
     def _start(self, member: Remote) -> Member:
         member.actor = self._class.remote()
         member.asked = member.actor.prepare.remote(self._make)
