@@ -18,11 +18,11 @@ schedule runs over that visit. The store also holds each block as it began, unde
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, join
@@ -49,6 +49,10 @@ SURFACE_SCALE = 0.5
 """Their size as such, as a share of what they begin with: outliers, which begin large, hide too much."""
 BEYOND = 1e30
 """Camera z of a pixel that shows no point: further than any finite cell."""
+OWN, CLEAR = 1, 2
+"""What a pixel is to a block, by where its surface lies. In the enlarged cell: the photo is the block's to
+explain. Behind it, or the ray misses the cell: the block must let all light through. Any other is 0: the cell
+lies behind the surface, and nobody can tell what is there."""
 
 
 def independent_at_rest(
@@ -74,27 +78,6 @@ def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
     return Box(cell.lower - margin, cell.upper + margin)
 
 
-@dataclass(frozen=True)
-class Region:
-    """What the pixels of one view are to a block, by where their surface lies; of a crop or the whole view.
-
-    Neither of both: the cell lies behind the surface, and nobody can tell what is there.
-    """
-
-    own: Bool[Tensor, "h w"]
-    """In the enlarged cell: the photo is the block's to explain."""
-    clear: Bool[Tensor, "h w"]
-    """Behind the cell, or the ray misses it: the block must let all light through."""
-
-    def to(self, device: torch.device) -> "Region":
-        """On a device."""
-        return Region(self.own.to(device), self.clear.to(device))
-
-    def __getitem__(self, crop: Crop) -> "Region":
-        """Some of its pixels, counted from its own upper left corner."""
-        return Region(self.own[crop.slices], self.clear[crop.slices])
-
-
 class Surfaces:
     """How far the initial points are at every pixel of every view; 4 bytes of RAM for each.
 
@@ -103,22 +86,22 @@ class Surfaces:
 
     def __init__(self, scene: StoredScene, views: list[View], rasterizer: Rasterizer, device: torch.device):
         self._views = {view.index: view for view in views}
-        gaussians = Gaussians.cat([initial_gaussians(scene, b) for b in range(scene.tree.num_blocks)])
+        gaussians = Gaussians.cat([scene.stored(initial_of(b)) for b in range(scene.tree.num_blocks)])
         opaque = math.log(SURFACE_OPACITY / (1 - SURFACE_OPACITY))
         scales = gaussians.scales + math.log(SURFACE_SCALE)
         opacities = torch.full_like(gaussians.opacities, opaque)
         points = replace(gaussians, opacities=opacities, scales=scales).to(device)
         self._depths = {index: self._depth(points, view, rasterizer) for index, view in self._views.items()}
 
-    def region(self, view: int, cell: Box) -> Region:
-        """What every pixel of `view` is to a block with this cell."""
+    def region(self, view: int, cell: Box) -> UInt8[Tensor, "h w"]:
+        """What every pixel of `view` is to a block with this cell: OWN, CLEAR or 0."""
         camera = self._views[view]
         depth = self._depths[view].to(camera.viewmat)
         span = ray_interval(cell, camera, TileGrid(camera.full, 1))
         near, far = (plane.view_as(depth) for plane in (span.near, span.far))
         own = (near <= depth) & (depth < far)
         hidden = (depth < near) & near.isfinite()
-        return Region(own, ~own & ~hidden)
+        return (OWN * own + CLEAR * (~own & ~hidden)).to(torch.uint8)
 
     @staticmethod
     @torch.no_grad()
@@ -135,7 +118,7 @@ class BlocksAlone(Visits):
     def __init__(self, run: TrainingRun) -> None:
         self._run, self._scene = run, run.scene
         self._surfaces: Surfaces | None = None
-        self._regions: dict[int, Region] = {}
+        self._regions: dict[int, UInt8[Tensor, "h w"]] = {}
         self._crops: dict[int, Crop] = {}
         self._part = 1.0
         self._looked_at: int | None = None
@@ -190,9 +173,8 @@ class BlocksAlone(Visits):
         shown, wanted = [], []
         for sample, picture, photo in zip(batch.samples, pictures, photos, strict=True):
             index = sample.view.index
-            region = self._regions[index][sample.crop.within(self._crops[index])]
-            counts = (region.own | region.clear)[..., None].to(picture)
-            clear = region.clear[..., None].to(photo.device)
+            region = self._regions[index][sample.crop.within(self._crops[index]).slices][..., None]
+            counts, clear = (region > 0).to(picture), (region == CLEAR).to(photo.device)
             target = torch.where(clear, sample.background.to(photo), photo)
             shown.append(picture * counts)
             wanted.append(target * counts)
@@ -207,7 +189,7 @@ class BlocksAlone(Visits):
         state = self._run.state
         for block in self._blocks:
             self._look(block)
-            owns = any(bool(region.own.any()) for region in self._regions.values())
+            owns = any(bool((region == OWN).any()) for region in self._regions.values())
             state.views[block] = len(self._regions) if owns else 0
         state.queue = list(plan_sweep(0, state.views, 1, None, self._run.config.seed))
         if not state.queue:
@@ -224,26 +206,21 @@ class BlocksAlone(Visits):
         begun = self._joined(block).gaussians.to(run.device)
         crops = survey(begun, block, run.views.values(), run.rasterizer).crops
         for view, crop in crops.items():
-            region = self._surfaces.region(view, box)[crop].to(run.device)
-            if bool((region.own | region.clear).any()):
+            region = self._surfaces.region(view, box)[crop.slices].to(run.device)
+            if bool(region.any()):
                 self._regions[view], self._crops[view] = region, crop
 
     def _box(self, block: int) -> Box:
-        means = initial_gaussians(self._scene, block).means
+        means = self._scene.stored(initial_of(block)).means
         return enlarged(self._scene.tree.cell(block), means, self._run.config.recipe.overlap)
 
     def _joined(self, block: int) -> BlockState:
         """The block as it begins, with what of the others lies in its enlarged cell."""
         box, others = self._box(block), [b for b in self._blocks if b != block]
-        own, *around = [initial_gaussians(self._scene, b) for b in [block, *others]]
+        own, *around = [self._scene.stored(initial_of(b)) for b in [block, *others]]
         return join([BlockState.fresh(g) for g in [own, *(g[box.contains(g.means)] for g in around)]])
 
 
 def independent_trainer(run: TrainingRun) -> Coordinator:
     """Trains each block in one visit, alone: by a recipe with an overlap, without layers and migration."""
     return Coordinator(run, BlocksAlone(run))
-
-
-def initial_gaussians(scene: StoredScene, block: int) -> Gaussians:
-    """A block's Gaussians as they began."""
-    return scene.stored(initial_of(block))

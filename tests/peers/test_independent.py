@@ -10,6 +10,8 @@ from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.peers.independent import (
+    CLEAR,
+    OWN,
     Surfaces,
     enlarged,
     independent_at_rest,
@@ -107,8 +109,7 @@ def test_every_pixel_is_some_blocks_and_without_overlap_just_ones(tmp_path, view
             for block in range(4):
                 box = enlarged(scene.tree.cell(block), scene.gaussians(block).means, overlap)
                 region = surfaces.region(view.index, box)
-                owners += region.own
-                assert not bool((region.own & region.clear).any())
+                owners += region == OWN
             assert int(owners.min()) == 1
             assert (int(owners.max()) == 1) == (overlap == 0)
 
@@ -127,11 +128,11 @@ def test_own_pixels_pull_to_the_photo_clear_ones_to_the_background_and_hidden_on
     kinds = torch.zeros(3, dtype=torch.int64)
     for sample, picture, photo in zip(batch.samples, pictures, wanted, strict=True):
         region = coordinator.visits._regions[sample.view.index]
-        hidden = ~region.own & ~region.clear
-        kinds += torch.stack([region.own.sum(), region.clear.sum(), hidden.sum()])
+        masks = [region == kind for kind in (OWN, CLEAR, 0)]
+        kinds += torch.stack([mask.sum() for mask in masks])
         scale = 2 / (3 * sample.view.width * sample.view.height * len(batch.samples))
         apart = {"own": picture - photo, "clear": picture - sample.background, "hidden": 0 * picture}
-        for (name, difference), mask in zip(apart.items(), (region.own, region.clear, hidden), strict=True):
+        for (name, difference), mask in zip(apart.items(), masks, strict=True):
             assert torch.allclose(picture.grad[mask], scale * difference[mask], atol=1e-9), name
     assert bool((kinds > 0).all())
 
