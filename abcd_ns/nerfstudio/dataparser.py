@@ -24,7 +24,7 @@ from abcd_ns.data.colmap_model import IMAGES
 from abcd_ns.data.foreign_outputs import PHOTOS, pinhole_cameras
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.normalize import Center, Orientation
-from abcd_ns.data.prepare import Prepared, SceneOptions, check_masks, prepare
+from abcd_ns.data.prepare import Prepared, SceneOptions, prepare
 
 
 @dataclass
@@ -100,18 +100,6 @@ class AbcdDataParser(DataParser):
         self.downscale_factor: int | None = None
         """nerfstudio sets it to 1 where a trained scene is viewed or exported: photos may then be absent."""
         self._prepared: Prepared | None = None
-
-    def check(self) -> None:
-        """Read the model, look at every photo and decode every mask, before anything costly is started.
-
-        Later calls of other methods reuse what was read.
-
-        Raises:
-            InputError: as `get_dataparser_outputs`, or a mask is of no use.
-        """
-        for split in ("train", "test"):
-            self.rows(split)
-        check_masks(self.prepared().sources)
 
     @property
     def factor(self) -> int:

@@ -256,13 +256,13 @@ def test_photos_of_the_next_steps_are_read_ahead_of_a_device(scene, monkeypatch,
     assert expected == read
 
 
-def test_check_reads_once_and_names_faults(scene):
+def test_a_scene_is_read_once_for_all_splits(scene):
     checked = parser(scene)
-    checked.check()
+    checked.get_dataparser_outputs("test")
     shutil.rmtree(scene / "sparse")
     assert len(checked.get_dataparser_outputs().image_filenames) == 8
     with pytest.raises(InputError, match="holds no model"):
-        parser(scene).check()
+        parser(scene).get_dataparser_outputs()
 
 
 # transforms.json

@@ -14,6 +14,7 @@ from PIL import Image
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
+from abcd_ns.nerfstudio.inspection import inspect
 from tests.data.dataparser_scenes import (
     NAMES,
     SIZES,
@@ -42,7 +43,7 @@ def png_that_claims(size: tuple[int, int]) -> bytes:
 def check_refusal(scene: Path, **options) -> list[str]:
     """The lines that `ns-train` would end with before it writes anything."""
     with pytest.raises(InputError) as caught:
-        parser(scene, **options).check()
+        inspect(parser(scene, **options).config)
     return str(caught.value).splitlines()
 
 
@@ -225,7 +226,7 @@ def write_masks(scene: Path) -> list[Path]:
 
 def test_masks_of_no_use_are_all_found_before_training(scene):
     masks = write_masks(scene)
-    parser(scene).check()
+    inspect(parser(scene).config)
     Image.new("L", Image.open(masks[0]).size, 0).save(masks[0])
     Image.new("L", (99, 3), 255).save(masks[1])
     masks[2].write_bytes(masks[2].read_bytes()[:60])
@@ -268,7 +269,7 @@ def test_masks_are_no_photos_without_pose(scene, capsys):
         frame["mask_path"] = frame["file_path"].replace(".png", "-mask.png")
         Image.new("L", (frame["w"], frame["h"]), 255).save(scene / frame["mask_path"])
     rewrite(scene, meta)
-    parser(scene).check()
+    inspect(parser(scene).config)
     assert "have no pose" not in capsys.readouterr().out
 
 
@@ -305,7 +306,7 @@ def test_what_the_train_list_leaves_is_held_out(scene):
 def test_views_in_both_lists_are_mentioned(scene, capsys):
     (scene / "train_list.txt").write_text("\n".join(NAMES[:7]))
     (scene / "val_list.txt").write_text("\n".join(NAMES[6:]))
-    parser(scene).check()
+    inspect(parser(scene).config)
     assert "1 view(s) are trained on and held out" in capsys.readouterr().out
 
 

@@ -18,6 +18,7 @@ from PIL import Image
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
+from abcd_ns.nerfstudio.inspection import inspect
 from tests.data.dataparser_scenes import (
     NAMES,
     SIZES,
@@ -69,7 +70,7 @@ def test_masks_of_a_colmap_model_are_found_by_name(scene, called):
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(mask).save(path)
     read = parser(scene, masks_path=Path("masks"))
-    read.check()
+    inspect(read.config)
     dataset = AbcdDataset(read.get_dataparser_outputs())
     mask = dataset[0]["mask"]
     assert not mask[:, :9].any()

@@ -10,7 +10,7 @@ import numpy as np
 from abcd_ns.cli.check.looks import Look, copies, look_at_all
 from abcd_ns.cli.check.visibility import Visibility, visibility
 from abcd_ns.data.photos import PhotoSource
-from abcd_ns.data.prepare import Prepared
+from abcd_ns.data.prepare import Prepared, check_masks
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser, AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views
 
@@ -69,9 +69,8 @@ def survey(data: Path, downscale: int | None) -> Survey:
         InputError: training would refuse it; lists all that is wrong.
     """
     parser = QuietParser(AbcdDataParserConfig(data=data, downscale_factor=downscale))
-    parser.check()
-    prepared = parser.prepared()
-    outputs = parser.get_dataparser_outputs("train")
+    prepared, outputs = parser.prepared(), parser.get_dataparser_outputs("train")
+    check_masks(prepared.sources)
     return Survey(
         prepared=prepared,
         train=parser.rows("train"),

@@ -14,6 +14,7 @@ from abcd_ns.cli.check.visibility import visibility
 from abcd_ns.cli.findings import Finding, by_level
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.inspection import inspect
 from tests.cli.check.scenes import POINTS, names
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -103,7 +104,7 @@ def test_what_training_refuses_is_refused_in_the_same_lines(scene, tmp_path, cap
     spoil(scene)
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError) as refused:
-        parser(scene).check()
+        inspect(parser(scene).config)
 
     assert check(data=scene) == 2
 
@@ -119,7 +120,7 @@ def test_damage_in_the_middle_of_a_photo_is_an_error(scene, capsys):
     data = bytearray(path.read_bytes())
     data[len(data) // 2 : len(data) // 2 + 40] = bytes(40)
     path.write_bytes(data)
-    parser(scene).check()
+    inspect(parser(scene).config)
 
     assert check(data=scene) == 2
     assert f"damaged-photo: {path} cannot be decoded" in capsys.readouterr().out
