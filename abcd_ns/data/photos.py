@@ -26,6 +26,8 @@ READERS = 4
 FEWEST_AHEAD = 12
 """Photos that are read ahead of whoever asks for them, beyond the budget: a step's, and those of the next."""
 _MASK_USED = 255
+_Key = tuple[Literal["image", "mask"], int]
+"""What is read, and of which source."""
 
 
 @dataclass(frozen=True)
@@ -68,23 +70,19 @@ class Photos:
 
     def __init__(self, sources: Sequence[PhotoSource], budget_bytes: int | None = None):
         self.sources = tuple(sources)
-        budget = default_budget() if budget_bytes is None else budget_bytes
+        self.budget_bytes = default_budget() if budget_bytes is None else budget_bytes
+        self.cached_bytes = 0
+        """Of decoded pixels that are kept now; at most the budget."""
         largest = max((3 * source.size[0] * source.size[1] for source in self.sources), default=1)
-        self._ahead = max(FEWEST_AHEAD, budget // (8 * largest))
-        self._cache = _ByteCache(budget, 2 * self._ahead)  # each may have a mask
+        self._ahead = max(FEWEST_AHEAD, self.budget_bytes // (8 * largest))
+        self._readers = ThreadPoolExecutor(READERS, "photos")
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[_Key, Tensor] = OrderedDict()
+        """Least recently used ones go first."""
+        self._expected: OrderedDict[_Key, Future[Tensor]] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.sources)
-
-    @property
-    def budget_bytes(self) -> int:
-        """How much decoded pixels may stay in memory."""
-        return self._cache.budget
-
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes of decoded pixels that are kept now; at most the budget."""
-        return self._cache.used
 
     def image(self, index: int) -> UInt8[Tensor, "h w c"]:
         """A whole photo, c = 3 or (with alpha) 4. Shared with later callers: do not write to it.
@@ -92,15 +90,15 @@ class Photos:
         Raises:
             InputError: the file is gone, damaged or has another size than when it was checked.
         """
-        return self._cache.get(("image", index), self._read)
+        return self._get(("image", index))
 
     def expect(self, indices: Iterable[int]) -> None:
         """Begin to decode the first of these photos and their masks, if they are not kept, for whoever asks
         next: as many as take an eighth of the budget, and a few in any case."""
         for index in islice(indices, self._ahead):
-            self._cache.expect(("image", index), self._read)
+            self._expect(("image", index))
             if self.sources[index].mask_path is not None:
-                self._cache.expect(("mask", index), self._read)
+                self._expect(("mask", index))
 
     def mask(self, index: int) -> Bool[Tensor, "h w 1"] | None:
         """Which pixels count, or None where the photo has no mask. Do not write to it.
@@ -112,11 +110,43 @@ class Photos:
         """
         if self.sources[index].mask_path is None:
             return None
-        return self._cache.get(("mask", index), self._read)
+        return self._get(("mask", index))
 
-    def _read(self, key: "_Key") -> Tensor:
+    def _read(self, key: _Key) -> Tensor:
         kind, index = key
         return (_read_photo if kind == "image" else _read_mask)(self.sources[index])
+
+    def _expect(self, key: _Key) -> None:
+        """Read it on another thread, for the next `_get`."""
+        with self._lock:
+            if key in self._expected:
+                self._expected.move_to_end(key)
+            if key in self._kept or key in self._expected:
+                return
+            self._expected[key] = self._readers.submit(self._read, key)
+            while len(self._expected) > 2 * self._ahead:  # with a mask each; else its visit is over
+                self._expected.popitem(last=False)[1].cancel()
+
+    def _get(self, key: _Key) -> Tensor:
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+            expected = self._expected.pop(key, None)
+        # Not under the lock, so that two threads may both read one.
+        value = self._read(key) if expected is None else expected.result()
+        with self._lock:
+            self._keep(key, value)
+        return value
+
+    def _keep(self, key: _Key, value: Tensor) -> None:
+        if value.nbytes > self.budget_bytes or key in self._kept:
+            return
+        self._kept[key] = value
+        self.cached_bytes += value.nbytes
+        while self.cached_bytes > self.budget_bytes:
+            _, oldest = self._kept.popitem(last=False)
+            self.cached_bytes -= oldest.nbytes
 
 
 def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UInt8[np.ndarray, "y x c"]:
@@ -178,56 +208,3 @@ def _read_mask(source: PhotoSource) -> Tensor:
     if not (used == _MASK_USED).any():
         raise InputError(f"{source.mask_path} hides the whole photo; remove the frame or repair the mask.")
     return torch.from_numpy(used == _MASK_USED)
-
-
-_Key = tuple[Literal["image", "mask"], int]
-_Read = Callable[[_Key], Tensor]
-
-
-class _ByteCache:
-    """Least recently used tensors go first. Two threads may both make one.
-
-    Args:
-        ahead: how many are made, at most, before anybody asks for them.
-    """
-
-    def __init__(self, budget: int, ahead: int):
-        self.budget, self._ahead = budget, ahead
-        self.used = 0
-        self._lock = threading.Lock()
-        self._kept: OrderedDict[_Key, Tensor] = OrderedDict()
-        self._expected: OrderedDict[_Key, Future[Tensor]] = OrderedDict()
-        self._readers: ThreadPoolExecutor | None = None
-
-    def expect(self, key: _Key, make: _Read) -> None:
-        """Make it on another thread, for the next `get`."""
-        with self._lock:
-            if key in self._expected:
-                self._expected.move_to_end(key)
-            if key in self._kept or key in self._expected:
-                return
-            if self._readers is None:
-                self._readers = ThreadPoolExecutor(READERS, "photos")
-            self._expected[key] = self._readers.submit(make, key)
-            while len(self._expected) > self._ahead:  # nobody asked for it: its visit is over
-                self._expected.popitem(last=False)[1].cancel()
-
-    def get(self, key: _Key, make: _Read) -> Tensor:
-        with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-                return self._kept[key]
-            expected = self._expected.pop(key, None)
-        value = make(key) if expected is None else expected.result()  # not under the lock
-        with self._lock:
-            self._keep(key, value)
-        return value
-
-    def _keep(self, key: _Key, value: Tensor) -> None:
-        if value.nbytes > self.budget or key in self._kept:
-            return
-        self._kept[key] = value
-        self.used += value.nbytes
-        while self.used > self.budget:
-            _, oldest = self._kept.popitem(last=False)
-            self.used -= oldest.nbytes

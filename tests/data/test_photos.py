@@ -138,7 +138,7 @@ def test_expected_photo_is_read_once_and_before_it_is_asked_for(sources, monkeyp
     reads = _count_reads(monkeypatch)
     photos = Photos(sources, 0)
     photos.expect([2, 1, 2])
-    photos._cache._readers.shutdown(wait=True)
+    photos._readers.shutdown(wait=True)
     assert sorted(reads) == [1, 2]
     assert all(np.array_equal(photos.image(i).numpy(), noise(i)) for i in (1, 2))
     assert sorted(reads) == [1, 2]
@@ -160,7 +160,7 @@ def test_expected_photos_that_nobody_asks_for_are_let_go(sources, monkeypatch):
     photos = Photos(sources, 0)
     for i in range(len(sources)):
         photos.expect([i, 0])  # the first alone
-    assert [index for _, index in photos._cache._expected] == [4, 5]
+    assert [index for _, index in photos._expected] == [4, 5]
     assert all(np.array_equal(photos.image(i).numpy(), noise(i)) for i in range(len(sources)))
 
 
