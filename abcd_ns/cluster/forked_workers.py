@@ -41,29 +41,20 @@ def can_fork(device: torch.device) -> bool:
     return sys.platform == "linux" and device.type == "cpu" and not torch.cuda.is_available()
 
 
-@dataclass(frozen=True)
-class Failed:
-    """A worker's last words."""
-
-    why: str
-    is_loss: bool
-    """Whether another may do better: it had no memory."""
-
-    @staticmethod
-    def of(error: Exception) -> "Failed":
-        """What the user can mend as it is; of all else, one line of the traceback's end."""
-        if isinstance(error, UserError):
-            return Failed(str(error), False)
-        if is_out_of_memory(error):
-            return Failed("out of memory", True)
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{os.path.basename(place.filename)}:{place.lineno}, in {place.name}"
-        what = traceback.format_exception_only(error)[-1].splitlines()[0]
-        return Failed(
-            f"A process that trains a block failed: {what} ({where}). What visits have finished is safe; "
-            "--pipeline.workers 1 trains in one process.",
-            False,
-        )
+def last_words(error: Exception) -> WorkersError | MemoryError:
+    """Of a worker: MemoryError where another may do better; what the user can mend as it is; of all else, one
+    line of the traceback's end."""
+    if isinstance(error, UserError):
+        return WorkersError(str(error))
+    if is_out_of_memory(error):
+        return MemoryError("out of memory")
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{os.path.basename(place.filename)}:{place.lineno}, in {place.name}"
+    what = traceback.format_exception_only(error)[-1].splitlines()[0]
+    return WorkersError(
+        f"A process that trains a block failed: {what} ({where}). What visits have finished is safe; "
+        "--pipeline.workers 1 trains in one process."
+    )
 
 
 @dataclass
@@ -134,10 +125,10 @@ class ForkedWorkers(Members[Place]):
             case Parcel():
                 member.visits += 1
                 return [Finished(self._end(member).number, said.opened())]
-            case Failed(is_loss=True):
-                return [self._lose(member, said.why)]
+            case MemoryError():
+                return [self._lose(member, str(said))]
         self._end(member)
-        raise WorkersError(said.why)
+        raise said
 
     def _lose(self, member: Place, why: str) -> Lost:
         member.deaths += 1
@@ -182,7 +173,7 @@ def _live(pipe: Connection, visit: Callable[[Callable[[StepTaken], None]], Any])
         status = 0
     except Exception as error:
         with suppress(OSError):
-            pipe.send(Failed.of(error))
+            pipe.send(last_words(error))
         raise
     finally:
         os._exit(status)  # none of the training process' own exits and handlers

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from abcd_ns.cluster import forked_workers
-from abcd_ns.cluster.forked_workers import Failed, ForkedWorkers, can_fork
+from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork, last_words
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import WorkerLost, WorkersSeen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -94,7 +94,7 @@ def test_whoever_is_killed_is_replaced_and_nothing_is_lost(make, photos, steady)
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
 def test_full_ram_is_a_loss_whoever_says_so(error):
-    assert Failed.of(error) == Failed("out of memory", is_loss=True)
+    assert repr(last_words(error)) == "MemoryError('out of memory')"
 
 
 def test_a_visit_that_had_no_memory_is_lent_again(make, photos, steady, tmp_path):
