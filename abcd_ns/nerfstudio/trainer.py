@@ -1,7 +1,6 @@
 """nerfstudio's trainer, with checkpoints that a run can truly go on from, and an end that loses nothing."""
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
 from abcd_ns.engine.events import Event, LayersDrawn, Shedding, WorkersSeen
 from abcd_ns.engine.store import StoreError, crash_points
-from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder
+from abcd_ns.engine.store.atomic import fsync_folder, remove_temporaries, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
 from abcd_ns.nerfstudio.flags import hidden
@@ -281,22 +280,14 @@ def _save_atomically(state: dict[str, Any], path: Path) -> None:
     """
     # Not beside it: nerfstudio takes every file there for a checkpoint.
     run = path.parent.parent
-    temporary = run / f".{path.name}{TEMPORARY_SUFFIX}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for leftover in run.glob(f".step-*.ckpt{TEMPORARY_SUFFIX}"):  # of a run that was killed
-            leftover.unlink()
-        torch.save(state, temporary)
-        crash_points.reached(crash_points.CHECKPOINT_WRITTEN)
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        remove_temporaries(run)  # of a run that was killed
+        with replacing(path, run) as temporary:
+            torch.save(state, temporary)
+            crash_points.reached(crash_points.CHECKPOINT_WRITTEN)
         fsync_folder(path.parent)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        if isinstance(error, (OSError, RuntimeError)):  # torch raises the latter for a full disk
-            raise UserError(
-                f"{path} could not be written: {error}. The training itself is safe in the store; free space."
-            ) from error
-        raise
+    except (OSError, RuntimeError) as error:  # torch raises the latter for a full disk
+        raise UserError(
+            f"{path} could not be written: {error}. The training itself is safe in the store; free space."
+        ) from error

@@ -25,13 +25,16 @@ def fsync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path` to write to; on leaving, sync it and put it in place of `path`.
+def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
+    """Give a temporary path to write to; on leaving, sync it and put it in place of `path`.
+
+    Args:
+        folder: of the temporary file, on the disk of `path`; None is that of `path`.
 
     If anything fails, `path` is what it was and the temporary file is gone. The new name survives a
     power loss only after `fsync_folder(path.parent)`, so that several files can share one such call.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
+    temporary = (folder or path.parent) / f".{path.name}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}"
     try:
         yield temporary
         crash_points.reached(crash_points.FILE_WRITTEN)
