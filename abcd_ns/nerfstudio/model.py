@@ -339,7 +339,8 @@ class AbcdModel(SplatfactoModel):
         """
         pictures, photos = self._pairs(outputs, batch)
         outputs["psnrs"] = psnrs(pictures, photos)
-        return {"psnr": torch.stack(outputs["psnrs"]).mean(), "gaussian_count": self._count()}
+        count = len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
+        return {"psnr": torch.stack(outputs["psnrs"]).mean(), "gaussian_count": count}
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
@@ -359,23 +360,17 @@ class AbcdModel(SplatfactoModel):
 
     def _pairs(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
         """Pictures and their photos, on the same background."""
-        photos = [
-            self.photo_on(image, background)
-            for image, background in zip(as_list(batch["image"]), as_list(outputs["background"]), strict=True)
-        ]
+        backgrounds = zip(as_list(batch["image"]), as_list(outputs["background"]), strict=True)
+        photos = [self.composite_with_background(self.get_gt_img(image), b) for image, b in backgrounds]
         return as_list(outputs["rgb"]), photos
-
-    def photo_on(self, image: Tensor, background: Tensor) -> Tensor:
-        """What a picture on this background should be: float32 in 0..1, [h, w, 3]."""
-        return self.composite_with_background(self.get_gt_img(image), background)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of a whole picture, and photo and picture side by side."""
-        photo = self.photo_on(batch["image"], outputs["background"])
-        found = image_metrics(outputs["rgb"], photo, self.config.color_corrected_metrics)
-        return found, {"img": torch.cat([photo, outputs["rgb"]], dim=1)}
+        (picture,), (photo,) = self._pairs(outputs, batch)
+        found = image_metrics(picture, photo, self.config.color_corrected_metrics)
+        return found, {"img": torch.cat([photo, picture], dim=1)}
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """A photo as float32 in 0..1 on the device; samples have theirs reduced already."""
@@ -387,6 +382,3 @@ class AbcdModel(SplatfactoModel):
         """None: the pipeline's callbacks drive the coordinator, which does what splatfacto's would."""
         del training_callback_attributes
         return []
-
-    def _count(self) -> int:
-        return len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
