@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from itertools import product
+from operator import attrgetter
 from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
@@ -16,8 +17,15 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
 from abcd_ns.nerfstudio.workers import check_workers
 
-MIRRORED = {"sh_degree", "ssim_lambda", "rasterize_mode", "background_color"}
-"""Splatfacto's model options that nerfstudio's tools read; `mirror` sets them."""
+MIRRORED = {
+    "sh_degree": "sh_degree",
+    "ssim_lambda": "ssim_lambda",
+    "rasterize_mode": "antialiased",
+    "background_color": "background",
+    "ownership": "recipe.ownership",
+    "primitive": "primitive",
+}
+"""The model's options that nerfstudio's tools and viewers read, and those of `training` that set them."""
 HONOURED = {
     "random_init",
     "num_random",
@@ -113,8 +121,7 @@ def check_options(config: TrainerConfig) -> None:
     pipeline.training.check()
     if pipeline.training.recipe.overlap > 0 and pipeline.blocks == 0:
         raise UserError("abcd-partition cuts no block that outgrows the device: give --pipeline.blocks.")
-    workers = (pipeline.workers, pipeline.cluster, pipeline.blocks, pipeline.training.recipe)
-    check_workers(*workers, on_gpu=config.machine.device_type == "cuda")
+    check_workers(config)
     refuse_changed(config, UNUSED, "")
     refuse_changed(pipeline.datamanager, UNUSED_OF_DATA, "pipeline.datamanager.")
     for name, group in config.optimizers.items():
@@ -168,7 +175,7 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         UserError: an option of splatfacto was set that ABCD does not use.
     """
     for name in HIDDEN:
-        if name in MIRRORED | TOLERATED or getattr(model, name) == _default(type(model), name):
+        if name in {*MIRRORED, *TOLERATED} or getattr(model, name) == _default(type(model), name):
             continue
         why = UNUSED_OF_MODEL.get(name, "it is splatfacto's; `ns-train abcd --help` has ABCD's")
         raise UserError(_no_effect(f"pipeline.model.{name}", why))
@@ -183,15 +190,10 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         training.light = "bilateral"
     if training.light != "none":  # held-out photos have a light of their own, too
         model.color_corrected_metrics = True
-    mirrored = {
-        "sh_degree": ("sh_degree", training.sh_degree),
-        "ssim_lambda": ("ssim_lambda", training.ssim_lambda),
-        "rasterize_mode": ("antialiased", "antialiased" if training.antialiased else "classic"),
-        "background_color": ("background", training.background),
-        "ownership": ("recipe.ownership", training.recipe.ownership),
-        "primitive": ("primitive", training.primitive),
-    }
-    for name, (source, value) in mirrored.items():
+    for name, source in MIRRORED.items():
+        value = attrgetter(source)(training)
+        if name == "rasterize_mode":
+            value = "antialiased" if value else "classic"
         if getattr(model, name) not in (value, _default(type(model), name)):
             flags = (f"--pipeline.model.{name}".replace("_", "-"), source.replace("_", "-"))
             raise UserError(f"{flags[0]} has no effect here; set --pipeline.training.{flags[1]} instead.")

@@ -27,12 +27,14 @@ BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one that rests."""
 
 
-def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe, *, on_gpu: bool) -> None:
+def check_workers(config: TrainerConfig) -> None:
     """Look at what is asked for, before anything is written.
 
     Raises:
         UserError: workers are of no use, or cannot be had.
     """
+    pipeline = config.pipeline
+    workers, cluster, blocks = pipeline.workers, pipeline.cluster, pipeline.blocks
     if workers < 0:
         raise UserError(f"--pipeline.workers must be 0 or more, not {workers}.")
     if cluster is not None and not workers:
@@ -41,9 +43,9 @@ def check_workers(workers: int, cluster: str | None, blocks: int, recipe: Recipe
         )
     if workers <= 1 and cluster is None:
         return
-    if cluster is not None or on_gpu:
+    if cluster is not None or config.machine.device_type == "cuda":
         check_installed()
-    if not _works_at_once(recipe):
+    if not _works_at_once(pipeline.training.recipe):
         raise UserError(
             "This method trains in one process; leave out --pipeline.workers and --pipeline.cluster."
         )
