@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
 from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_model, read_colmap
@@ -26,18 +27,35 @@ DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 
 
-@dataclass(frozen=True)
-class SceneOptions:
-    """Where a scene is, and how it is to be placed; AbcdDataParserConfig says more of each."""
+@dataclass
+class SceneOptions(DataParserConfig):
+    """Where a scene is, and how it is to be placed."""
 
-    data: Path
-    downscale_factor: int | None
-    orientation_method: Orientation
-    center_method: Center
-    auto_scale_poses: bool
-    scale_factor: float
+    data: Path = Path()
+    """A folder with sparse/0, colmap/sparse/0 or sparse (COLMAP, .bin or .txt) and images, or with
+    transforms.json or transforms_train.json; or a transforms.json file itself. Where several are, COLMAP's
+    model is taken."""
     images_path: Path = IMAGES
+    """The folder of a COLMAP model's photos, from `data`."""
     masks_path: Path | None = None
+    """The folder of their masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg. Black is
+    not trained on. None for no masks."""
+    downscale_factor: int | None = None
+    """Divides the photos' width and height. None takes the smallest of 1, 2, 4, ... with which no photo is
+    wider or higher than 1,600 px, as splatfacto's data parsers do; 1 keeps photos as they are. images_N is
+    read where it fits the model; otherwise photos are reduced in memory by area averaging, to sizes rounded
+    down, and nothing is written. Intrinsics follow the sizes: fx x new width / old width, fy x new height /
+    old height."""
+    scale_factor: float = 1.0
+    """Multiplies the scene's size, after auto_scale_poses."""
+    scene_scale: float = 1.0
+    """Half the side of the scene box, in scaled units."""
+    orientation_method: Orientation = "up"
+    """How the scene is turned; "up" makes the mean of the cameras' up vectors +z."""
+    center_method: Center = "poses"
+    """What becomes the origin: the mean of the cameras, the point that they look at, or nothing."""
+    auto_scale_poses: bool = True
+    """Scale the scene until all camera coordinates lie within -1 to 1."""
 
 
 @dataclass(frozen=True)
@@ -105,13 +123,18 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
         raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
+    problems = Problems()
     try:
         scene = read_scene(options.data, options.images_path, options.masks_path)
         factor = automatic_factor(scene) if wanted is None else int(wanted)
-        files, notes = _check_layout_and_photos(scene, factor, needs_photos)
+        with problems.collect():
+            check_layout(scene)
+        with problems.collect():
+            files, notes = _find_photos(scene, factor, needs_photos)
     except OSError as error:
         where = error.filename or options.data
         raise InputError(f"{where} cannot be read ({error.strerror}); check its permissions.") from None
+    problems.raise_if_any()
     sources, lenses = _sources(scene, files)
     poses = np.stack([frame.camera_to_world for frame in scene.frames])
     similarity = normalizing_similarity(
@@ -158,12 +181,10 @@ def check_masks(sources: list[PhotoSource]) -> None:
     masked = [source for source in sources if source.mask_path is not None]
     photos, problems = Photos(masked, budget_bytes=0), Problems()
 
-    def look(row: int) -> tuple[str, ...]:
-        try:
+    def look(row: int) -> list[str]:
+        with (found := Problems()).collect():
             photos.mask(row)
-        except InputError as error:
-            return error.lines
-        return ()
+        return found.lines
 
     with ThreadPoolExecutor() as pool, ProgressBar("Looking at masks", len(masked)) as bar:
         for lines in pool.map(look, range(len(masked))):
@@ -172,18 +193,8 @@ def check_masks(sources: list[PhotoSource]) -> None:
     problems.raise_if_any()
 
 
-def _check_layout_and_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSource], list[str]]:
-    """The photos' files, and notes; both kinds of fault are looked for before either is reported."""
-    problems = Problems()
-    with problems.collect():
-        check_layout(scene)
-    with problems.collect():
-        found = _find_photos(scene, factor, needed)
-    problems.raise_if_any()
-    return found
-
-
 def _find_photos(scene: Scene, factor: int, needed: bool) -> tuple[list[PhotoSource], list[str]]:
+    """The photos' files, and notes."""
     problems = Problems()
     for frame in scene.frames:
         if frame.mask_path is not None:

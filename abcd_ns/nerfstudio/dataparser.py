@@ -1,7 +1,6 @@
 """From a folder to cameras, points and photos: what `ns-train abcd --data DIR` takes."""
 
-from dataclasses import dataclass, field, fields
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,7 +10,6 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import (
     DataParser,
-    DataParserConfig,
     DataparserOutputs,
     transform_poses_to_original_space,
 )
@@ -20,44 +18,17 @@ from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fractio
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from abcd_ns.data.colmap_model import IMAGES
 from abcd_ns.data.foreign_outputs import PHOTOS, pinhole_cameras
 from abcd_ns.data.input_errors import InputError, one_line
-from abcd_ns.data.normalize import Center, Orientation
 from abcd_ns.data.prepare import Prepared, SceneOptions, prepare
 
 
 @dataclass
-class AbcdDataParserConfig(DataParserConfig):
+class AbcdDataParserConfig(SceneOptions):
     """A folder with a COLMAP model or a transforms.json, and photos. `--data DIR` alone is enough."""
 
     _target: type = field(default_factory=lambda: AbcdDataParser)
     """target class to instantiate"""
-    data: Path = Path()
-    """A folder with sparse/0, colmap/sparse/0 or sparse (COLMAP, .bin or .txt) and images, or with
-    transforms.json or transforms_train.json; or a transforms.json file itself. Where several are, COLMAP's
-    model is taken."""
-    images_path: Path = IMAGES
-    """The folder of a COLMAP model's photos, from `data`."""
-    masks_path: Path | None = None
-    """The folder of their masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg. Black is
-    not trained on. None for no masks."""
-    downscale_factor: int | None = None
-    """Divides the photos' width and height. None takes the smallest of 1, 2, 4, ... with which no photo is
-    wider or higher than 1,600 px, as splatfacto's data parsers do; 1 keeps photos as they are. images_N is
-    read where it fits the model; otherwise photos are reduced in memory by area averaging, to sizes rounded
-    down, and nothing is written. Intrinsics follow the sizes: fx x new width / old width, fy x new height /
-    old height."""
-    scale_factor: float = 1.0
-    """Multiplies the scene's size, after auto_scale_poses."""
-    scene_scale: float = 1.0
-    """Half the side of the scene box, in scaled units."""
-    orientation_method: Orientation = "up"
-    """How the scene is turned; "up" makes the mean of the cameras' up vectors +z."""
-    center_method: Center = "poses"
-    """What becomes the origin: the mean of the cameras, the point that they look at, or nothing."""
-    auto_scale_poses: bool = True
-    """Scale the scene until all camera coordinates lie within -1 to 1."""
     eval_mode: Literal["auto", "interval", "fraction", "all"] = "auto"
     """"auto" follows train_list.txt, val_list.txt and test_list.txt, or transforms.json's train_filenames,
     val_filenames and test_filenames, or transforms_test.json; without them it is "interval", which holds out
@@ -113,10 +84,10 @@ class AbcdDataParser(DataParser):
             InputError: the input cannot be used.
         """
         if self._prepared is None:
-            options = {field.name: getattr(self.config, field.name) for field in fields(SceneOptions)}
-            if self.config.as_stored and self.config.downscale_factor is None:
-                options["downscale_factor"] = 1
-            self._prepared = prepare(SceneOptions(**options), needs_photos=self.downscale_factor is None)
+            options = self.config
+            if options.as_stored and options.downscale_factor is None:
+                options = replace(options, downscale_factor=1)
+            self._prepared = prepare(options, needs_photos=self.downscale_factor is None)
             for note in (*self._prepared.chosen, *self._prepared.notes):
                 self.tell(note)
         return self._prepared
