@@ -116,11 +116,6 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
         super().__init__(*args, **kwargs)
         self._eval_order = random.Random(0)
 
-    @property
-    def dataset_type(self) -> type[AbcdDataset]:
-        """The class of both datasets."""
-        return AbcdDataset
-
     def create_train_dataset(self) -> AbcdDataset:
         """The training photos, under their share of RAM."""
         budget = int(self.config.photo_cache_gb * 2**30) if self.config.photo_cache_gb else None
