@@ -94,11 +94,6 @@ class ForkedWorkers(Members[Place]):
         theirs.close()
 
     def wait(self, seconds: float) -> list[Report]:
-        """What has happened; waits for something so long at most.
-
-        Raises:
-            WorkersError: a visit failed, as it would in any process.
-        """
         busy = {member.pipe: member for member in self._members if member.lease is not None}
         reports = [report for pipe in wait(list(busy), seconds) for report in self._hear(busy[pipe])]
         for member in self._members:
@@ -107,7 +102,6 @@ class ForkedWorkers(Members[Place]):
         return reports
 
     def close(self) -> None:
-        """End them."""
         for member in self._members:
             if member.lease is not None:
                 self._end(member)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from abcd_ns.cluster.lease import Lease
+from abcd_ns.cluster.lease import Lease, Workers
 from abcd_ns.engine.events import WorkerSeen
 
 
@@ -57,20 +57,18 @@ class Member:
 M = TypeVar("M", bound=Member)
 
 
-class Members(Generic[M]):
-    """All of them."""
+class Members(Workers, Generic[M]):
+    """All of them, as far as both kinds of workers are alike."""
 
     def __init__(self, members: Sequence[M]) -> None:
         self._members = list(members)
 
     @property
     def count(self) -> int:
-        """How many there are, those that are starting included."""
         return len(self._members)
 
     @property
     def idle(self) -> int:
-        """How many could take a visit now."""
         return sum(member.is_idle for member in self._members)
 
     @property
@@ -79,7 +77,6 @@ class Members(Generic[M]):
         return [member.pid for member in self._members if member.lease is not None]
 
     def seen(self) -> Sequence[WorkerSeen]:
-        """What each is doing."""
         return [member.seen() for member in self._members]
 
     def _longest_idle(self) -> M:

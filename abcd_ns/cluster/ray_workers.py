@@ -173,12 +173,11 @@ class RayWorkers(Members[Remote]):
         return self._replace(member, f"silent for {patience:.0f} s")
 
     def close(self) -> None:
-        """End them."""
         for member in self._members:
             ray.kill(member.actor)
         self._members = []
 
-    def _start(self, member: Remote) -> Member:
+    def _start(self, member: Remote) -> Remote:
         member.actor = self._class.remote()
         member.asked = member.actor.prepare.remote(self._make)
         member.question, member.lease, member.ready = None, None, False
