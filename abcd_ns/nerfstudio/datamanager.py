@@ -1,7 +1,7 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -150,7 +150,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def photo(self, row: int, crop: Crop) -> torch.Tensor:
         """Pixels of a training photo: float32 [h, w, 3] in 0..1 (or [h, w, 4] with alpha), on the device."""
-        return self._pixels("photo", row, self.train_dataset.photos.image, crop).float() / 255
+        return self._pixels("image", row, crop).float() / 255
 
     def target(self, sample: Sample) -> Target:
         """What a sample is trained on where no model is asked: workers have none."""
@@ -161,24 +161,22 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def shown(self, sample: Sample) -> Target:
         """What a sample's crop shows of the photo and of the mask, in the crop's pixels."""
-        row, crop = sample.view.index, sample.source
-        mask = self._pixels("mask", row, self.train_dataset.photos.mask, crop)
-        return sample.reduced(self.photo(row, crop)), sample.reduced_mask(mask)
+        shot = sample.view.index, sample.source
+        return sample.reduced(self.photo(*shot)), sample.reduced_mask(self._pixels("mask", *shot))
 
     def read_ahead(self, event: Event) -> None:
         """Begin to read photos that are wanted soon and not on the device; a CPU has its threads busy."""
         if isinstance(event, PhotosWanted) and torch.device(self.device).type != "cpu":
-            rows = (row for row in event.views if ("photo", row) not in self._on_device)
+            rows = (row for row in event.views if ("image", row) not in self._on_device)
             self.train_dataset.photos.expect(rows)
 
-    def _pixels(
-        self, kind: str, row: int, read: Callable[[int], torch.Tensor | None], crop: Crop
-    ) -> torch.Tensor | None:
-        """A crop on the device, of what is kept there, or copied while the device goes on."""
+    def _pixels(self, kind: Literal["image", "mask"], row: int, crop: Crop) -> torch.Tensor | None:
+        """A crop on the device, of what is kept there, or copied while it goes on; None for no mask."""
         kept = self._on_device.get((kind, row))
         if kept is not None:
             return kept[crop.slices]
-        whole, device = read(row), torch.device(self.device)
+        photos, device = self.train_dataset.photos, torch.device(self.device)
+        whole = photos.image(row) if kind == "image" else photos.mask(row)
         if whole is None:
             return None
         if device.type == "cpu" or self._used + whole.nbytes > self.device_photo_bytes:

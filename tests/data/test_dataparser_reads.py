@@ -249,7 +249,7 @@ def test_nerfstudios_datamanager_takes_it(tmp_path):
 def test_photos_of_the_next_steps_are_read_ahead_of_a_device(scene, monkeypatch, device, read):
     """But for those that are kept there."""
     manager = AbcdDataManagerConfig(data=scene).setup(device="cpu", test_mode="val")
-    manager.device, manager._on_device["photo", 1] = device, torch.empty(0)
+    manager.device, manager._on_device["image", 1] = device, torch.empty(0)
     expected: list[int] = []
     monkeypatch.setattr(manager.train_dataset.photos, "expect", expected.extend)
     manager.read_ahead(PhotosWanted((0, 1, 2)))
