@@ -145,8 +145,8 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
         options.scale_factor,
     )
     points, in_model, more = _points(scene, similarity)
-    both = scene.split_lists.in_both if scene.split_lists else 0
-    if both:
+    lists = scene.split_lists
+    if lists and (both := len(lists.train & lists.held_out)):
         more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
     reduced = [_reduction(scene, sources, factor)] if wanted is None and factor > 1 and needs_photos else []
     notes = (*scene.notes, *notes, *more)

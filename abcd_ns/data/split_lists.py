@@ -27,11 +27,6 @@ class SplitLists:
         wanted = self.train if split == "train" else self.held_out
         return [row for row, name in enumerate(names) if name in wanted]
 
-    @property
-    def in_both(self) -> int:
-        """How many views are trained on and held out."""
-        return len(self.train & self.held_out)
-
 
 def split_lists(
     found: Mapping[str, Sequence[str]], known: Mapping[str, str], labels: Mapping[str, str]
