@@ -231,15 +231,13 @@ class RamShares:
     layers: int
     """A visit's layers; where there is a GPU, those that have no room there."""
 
-
-def share_out(budget: int) -> RamShares:
-    """A quarter of `budget` bytes for photos, one for blocks, the rest for layers."""
-    photos = blocks = budget // 4
-    return RamShares(photos, blocks, budget - photos - blocks)
-
-
-def ram_budget(gigabytes: float) -> int:
-    """The budget in bytes; 0 GB is the smaller of 8 GiB and 40% of the machine's memory."""
-    if gigabytes:
-        return int(gigabytes * GB)
-    return min(MOST_RAM, int(KEPT_SHARE * psutil.virtual_memory().total))
+    @staticmethod
+    def of(gigabytes: float) -> "RamShares":
+        """A quarter of so many for photos, one for blocks, the rest for layers; 0 is the smaller of 8 and 40%
+        of the machine's memory."""
+        if gigabytes:
+            budget = int(gigabytes * GB)
+        else:
+            budget = min(MOST_RAM, int(KEPT_SHARE * psutil.virtual_memory().total))
+        photos = blocks = budget // 4
+        return RamShares(photos, blocks, budget - photos - blocks)

@@ -39,10 +39,9 @@ from abcd_ns.nerfstudio.fit import (
     SCAFFOLD,
     Demand,
     Fit,
+    RamShares,
     device_budget,
     find_fit,
-    ram_budget,
-    share_out,
 )
 from abcd_ns.nerfstudio.flags import named_too
 from abcd_ns.nerfstudio.inspection import factor_of
@@ -111,7 +110,7 @@ class AbcdPipeline(VanillaPipeline):
 
     def __init__(self, config: AbcdPipelineConfig, *args: Any, **kwargs: Any) -> None:
         mirror(config.training, config.model)
-        self._ram = share_out(ram_budget(config.ram_budget_gb))
+        self._ram = RamShares.of(config.ram_budget_gb)
         if not config.datamanager.photo_cache_gb:
             config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / 2**30
         # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
@@ -317,7 +316,10 @@ class AbcdPipeline(VanillaPipeline):
             )
         del everything
         blocks, fitted = self._first_cut(len(gaussians))
-        tree = cut_space(gaussians, blocks, self.config.partition)
+        if self.config.partition == "kd":
+            tree = build_kd(gaussians.means, blocks)
+        else:
+            tree = build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
         keep = self._scaffold_size(len(gaussians), tree.num_blocks, fitted)
         header = {"tree": tree.to_json(), **fitted, SCAFFOLD: keep or 0}
         store = new_store(folder, {**header, **made_for.header()})
@@ -350,13 +352,6 @@ class AbcdPipeline(VanillaPipeline):
         if begun < self._points:
             words = f"{self._points:,} points begin as {begun:,} Gaussians: photos of this size show no more."
             CONSOLE.print(words, highlight=False)
-
-
-def cut_space(gaussians: Gaussians, blocks: int, partition: str) -> BlockTree:
-    """Cells for a scene that is about to be trained."""
-    if partition == "kd":
-        return build_kd(gaussians.means, blocks)
-    return build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
 
 
 def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:

@@ -20,10 +20,9 @@ from abcd_ns.nerfstudio.fit import (
     LEAST_BLOCK,
     Demand,
     Fit,
+    RamShares,
     device_budget,
     find_fit,
-    ram_budget,
-    share_out,
 )
 from tests.reference.scenes import training_config
 
@@ -229,17 +228,13 @@ def test_the_budget_is_what_is_wanted_or_a_share_of_what_there_is():
     assert device_budget(0.0, "cpu") > 0
 
 
-@given(st.integers(0, 2**50))
+@given(st.integers(1, 2**50))
 def test_shares_of_ram_add_up(budget):
-    shares = share_out(budget)
+    shares = RamShares.of(budget / GB)
     assert sum(vars(shares).values()) == budget
     assert min(vars(shares).values()) >= 0
 
 
 def test_the_automatic_ram_budget_is_a_part_of_the_machines():
-    automatic = ram_budget(0.0)
+    automatic = sum(vars(RamShares.of(0.0)).values())
     assert 0 < automatic <= min(8 * 2**30, psutil.virtual_memory().total // 2)
-
-
-def test_a_ram_budget_can_be_given():
-    assert ram_budget(1.5) == 3 * 2**29

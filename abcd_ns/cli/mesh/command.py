@@ -28,7 +28,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import FREE_SHARE, ram_budget, share_out
+from abcd_ns.nerfstudio.fit import FREE_SHARE, RamShares
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.run.resuming import MadeFor
@@ -165,7 +165,7 @@ def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[Painter, P
     views = training_views(capture.cameras, capture.metadata.get("points3D_xyz"), config.near_plane)
     if different := MadeFor.of(capture.image_filenames, views, config.training).differences(store):
         raise UserError(f"--data {config.datamanager.data} is not what the run was made for: {different}.")
-    ram = share_out(ram_budget(config.ram_budget_gb))
+    ram = RamShares.of(config.ram_budget_gb)
     scene = StoredScene(BlockTree.from_json(store.header["tree"]), store, ram.blocks)
     of_each = drawing_bytes(config.training.sh_degree, config.training.primitive)
     room = int(FREE_SHARE * free_bytes(device)) // of_each

@@ -14,7 +14,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.fit import Fit, ram_budget, share_out
+from abcd_ns.nerfstudio.fit import Fit, RamShares
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
@@ -112,7 +112,7 @@ def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int
     return (
         *(lent if workers > 1 else ()),
         Share("decoded photos", min(photo_bytes, photo_budget)),
-        Share("frozen blocks", min(scene, share_out(ram_budget(0)).blocks)),
+        Share("frozen blocks", min(scene, RamShares.of(0).blocks)),
         Share("the whole scene, while a checkpoint is written", scene),
     )
 
