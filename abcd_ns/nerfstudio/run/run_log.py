@@ -95,13 +95,8 @@ class RunLog:
         """Training is over: say what it took."""
         self._sample()
         for worker in self._workers:
-            self._note(
-                "worker",
-                worker=worker.worker,
-                visits=worker.visits,
-                deaths=worker.deaths,
-                waited=round(worker.waited, 3),
-            )
+            told = {name: getattr(worker, name) for name in ("worker", "visits", "deaths")}
+            self._note("worker", **told, waited=round(worker.waited, 3))
         self._note(
             "end",
             gaussians=self._coordinator.count(),
@@ -121,17 +116,9 @@ class RunLog:
     def _end_visit(self, event: VisitEnded) -> None:
         self._sample()
         psnrs = self._visit_psnrs.pop(event.visit, [])
-        self._note(
-            "visit end",
-            visit=event.visit,
-            sweep=event.sweep,
-            block=event.block,
-            gaussians=event.gaussians,
-            migrated=event.migrated,
-            layer_seconds=round(event.layer_seconds, 3),
-            visit_seconds=round(event.seconds, 3),
-            psnr=_mean(psnrs[len(psnrs) // 2 :]),
-        )
+        told = vars(event) | {"layer_seconds": round(event.layer_seconds, 3)}
+        seconds = round(told.pop("seconds"), 3)  # a line's own are of the whole run
+        self._note("visit end", **told, visit_seconds=seconds, psnr=_mean(psnrs[len(psnrs) // 2 :]))
         self._flush()
 
     def _sample(self) -> None:
