@@ -49,7 +49,7 @@ def describe_machine() -> Machine:
 
     return Machine(
         cpu=_cpu_model(),
-        cores=_usable_cores(),
+        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         torch_threads=torch.get_num_threads(),
         ram_bytes=psutil.virtual_memory().total,
         gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -114,12 +114,6 @@ def _cpu_model() -> str:
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def package_version(package: str) -> str | None:

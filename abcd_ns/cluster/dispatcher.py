@@ -136,7 +136,8 @@ class Dispatcher(Coordinator):
     def _lend(self) -> None:
         """Take in what may be, and lend as much as workers can take."""
         self._submit()
-        while self._may_lend:
+        steps = self.run.budget.steps
+        while self.progress < 1.0 and (steps is None or self.state.planned < steps):
             if len(self._lent) >= self._lag:
                 if not self._take_in_first():
                     return
@@ -153,11 +154,6 @@ class Dispatcher(Coordinator):
                 self._submit()
         while self._lent and self._take_in_first():
             pass
-
-    @property
-    def _may_lend(self) -> bool:
-        steps = self.run.budget.steps
-        return self.progress < 1.0 and (steps is None or self.state.planned < steps)
 
     def _lent_of(self, active: ActiveVisit) -> Lent:
         state, scene, block = self.state, self.scene, active.geometry.block

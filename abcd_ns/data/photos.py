@@ -136,17 +136,13 @@ class Photos:
         # Not under the lock, so that two threads may both read one.
         value = self._read(key) if expected is None else expected.result()
         with self._lock:
-            self._keep(key, value)
+            if value.nbytes <= self.budget_bytes and key not in self._kept:
+                self._kept[key] = value
+                self.cached_bytes += value.nbytes
+            while self.cached_bytes > self.budget_bytes:
+                _, oldest = self._kept.popitem(last=False)
+                self.cached_bytes -= oldest.nbytes
         return value
-
-    def _keep(self, key: _Key, value: Tensor) -> None:
-        if value.nbytes > self.budget_bytes or key in self._kept:
-            return
-        self._kept[key] = value
-        self.cached_bytes += value.nbytes
-        while self.cached_bytes > self.budget_bytes:
-            _, oldest = self._kept.popitem(last=False)
-            self.cached_bytes -= oldest.nbytes
 
 
 def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UInt8[np.ndarray, "y x c"]:
