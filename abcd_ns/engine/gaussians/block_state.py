@@ -78,10 +78,6 @@ class BlockState:
         growth = {name: change(value) for name, value in self.growth.items()}
         return BlockState(gaussians, *moments, growth, self.clocks, change(self.waits))
 
-    def joined_by(self, arrivals: "BlockState") -> "BlockState":
-        """This block with the Gaussians of `arrivals` added at the end; see `join`."""
-        return join([self, arrivals])
-
     def forgetful(self) -> "BlockState":
         """As if no optimizer had ever seen it: zero moments and no statistics. The other clocks stay."""
         return replace(BlockState.fresh(self.gaussians), clocks=replace(self.clocks, adam_views=0))

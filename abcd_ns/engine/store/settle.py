@@ -38,7 +38,7 @@ def _blocks(scene: VisitScene, block: BlockName) -> range:
 def with_mail(scene: VisitScene, block: int) -> BlockState:
     """A block at rest, joined by those that wait for its next visit."""
     state, mail = scene.state(block), scene.mail(block)
-    return state if mail is None else state.joined_by(mail)
+    return state if mail is None else join([state, mail])
 
 
 def settle(
@@ -57,7 +57,7 @@ def settle(
     inside = _owner(scene, state) == block
     left = state[~inside] if migrate else state.nobody
     if taken is not None and (mail := scene.mail(block)) is not None:
-        left = left.joined_by(mail[taken:])
+        left = join([left, mail[taken:]])
     return {block: state[inside], **inbox_without(scene, {block}, left)}
 
 
@@ -91,7 +91,7 @@ def settle_scaffold(scene: StoredScene, state: BlockState) -> dict[BlockName, Bl
     arrivals = split_by_block(put_to_wait(waiting), _owner(scene, waiting))
     nobody = replace(waiting.nobody, clocks=state.clocks)
     settled = {
-        block: trained.get(block, nobody).joined_by(arrivals.get(block, nobody))
+        block: join([trained.get(block, nobody), arrivals.get(block, nobody)])
         for block in range(scene.tree.num_blocks)
     }
     return {**settled, RESERVE: waiting.nobody}

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
 from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, make_adam
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import random_gaussians
@@ -58,12 +58,12 @@ def test_rows_that_part_and_join_again_lose_nothing():
     state = some_state(10)
     mask = torch.arange(10) % 3 == 0
     assert_same(
-        state[mask].joined_by(state[~mask]), state[torch.cat([torch.where(mask)[0], torch.where(~mask)[0]])]
+        join([state[mask], state[~mask]]), state[torch.cat([torch.where(mask)[0], torch.where(~mask)[0]])]
     )
 
 
 def test_a_statistic_that_one_side_lacks_starts_at_zero():
-    joined = BlockState.fresh(random_gaussians(2)).joined_by(some_state(3))
+    joined = join([BlockState.fresh(random_gaussians(2)), some_state(3)])
     assert joined.growth["grad2d"][:2].tolist() == [0, 0]
     assert torch.equal(joined.growth["grad2d"][2:], some_state(3).growth["grad2d"])
 

@@ -1,7 +1,7 @@
 """Blocks that outgrow what the device holds are cut in two where they come to rest."""
 
 from abcd_ns.engine.events import Announcer, BlockSplit
-from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.space.partition import best_split
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scaffold import split_by_block
@@ -72,7 +72,7 @@ def with_full(
     rows = {block: len(settled[block]) if block in settled else scene.rows(block) for block in at_rest}
     full = {block: mail for block, mail in at_rest.items() if rows[block] + len(mail) > FULL * limit}
     joined = {
-        block: (settled[block] if block in settled else scene.state(block)).joined_by(mail)
+        block: join([settled[block] if block in settled else scene.state(block), mail])
         for block, mail in full.items()
     }
     return {**settled, **joined, INBOX: without(scene, inbox, full)} if full else settled
