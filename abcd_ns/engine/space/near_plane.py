@@ -5,6 +5,7 @@ view that is not, from a place that no photo was taken from, may be lost to a ha
 is a fair guess at what other views show there. Photos do tell how near things come to a camera.
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -32,12 +33,9 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
         Camera z, world units; gsplat's own where there is nothing to tell by, and never less.
     """
     points = points[:: -(-len(points) // MOST_POINTS) or 1].double()
-    nearest = [_nearest(points, view) for view in views[:: -(-len(views) // MOST_VIEWS) or 1]]
-    seen = [depth for depth in nearest if depth is not None]
-    return max(SHARE * min(seen), NEAR_PLANE) if seen else NEAR_PLANE
-
-
-def _nearest(points: Float[Tensor, "n 3"], view: View) -> float | None:
-    depths, seen = view.depths_of(points)
-    depths = depths[seen]
-    return float(torch.quantile(depths, OUTLIERS)) if len(depths) else None
+    nearest = math.inf
+    for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
+        depths, seen = view.depths_of(points)
+        if bool(seen.any()):
+            nearest = min(nearest, float(torch.quantile(depths[seen], OUTLIERS)))
+    return max(SHARE * nearest, NEAR_PLANE) if math.isfinite(nearest) else NEAR_PLANE
