@@ -3,8 +3,8 @@
 import copy
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -192,7 +192,7 @@ class ParameterStore:
             header=old.header if header is None else header,
             state=old.state if state is None else state,
         )
-        try:
+        with self._or_roll_back(f"Writing generation {generation} failed"):
             self._require_space(sum(t.nbytes for tensors, _ in updates.values() for t in tensors.values()))
             shards = {
                 block: write_shard(self.folder, block, generation, tensors, meta)
@@ -202,11 +202,6 @@ class ParameterStore:
             crash_points.reached(crash_points.SHARDS_IN_PLACE)
             new = replace(new, blocks=old.blocks | shards)
             self._publish(new)
-        except BaseException as error:
-            outcome = self._roll_back(old)
-            if isinstance(error, (OSError, SafetensorError)):
-                raise StoreError(f"Writing generation {generation} failed: {error}. {outcome}") from error
-            raise
         self._verified.update(shard.file for shard in shards.values())
         self._collect()
         return generation
@@ -251,15 +246,9 @@ class ParameterStore:
             StoreError: read-only store, no such pin, or a write that failed.
         """
         self._require_writable()
-        old = self._manifest
         pinned = read_checked_manifest(manifest_path(self.folder, name))
-        try:
-            self._publish(replace(pinned, generation=old.generation + 1))
-        except BaseException as error:
-            outcome = self._roll_back(old)
-            if isinstance(error, OSError):
-                raise StoreError(f"Pin {name!r} could not be restored: {error}. {outcome}") from error
-            raise
+        with self._or_roll_back(f"Pin {name!r} could not be restored"):
+            self._publish(replace(pinned, generation=self.generation + 1))
         self._collect()
         return self.generation
 
@@ -337,6 +326,18 @@ class ParameterStore:
         write_file(manifest_path(self.folder), data)
         self._manifest = Manifest.written(data)
         crash_points.reached(crash_points.GENERATION_PUBLISHED)
+
+    @contextmanager
+    def _or_roll_back(self, failed: str) -> Iterator[None]:
+        """Make a new generation in here, or keep the old one; `failed` says what the disk refused."""
+        old = self._manifest
+        try:
+            yield
+        except BaseException as error:
+            outcome = self._roll_back(old)
+            if isinstance(error, (OSError, SafetensorError)):
+                raise StoreError(f"{failed}: {error}. {outcome}") from error
+            raise
 
     def _roll_back(self, old: Manifest) -> str:
         """Undo a commit that failed anywhere, even after its manifest came into place; say what is left.
