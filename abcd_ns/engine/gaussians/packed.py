@@ -21,11 +21,12 @@ DRAWN = (*PARAM_NAMES, WAITS, DEGREES)
 
 
 class Packed(NamedTuple):
-    """A block, or some columns of it, as a store takes it."""
+    """A block, or some columns of it, as a store takes it; or a table of the run's, of no Gaussians."""
 
     tensors: dict[str, Tensor]
+    """Nobody changes them any more."""
     meta: dict[str, Any]
-    """JSON. `coefficients` is k; `parameters`, of how many numbers the Gaussians are."""
+    """JSON. Of a block, `coefficients` is k; `parameters`, of how many numbers its Gaussians are."""
 
     @property
     def rows(self) -> int:

@@ -21,7 +21,6 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.block_memory import BlockMemory
 from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
-from abcd_ns.engine.store.table import Table
 from abcd_ns.engine.store.write_behind import Snapshot, WriteBehind
 from abcd_ns.engine.types import Gaussians
 
@@ -115,7 +114,7 @@ class StoredScene(VisitScene):
         """What is durable; to be read and written by way of the scene alone while there is one."""
         self.ram_bytes = ram_bytes
         self._memory = BlockMemory(ram_bytes)
-        self._unsaved: dict[BlockName, Packed | Table] = {}
+        self._unsaved: dict[BlockName, Packed] = {}
         self._writer = WriteBehind(store, self._saved)
         self._numbers, self._versions = itertools.count(1), dict[BlockName, int]()
         self._bounds: dict[int, tuple[int, Box | None]] = {}
@@ -131,7 +130,7 @@ class StoredScene(VisitScene):
     def rest(
         self,
         tree: BlockTree,
-        blocks: Mapping[BlockName, BlockState | Table],
+        blocks: Mapping[BlockName, BlockState | Packed],
         state: dict[str, Any],
         within: float = 0.0,
     ) -> None:
@@ -148,7 +147,7 @@ class StoredScene(VisitScene):
             StoreError: the disk refused, now or since the last call. Everything is in RAM, and waits to be
                 written by the next `rest` or `flush`.
         """
-        packed = {n: block if isinstance(block, Table) else block.packed() for n, block in blocks.items()}
+        packed = {n: block if isinstance(block, Packed) else block.packed() for n, block in blocks.items()}
         with self._writer.lock:
             header = None if tree is self.tree else {**self.store.header, "tree": tree.to_json()}
             self.tree = tree
@@ -186,7 +185,7 @@ class StoredScene(VisitScene):
             for name, block in snapshot.blocks.items():
                 if self._unsaved.get(name) is block:
                     del self._unsaved[name]
-                    if isinstance(block, Packed) and name not in (LIVE, INBOX):  # nobody reads them here
+                    if isinstance(name, int):  # what has a name of its own nobody reads here
                         self._memory.put(name, block)
             self._memory.shrink(self.unsaved_bytes)
 
@@ -279,11 +278,11 @@ class StoredScene(VisitScene):
                 self._memory.shrink(self.unsaved_bytes)
             return found
 
-    def table(self, name: str) -> Table | None:
+    def table(self, name: str) -> Packed | None:
         """A table of the run's, at rest; None where there is none of this name."""
         if not self.has(name):
             return None
-        return self._unsaved.get(name) or Table(*self.store.load(name))
+        return self._unsaved.get(name) or Packed(*self.store.load(name))
 
     def read_ahead(self, block: int) -> None:
         """Have `state` of a block at hand soon; returns at once."""

@@ -23,14 +23,13 @@ from typing import Any
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.special_blocks import BlockName
-from abcd_ns.engine.store.table import Table
 
 
 @dataclass(frozen=True)
 class Snapshot:
     """What a commit brings: everything as it was at one moment between two steps. Nobody changes it."""
 
-    blocks: dict[BlockName, Packed | Table]
+    blocks: dict[BlockName, Packed]
     """Those that have changed, and tables of the run's."""
     header: dict[str, Any] | None
     """None where it has not changed."""

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.store.table import Table
+from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.train.capture import bilateral_grid
 from abcd_ns.engine.transfer import Download, upload
 from abcd_ns.engine.types import Crop, View
@@ -133,7 +133,7 @@ class Light:
 
     # -- at rest -------------------------------------------------------------------------------------
 
-    def changed(self) -> dict[str, Table]:
+    def changed(self) -> dict[str, Packed]:
         """All that has changed since the last call, by the names under which it is to be kept; shares no
         memory."""
         self._settle()
@@ -141,7 +141,7 @@ class Light:
         self._stepped.clear()
         return {_name(part): self._table(part) for part in sorted(parts | {0})} if parts else {}
 
-    def restore(self, table: Callable[[str], Table | None]) -> None:
+    def restore(self, table: Callable[[str], Packed | None]) -> None:
         """Stand where all that `changed` ever gave was kept.
 
         Args:
@@ -167,9 +167,9 @@ class Light:
         """Rows of a table."""
         return max(1, TABLE_BYTES // (self._changes[:1].nbytes * 3))
 
-    def _table(self, part: int) -> Table:
+    def _table(self, part: int) -> Packed:
         tensors = {name: value.to("cpu", copy=True) for name, value in self._tensors(part).items()}
-        return Table(tensors, {"kind": self.kind})
+        return Packed(tensors, {"kind": self.kind})
 
     def _tensors(self, part: int) -> dict[str, Tensor]:
         """What is kept together, itself. The first has the sum, too."""
