@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.sh_degrees import degrees_in_use, up_to_degree
+from abcd_ns.engine.gaussians.spherical_harmonics import degrees_in_use, up_to_degree
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
 WAITS, DEGREES = "waits", "degrees"

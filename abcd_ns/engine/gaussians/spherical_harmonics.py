@@ -1,12 +1,20 @@
-"""View-dependent colour: real spherical harmonics up to degree 3, in the order and signs of 3DGS."""
+"""View-dependent colour: real spherical harmonics up to degree 3, in the order and signs of 3DGS.
+
+Of which degree those of a Gaussian are, and of how many numbers that makes it.
+"""
 
 import math
+from collections.abc import Sequence
 
+import torch
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 MAX_SH_DEGREE = 3
 BASES = (MAX_SH_DEGREE + 1) ** 2 - 1
 """Basis functions of degrees 1 and up."""
+NUMBERS_WITHOUT_COLOR = 11
+"""Of a Gaussian: mean, scales, quaternion, opacity."""
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
 _C1 = math.sqrt(3 / (4 * math.pi))
@@ -35,5 +43,29 @@ def sh_basis_rows(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
 
 
 def sh_degree_of(basis: int) -> int:
-    """0 for the three functions of degree 1, 1 for the five of degree 2, 2 for the seven of degree 3."""
+    """0 for the three functions of degree 1, 1 for the five of degree 2, 2 for the seven of degree 3. So
+    it is the highest degree that so many functions come to."""
     return math.isqrt(basis + 1) - 1
+
+
+def degrees_in_use(parts: Sequence[Float[Tensor, "n k 3"]]) -> UInt8[Tensor, "n"]:
+    """The highest degree of which a coefficient is not zero, in any of the parts."""
+    used = torch.stack([(part != 0).any(dim=2) for part in parts]).any(dim=0)
+    degrees = torch.where(used, _degrees(used.shape[1], used.device), 0)
+    # One more column, for there may be none.
+    return torch.nn.functional.pad(degrees, (1, 0)).amax(dim=1).to(torch.uint8)
+
+
+def up_to_degree(degrees: Tensor, coefficients: int) -> Bool[Tensor, "n k"]:
+    """Which of so many coefficients of degrees 1 and up belong to degrees, [n], or lower ones."""
+    return _degrees(coefficients, degrees.device) <= degrees[:, None]
+
+
+def _degrees(coefficients: int, device: torch.device) -> Tensor:
+    return torch.tensor([sh_degree_of(k) + 1 for k in range(coefficients)], device=device)
+
+
+def count_parameters(features_rest: Float[Tensor, "n k 3"]) -> int:
+    """Of how many numbers Gaussians are, harmonics counted up to the highest degree in use of each."""
+    bands = (degrees_in_use([features_rest]).long() + 1).square()
+    return int((NUMBERS_WITHOUT_COLOR + 3 * bands).sum())

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.packed import DRAWN, WAITS, Packed
-from abcd_ns.engine.gaussians.sh_degrees import count_parameters
+from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
 from abcd_ns.engine.space.culling import bounds_of
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store import ParameterStore

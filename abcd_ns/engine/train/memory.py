@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import psutil
 import torch
 
+from abcd_ns.engine.gaussians.spherical_harmonics import NUMBERS_WITHOUT_COLOR
 from abcd_ns.engine.layers.painter import LEAST_PASS
 from abcd_ns.engine.layers.visit_layers import BYTES_PER_PIXEL, PARTS_BYTES
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
@@ -165,7 +166,7 @@ class OutOfRoomError(UserError):
 
 def parameter_bytes(sh_degree: int) -> int:
     """Of one Gaussian: 59 floats with spherical harmonics of degree 3."""
-    return FLOAT * (11 + 3 * (sh_degree + 1) ** 2)
+    return FLOAT * (NUMBERS_WITHOUT_COLOR + 3 * (sh_degree + 1) ** 2)
 
 
 def bytes_for(gaussians: int, sh_degree: int) -> int:

@@ -23,7 +23,7 @@ from abcd_ns.cli.report.plan import make_plan, push_apart
 from abcd_ns.cli.report.run_folder import open_run
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.cli.report.svg import DARK
-from abcd_ns.engine.gaussians.sh_degrees import count_parameters
+from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest

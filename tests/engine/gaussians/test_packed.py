@@ -7,7 +7,7 @@ import torch
 
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import DEGREES, DRAWN
-from abcd_ns.engine.gaussians.sh_degrees import count_parameters
+from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import random_gaussians
 

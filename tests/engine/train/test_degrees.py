@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from abcd_ns.engine.gaussians.sh_degrees import count_parameters, degrees_in_use
-from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows
+from abcd_ns.engine.gaussians.spherical_harmonics import (
+    SH_C0,
+    count_parameters,
+    degrees_in_use,
+    sh_basis_rows,
+)
 from abcd_ns.engine.train.density import degrees
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.degrees import GONE, lowered

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
-from abcd_ns.engine.gaussians.sh_degrees import up_to_degree
-from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, sh_degree_of, up_to_degree
 from abcd_ns.engine.train.density.shedding import WEIGHED, fills
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
@@ -60,7 +59,7 @@ class Lowered(NamedTuple):
 def are_gone(gone: Float[Tensor, "n"], features_rest: Float[Tensor, "n k 3"]) -> Bool[Tensor, "n k 1"]:
     """Which coefficients are."""
     coefficients = features_rest.shape[1]
-    return ~up_to_degree(_highest(coefficients) - gone, coefficients)[..., None]
+    return ~up_to_degree(sh_degree_of(coefficients) - gone, coefficients)[..., None]
 
 
 @torch.no_grad()
@@ -125,7 +124,7 @@ def _lowered(
         weight: pixels in all views; NaN for who is not judged, which no comparison finds to be less.
     """
     values = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
-    highest = _highest(gaussians.features_rest.shape[1])
+    highest = gaussians.sh_degree
     gram = _gram(gaussians, cameras, values.shape[1])
     before, least = highest - gone, torch.full_like(weight, torch.inf)
     best, degree = values, before
@@ -172,7 +171,3 @@ def _gram(gaussians: Gaussians, cameras: _Cameras, bases: int) -> Float[Tensor, 
     harmonics = sh_basis_rows(*(part / distance for part in away))[: bases - 1]
     basis = torch.stack((torch.full_like(distance, SH_C0), *harmonics), dim=2)
     return (basis * counts[..., None]).mT @ basis
-
-
-def _highest(coefficients: int) -> int:
-    return round((coefficients + 1) ** 0.5) - 1
