@@ -109,10 +109,10 @@ class Painter:
         return Frusta(seen, self.rasterizer.slack)
 
     def units(self, exclude: int | None = None) -> tuple[int, ...]:
-        """Nodes of the tree that together hold every block but `exclude`, each to be drawn in one pass.
+        """Nodes of the tree that tile space and hold every block but `exclude`, each to be drawn in one pass.
 
-        By fragments they tile space: where no other node holds the cell of `exclude` it is one of them, for
-        what reaches into it.
+        Where no other node holds the cell of `exclude` it is one of them: by fragments for what reaches into
+        it, by means for its place in the order.
         """
         return tuple(self._descend(0, exclude))
 
@@ -202,9 +202,11 @@ class Painter:
     ) -> FrozenLayers:
         by_means = self.ownership == "means"
         span = None if by_means else self.span(unit, seen.view, seen.crop)
-        layer = self._draw(gaussians, seen.view, seen.crop, settings, span)
-        nothing = self._nothing(seen.view, seen.crop)
-        front = not by_means or active is None or self._is_in_front(unit, active, seen.view)
+        with torch.no_grad():
+            raster = self.rasterizer(gaussians, seen.view, crop=seen.crop, z_window=span, **vars(settings))
+        layer, nothing = raster.layer, self._nothing(seen.view, seen.crop)
+        others = (unit,) if active is None else (unit, self.tree.node_of(active))
+        front = not by_means or self.order(others, seen.view)[0] == unit
         return FrozenLayers(layer, nothing) if front else FrozenLayers(nothing, layer)
 
     def span(self, unit: int, view: View, crop: Crop) -> ZWindow:
@@ -237,13 +239,10 @@ class Painter:
             parts[node] = _over(parts.pop(near), parts.pop(far))
 
     def fold(self, parts: dict[int, FrozenLayers | None], view: View, crop: Crop) -> FrozenLayers:
-        """All parts collapsed into one layer in front of the active block and one behind, and what is
-        inside in one."""
-        folded: FrozenLayers | None = None
-        for unit in self.order(tuple(parts), view):
-            folded = _over(folded, parts[unit])
+        """What `fold_up` has made of all units: one layer in front of the active block and one behind, and
+        what is inside in one."""
         nothing = self._nothing(view, crop)
-        return folded or FrozenLayers(nothing, nothing)
+        return parts[0] or FrozenLayers(nothing, nothing)
 
     def picture(self, view: View, settings: PaintSettings, crop: Crop | None = None) -> Layer:
         """The whole scene through layers, unit by unit: the composited render."""
@@ -255,35 +254,20 @@ class Painter:
             self.fold_up(parts, unit, view)
         return self.fold(parts, view, crop).front
 
-    def _draw(
-        self, gaussians: Gaussians, view: View, crop: Crop, settings: PaintSettings, window: ZWindow | None
-    ) -> Layer:
-        if len(gaussians) == 0:
-            return self._nothing(view, crop)
-        with torch.no_grad():
-            return self.rasterizer(gaussians, view, crop=crop, z_window=window, **vars(settings)).layer
-
     def _nothing(self, view: View, crop: Crop) -> Layer:
         return empty_layer(crop.height, crop.width, self.device, view.viewmat.dtype)
 
     def _descend(self, node: int, exclude: int | None) -> Iterator[int]:
-        blocks = [block for block in self.tree.leaves(node) if block != exclude]
-        if not blocks:
-            # What others' Gaussians do in the active cell, before or behind the window, is no other unit's.
-            if self.ownership == "fragments" and node != 0:
-                yield node
-            return
+        leaves = self.tree.leaves(node)
+        blocks = [block for block in leaves if block != exclude]
         # By means, a node around the active block would be neither in front of it nor behind it.
-        whole = self.ownership == "fragments" or len(blocks) == len(self.tree.leaves(node))
+        whole = self.ownership == "fragments" or len(blocks) == len(leaves)
         fits = sum(map(self.scene.count, blocks)) <= self._pass_gaussians
-        if whole and (fits or len(self.tree.leaves(node)) == 1):
+        if len(leaves) == 1 or (whole and fits):
             yield node
             return
         yield from self._descend(int(self.tree.left[node]), exclude)
         yield from self._descend(int(self.tree.right[node]), exclude)
-
-    def _is_in_front(self, unit: int, active: int, view: View) -> bool:
-        return self.order((unit, self.tree.node_of(active)), view)[0] == unit
 
 
 def _over(front: FrozenLayers | None, behind: FrozenLayers | None) -> FrozenLayers | None:

@@ -117,9 +117,7 @@ class VisitLayers:
         """All units one after the other, each for all of these views: the device holds one at a time."""
         self._find_windows(views)
         block = self._geometry.block
-        # By means no unit holds the active block's own place in the order; nothing stands there.
-        own_place = {} if self._own is not None else {self._painter.tree.node_of(block): None}
-        parts: dict[int, dict[int, FrozenLayers | None]] = {view: dict(own_place) for view in views}
+        parts: dict[int, dict[int, FrozenLayers | None]] = {view: {} for view in views}
         for unit in self._units:
             loaded = self._painter.load(unit, exclude=block, seen_by=self._seen_by)
             self._loaded[unit] = len(loaded.gaussians)

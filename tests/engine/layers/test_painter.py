@@ -164,7 +164,10 @@ def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pa
         ]
         for window in windows:
             seen = [Seen(view, view.full, window)]
-            parts = {unit: next(paint.paint(unit, loaded[unit], seen, SETTINGS, active=3)) for unit in units}
+            parts = {}
+            for unit in units:
+                parts[unit] = next(paint.paint(unit, loaded[unit], seen, SETTINGS, active=3))
+                paint.fold_up(parts, unit, view)
             cut = paint.fold(parts, view, view.full)
             splats = cut.inside.planes if cut.inside is not None else torch.zeros(2, 0)
             assert splats.unique(dim=1).shape == splats.shape
