@@ -8,7 +8,7 @@ import torch
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore
 from abcd_ns.engine.layers.painter import Painter
 from abcd_ns.engine.render.projection import Splats
-from abcd_ns.engine.train import memory
+from abcd_ns.engine.train import layer_source, memory
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import whole_scene
@@ -89,7 +89,8 @@ def test_where_steps_take_much_memory_layers_are_drawn_for_more_views_at_once(
     tmp_path, start, views, photos, monkeypatch, floats, groups
 ):
     """Each time that blocks around the one that is visited are read, some are copied to the device anew."""
-    monkeypatch.setattr(memory, "PARTS_BYTES", 1)
+    for module in (memory, layer_source):
+        monkeypatch.setattr(module, "PARTS_BYTES", 1)
     monkeypatch.setattr(memory, "PIXEL_FLOATS", floats)
     options = {"density": DensityConfig(strategy="off"), "warmup": 0.0, "pass_gaussians": 1, "steps": 1}
     coordinator = on_device(tmp_path, start, views, blocks=4, **options)

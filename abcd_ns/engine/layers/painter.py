@@ -25,6 +25,11 @@ from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.types import Crop, Gaussians, Layer, View
 
 Ownership = Literal["fragments", "means"]
+PARTS_BYTES = 256 << 20
+"""Size of the layers held while units are folded, at most, unless those of a single view are larger, or there
+is more room for them. Each group of views that has room loads the scene once."""
+BYTES_PER_PIXEL = 32
+"""Of a front and a back layer in float32, or of one with its depth."""
 LEAST_PASS = 200_000
 """Gaussians: so many are drawn in one pass wherever blocks are small."""
 

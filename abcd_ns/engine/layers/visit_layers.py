@@ -8,7 +8,15 @@ from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
-from abcd_ns.engine.layers.painter import FrozenLayers, Loaded, Painter, PaintSettings, Seen
+from abcd_ns.engine.layers.painter import (
+    BYTES_PER_PIXEL,
+    PARTS_BYTES,
+    FrozenLayers,
+    Loaded,
+    Painter,
+    PaintSettings,
+    Seen,
+)
 from abcd_ns.engine.render import Rasterizer, ZWindow
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.together import runs
@@ -16,11 +24,6 @@ from abcd_ns.engine.space.visibility import footprint
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
 
-PARTS_BYTES = 256 << 20
-"""Size of the layers held while units are folded, at most, unless those of a single view are larger, or the
-steps that follow take more. Each group of views that has room loads the scene around the block once."""
-BYTES_PER_PIXEL = 32
-"""Of a front and a back layer in float32."""
 CROP_MARGIN = SSIM_WINDOW - 1
 """Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
 CROP_ALIGN = 16

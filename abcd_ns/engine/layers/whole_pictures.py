@@ -15,15 +15,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.layers.compositing import empty_layer, fold, sandwich
-from abcd_ns.engine.layers.painter import Loaded, Painter, PaintSettings
+from abcd_ns.engine.layers.painter import BYTES_PER_PIXEL, PARTS_BYTES, Loaded, Painter, PaintSettings
 from abcd_ns.engine.render import Raster, Shot
 from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.types import Layer, View
-
-LAYERS_BYTES = 256 << 20
-"""Of the layers that are held until a picture's gradient is known, unless a single view has more."""
-BYTES_PER_PIXEL = 32
-"""Of a layer with its depth, in float32."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,7 @@ class WholePictures:
         layers_bytes: size of the layers held at a time.
     """
 
-    def __init__(self, painter: Painter, settings: PaintSettings, layers_bytes: int = LAYERS_BYTES) -> None:
+    def __init__(self, painter: Painter, settings: PaintSettings, layers_bytes: int = PARTS_BYTES) -> None:
         self._painter, self._settings, self._layers_bytes = painter, settings, layers_bytes
         self._units = painter.units()
 

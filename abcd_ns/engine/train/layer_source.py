@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from abcd_ns.engine.events import LayersDrawn
 from abcd_ns.engine.layers.layer_store import LAYER_BYTES, LayerStore
-from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
-from abcd_ns.engine.layers.visit_layers import PARTS_BYTES, VisitLayers
+from abcd_ns.engine.layers.painter import PARTS_BYTES, Painter, PaintSettings, default_pass
+from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.train.memory import free_bytes, needs_of
 from abcd_ns.engine.train.run import TrainingRun
@@ -52,31 +52,47 @@ class LayerSource:
         if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
             return None
         views_in_use = run.views_at(active.reduction)
-        painter = Painter(
-            self._around(),
-            list(views_in_use.values()),
-            run.rasterizer,
-            ownership=config.recipe.ownership,
-            pass_gaussians=config.limits.pass_gaussians or default_pass(run.scene),
-            device=run.device,
-        )
+        painted = list(views_in_use.values())
         layers = VisitLayers(
-            painter,
+            painter_of(run, self._around(), painted),
             LayerStore(run.device, self.room.device, self.room.ram),
             active.geometry,
             run.scene.gaussians_at_rest(active.geometry.block),
             views_in_use,
             PaintSettings(active.sh_degree, config.antialiased),
             window_weight=config.window_weight,
-            parts_bytes=self._parts_bytes(views_in_use.values()),
+            parts_bytes=parts_bytes(run, painted, blocks=2),
         )
         wanted = dict.fromkeys(views)
         for done, _ in enumerate(layers.draw(wanted), start=1):
             run.announce(LayersDrawn(active.number, done, len(wanted)))
         return layers
 
-    def _parts_bytes(self, views: Iterable[View]) -> int:
-        if self._run.device.type == "cpu":  # where a block is loaded from RAM to RAM
-            return PARTS_BYTES
-        needs = needs_of(self._run.config, max(view.full.pixels for view in views), 2)
-        return min(needs.parts_bytes, max(PARTS_BYTES, free_bytes(self._run.device) // 2))
+
+def painter_of(run: TrainingRun, scene: BlockScene, views: list[View]) -> Painter:
+    """What draws a scene as the run's options have it.
+
+    Args:
+        scene: the run's, or what it would be.
+    """
+    return Painter(
+        scene,
+        views,
+        run.rasterizer,
+        ownership=run.config.recipe.ownership,
+        pass_gaussians=run.config.limits.pass_gaussians or default_pass(scene),
+        device=run.device,
+    )
+
+
+def parts_bytes(run: TrainingRun, views: Iterable[View], blocks: int, share: float = 1.0) -> int:
+    """Size of the layers that may be held while units are folded.
+
+    Args:
+        blocks: that steps train by, one or several.
+        share: of what an accelerator has for them.
+    """
+    if run.device.type == "cpu":  # where a block is loaded from RAM to RAM
+        return PARTS_BYTES
+    needs = needs_of(run.config, max(view.full.pixels for view in views), blocks)
+    return max(PARTS_BYTES, int(share * min(needs.parts_bytes, free_bytes(run.device) // 2)))

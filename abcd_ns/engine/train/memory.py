@@ -12,8 +12,7 @@ import psutil
 import torch
 
 from abcd_ns.engine.gaussians.spherical_harmonics import NUMBERS_WITHOUT_COLOR
-from abcd_ns.engine.layers.painter import LEAST_PASS
-from abcd_ns.engine.layers.visit_layers import BYTES_PER_PIXEL, PARTS_BYTES
+from abcd_ns.engine.layers.painter import BYTES_PER_PIXEL, LEAST_PASS, PARTS_BYTES
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.train.config import TrainingConfig

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.layers.painter import Painter, PaintSettings
-from abcd_ns.engine.layers.whole_pictures import BYTES_PER_PIXEL, WholePictures
+from abcd_ns.engine.layers.painter import BYTES_PER_PIXEL, Painter, PaintSettings
+from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scene import MemoryScene
