@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.whole_pictures import WholePicture, WholePictures
+from abcd_ns.engine.layers.whole_pictures import WholePictures
+from abcd_ns.engine.render import Raster
 from abcd_ns.engine.types import View
 
 LEAST_OPACITY = 0.5
@@ -18,7 +19,7 @@ SAMPLES = 1000
 """Pixels of a view by which footprints are known."""
 
 
-def depth_of(picture: WholePicture, median: Float[Tensor, "h w"] | None = None) -> Float[Tensor, "h w"]:
+def depth_of(picture: Raster, median: Float[Tensor, "h w"] | None = None) -> Float[Tensor, "h w"]:
     """Camera z of what each pixel shows, world units. 0 where it shows too little.
 
     Args:
@@ -36,7 +37,7 @@ class DepthMaps:
     folder: Path
     views: list[View] = field(default_factory=list)
 
-    def add(self, view: View, picture: WholePicture, depth: Float[Tensor, "h w"]) -> None:
+    def add(self, view: View, picture: Raster, depth: Float[Tensor, "h w"]) -> None:
         """Keep what a view sees."""
         color = picture.color / (1 - picture.transmittance).clamp_min(LEAST_OPACITY)[..., None]
         number = len(self.views)

@@ -7,8 +7,8 @@ gets from each unit is added up. Layers are cut where the rays of the given pose
 fragment that moves over a border is the same in either layer, so that the gradient has no part of it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -21,31 +21,11 @@ from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.types import Layer, View
 
 
-@dataclass(frozen=True)
-class WholePicture:
-    """The scene as one view sees it, on black."""
-
-    color: Float[Tensor, "h w 3"]
-    """Not clamped."""
-    transmittance: Float[Tensor, "h w"]
-    depth: Float[Tensor, "h w"]
-    """Sum of weight x camera z, world units."""
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A unit in one view."""
-
-    unit: int
-    layer: Layer
-    depth: Float[Tensor, "h w"]
-
-
 class WholePictures:
-    """Draws a scene for it, or for poses, to be judged by.
+    """Draws a scene for it, or for poses, to be judged by: on black, not clamped, with no info.
 
     Args:
-        layers_bytes: size of the layers held at a time.
+        layers_bytes: size of the layers held at a time, unless a single view has more.
     """
 
     def __init__(self, painter: Painter, settings: PaintSettings, layers_bytes: int = PARTS_BYTES) -> None:
@@ -58,14 +38,14 @@ class WholePictures:
         return list(runs(views, [view.full for view in views], pixels))
 
     @torch.no_grad()
-    def draw(self, views: Sequence[View]) -> Iterator[WholePicture]:
+    def draw(self, views: Sequence[View]) -> Iterator[Raster]:
         """What each view sees, in order; the scene is read once for each of `groups`."""
         for group in self.groups(views):
             for view, own in zip(group, self._draw(group), strict=True):
-                yield self._picture(view, self._in_order(view, own))
+                yield self._picture(view, own)
 
     def differentiate(
-        self, views: Sequence[View], gradient: Callable[[View, WholePicture], Float[Tensor, "h w 3"]]
+        self, views: Sequence[View], gradient: Callable[[View, Raster], Float[Tensor, "h w 3"]]
     ) -> list[Float[Tensor, "4 4"]]:
         """The gradient of a loss by each view's world-to-camera matrix, all of whose entries count as free.
 
@@ -82,7 +62,7 @@ class WholePictures:
     def backward(
         self,
         views: Sequence[View],
-        gradient: Callable[[View, WholePicture], Float[Tensor, "h w 3"]],
+        gradient: Callable[[View, Raster], Float[Tensor, "h w 3"]],
         after: Callable[[], None] = lambda: None,
     ) -> None:
         """Leave the gradient of a loss, added up over views, in what of views and of the scene are leaves.
@@ -99,36 +79,38 @@ class WholePictures:
                 after()
             return
         parts = self._draw(views)
-        pulls = []
-        for view, own in zip(views, parts, strict=True):
-            own[:] = self._in_order(view, own)
-            pulls.append(gradient(view, self._picture(view, own)))
+        pulls = [gradient(view, self._picture(view, own)) for view, own in zip(views, parts, strict=True)]
         for unit in self._units:
             loaded = self._load(unit, views)
             for view, own, pull in zip(views, parts, pulls, strict=True):
-                self._differentiate(unit, loaded, view, own, pull)
+                if unit in own:
+                    self._differentiate(unit, loaded, view, own, pull)
                 after()
 
     def _backward_through_one(self, loaded: Loaded, view: View, gradient: Callable) -> None:
         """As `backward`, for a view, where one unit is all: it is drawn once."""
         (unit,) = self._units
         raster = self._raster(unit, loaded, view) if loaded.shows_in(view) else None
-        pull = gradient(view, self._picture(view, [] if raster is None else [_part(unit, raster)]))
+        pull = gradient(view, self._picture(view, {} if raster is None else {unit: _part(raster)}))
         if raster is not None:
             raster.color.backward(pull, retain_graph=True)  # views share what leads to the loaded Gaussians
 
     def _load(self, unit: int, views: Sequence[View]) -> Loaded:
         return self._painter.load(unit, seen_by=self._painter.frusta((still(v), v.full) for v in views))
 
-    def _draw(self, views: Sequence[View]) -> list[list[_Part]]:
-        parts: list[list[_Part]] = [[] for _ in views]
+    @torch.no_grad()
+    def _draw(self, views: Sequence[View]) -> list[dict[int, Raster]]:
+        """Of each view, the units that show in it, front to back."""
+        parts: list[dict[int, Raster]] = [{} for _ in views]
         for unit in self._units:
             loaded = self._load(unit, views)
             for view, own in zip(views, parts, strict=True):
                 if loaded.shows_in(view):
-                    with torch.no_grad():
-                        own.append(_part(unit, self._raster(unit, loaded, view)))
-        return parts
+                    own[unit] = _part(self._raster(unit, loaded, view))
+        return [
+            {unit: own[unit] for unit in self._painter.order(tuple(own), still(view))}
+            for view, own in zip(views, parts, strict=True)
+        ]
 
     def _raster(self, unit: int, loaded: Loaded, view: View) -> Raster:
         window = None
@@ -137,31 +119,24 @@ class WholePictures:
         shot = Shot(view, view.full, None, window)
         return self._painter.rasterizer.draw(loaded.gaussians, [shot], **vars(self._settings))[0]
 
-    def _in_order(self, view: View, parts: Sequence[_Part]) -> list[_Part]:
-        order = self._painter.order([part.unit for part in parts], still(view))
-        return sorted(parts, key=lambda part: order.index(part.unit))
-
-    def _picture(self, view: View, parts: Sequence[_Part]) -> WholePicture:
+    def _picture(self, view: View, parts: Mapping[int, Raster]) -> Raster:
         device, dtype = self._painter.device, view.viewmat.dtype
         nothing = empty_layer(view.height, view.width, device, dtype)
-        whole = fold([part.layer for part in parts], like=nothing)
-        depths = [Layer(part.depth[..., None].expand(-1, -1, 3), part.layer.transmittance) for part in parts]
-        return WholePicture(whole.color, whole.transmittance, fold(depths, like=nothing).color[..., 0])
+        whole = fold([part.layer for part in parts.values()], like=nothing)
+        depths = [Layer(p.depth[..., None].expand(-1, -1, 3), p.transmittance) for p in parts.values()]
+        return Raster(whole.color, whole.transmittance, fold(depths, like=nothing).color[..., 0], {})
 
     def _differentiate(
-        self, unit: int, loaded: Loaded, view: View, parts: Sequence[_Part], pull: Tensor
+        self, unit: int, loaded: Loaded, view: View, parts: Mapping[int, Raster], pull: Tensor
     ) -> None:
-        at = next((place for place, part in enumerate(parts) if part.unit == unit), None)
-        if at is None:
-            return
-        layers, like = [part.layer for part in parts], parts[at].layer
-        front, back = fold(layers[:at], like=like), fold(layers[at + 1 :], like=like)
+        at, layers = list(parts).index(unit), [part.layer for part in parts.values()]
+        front, back = fold(layers[:at], like=layers[at]), fold(layers[at + 1 :], like=layers[at])
         picture = sandwich(front, self._raster(unit, loaded, view).layer, back, pull.new_zeros(3))
         picture.backward(pull, retain_graph=True)  # views share what leads to `loaded`
 
 
-def _part(unit: int, raster: Raster) -> _Part:
-    return _Part(unit, Layer(raster.color.detach(), raster.transmittance.detach()), raster.depth.detach())
+def _part(raster: Raster) -> Raster:
+    return Raster(raster.color.detach(), raster.transmittance.detach(), raster.depth.detach(), {})
 
 
 def still(view: View) -> View:

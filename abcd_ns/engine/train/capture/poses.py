@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from abcd_ns.engine.layers.whole_pictures import WholePicture
+from abcd_ns.engine.render import Raster
 from abcd_ns.engine.types import View
 
 Kind = Literal["off", "SO3xR3"]
@@ -94,7 +94,7 @@ def robust(residual: Float[Tensor, "h w 3"]) -> tuple[Tensor, Float[Tensor, "h w
 
 
 def step_for(
-    view: View, picture: WholePicture, weight: Float[Tensor, "h w 3"], gradient: Float64[Tensor, "6"]
+    view: View, picture: Raster, weight: Float[Tensor, "h w 3"], gradient: Float64[Tensor, "6"]
 ) -> Float64[Tensor, "6"]:
     """A step of Gauss and Newton towards less of a robust loss, damped.
 
@@ -147,7 +147,7 @@ def _cross(v: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero)).view(3, 3)
 
 
-def _flow(view: View, picture: WholePicture) -> Float[Tensor, "2 h w 6"]:
+def _flow(view: View, picture: Raster) -> Float[Tensor, "2 h w 6"]:
     """By how much each pixel's content moves, right and down, pixels, for a unit of each number of a step."""
     depth, like = picture.depth, {"dtype": picture.depth.dtype, "device": picture.depth.device}
     opacity = 1 - picture.transmittance

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.events import PhotosWanted, ShedAtEnd, Shedding
-from abcd_ns.engine.layers.whole_pictures import WholePicture
+from abcd_ns.engine.render import Raster
 from abcd_ns.engine.store.derived_scenes import ChangedScene, HeldScene
 from abcd_ns.engine.store.scene import BlockScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail
@@ -141,7 +141,7 @@ class LastShedding:
         pictures = self._whole.pictures(chosen, probe.scene)
         drawn = random_signs(run.config.seed)
 
-        def gradient(view: View, picture: WholePicture) -> Float[Tensor, "h w 3"]:
+        def gradient(view: View, picture: Raster) -> Float[Tensor, "h w 3"]:
             square, counts = self._square(view, picture)
             signs = upload(drawn(picture.color.shape), run.device).to(picture.color)
             return signs * counts / square.clamp_min(LEAST_ERROR * picture.color.numel()).sqrt()
@@ -175,7 +175,7 @@ class LastShedding:
             found.append(-10 * error.clamp_min(LEAST_ERROR).log10())
         return float(torch.stack(found).mean())
 
-    def _square(self, view: View, picture: WholePicture) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 1"]]:
+    def _square(self, view: View, picture: Raster) -> tuple[Float[Tensor, ""], Float[Tensor, "h w 1"]]:
         """The squared error of a picture, summed over the pixels that count, and which these are."""
         seen, photo, counts = self._whole.beside(view, picture.color.detach())
         return ((seen.clamp(0, 1) - photo) * counts).square().sum(), counts

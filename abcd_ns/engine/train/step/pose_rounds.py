@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.events import PhotosWanted
-from abcd_ns.engine.layers.whole_pictures import WholePicture
+from abcd_ns.engine.render import Raster
 from abcd_ns.engine.train.capture.poses import by_step, robust, step_for
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -59,9 +59,9 @@ class PoseRounds:
         pictures = self._whole.pictures(views, run.scene)
         for group in pictures.groups(views):
             run.announce(PhotosWanted(tuple(view.index for view in group)))
-            judged: dict[int, tuple[WholePicture, Tensor]] = {}
+            judged: dict[int, tuple[Raster, Tensor]] = {}
 
-            def gradient(view: View, picture: WholePicture, judged=judged) -> Tensor:
+            def gradient(view: View, picture: Raster, judged=judged) -> Tensor:
                 found, weight = self._judge(view, picture)
                 judged[view.index] = picture, weight
                 return found
@@ -74,7 +74,7 @@ class PoseRounds:
         run.take_poses()
         run.state.posed = run.state.uses
 
-    def _judge(self, view: View, picture: WholePicture) -> tuple[Float[Tensor, "h w 3"], Tensor]:
+    def _judge(self, view: View, picture: Raster) -> tuple[Float[Tensor, "h w 3"], Tensor]:
         """The gradient of the loss by the picture, and the weight of each pixel."""
         shown = picture.color.detach().requires_grad_()
         seen, photo, counts = self._whole.beside(view, shown)
