@@ -39,23 +39,15 @@ def weights(
     gaussians: Gaussians,
     rasterizer: Rasterizer,
     shots: Sequence[Shot],
-    fronts: Sequence[Float[Tensor, "_h _w"]] = (),
     *,
     antialiased: bool = False,
 ) -> Float[Tensor, "v n"]:
-    """For each shot the sum of each Gaussian's weights over its pixels.
-
-    Args:
-        fronts: transmittances of what lies before everything in each shot; none for nothing.
-    """
+    """For each shot the sum of each Gaussian's weights over its pixels."""
     if not len(gaussians):
         return gaussians.means.new_zeros(len(shots), 0)
     rasters = rasterizer.draw(gaussians.detach(), shots, sh_degree=0, antialiased=antialiased, weigh=True)
-    depths = [raster.depth for raster in rasters]
-    if fronts:
-        depths = [depth * front for depth, front in zip(depths, fronts, strict=True)]
     leaves = {id(raster.info): raster.info["weights"] for raster in rasters}
-    found = torch.autograd.grad(sum(depth.sum() for depth in depths), list(leaves.values()))
+    found = torch.autograd.grad(sum(raster.depth.sum() for raster in rasters), list(leaves.values()))
     # Shots that share an info are its cameras, in their order.
     rows = {info: iter(each) for info, each in zip(leaves, found, strict=True)}
     return torch.stack([next(rows[id(raster.info)]) for raster in rasters])
@@ -81,10 +73,14 @@ def share_shown(
     *,
     antialiased: bool = False,
 ) -> float:
-    """The influence of some Gaussians on the view of a shot that shows all of them; see `weights`."""
-    fronts = () if front is None else (front,)
-    found = weights(gaussians, rasterizer, [shot], fronts, antialiased=antialiased)
-    return round(float(found.sum()) / shot.view.full.pixels, DIGITS)
+    """The influence of some Gaussians on the view of a shot that shows all of them.
+
+    Args:
+        front: transmittance of what lies before everything; None for nothing.
+    """
+    found = weights_by_pixel(gaussians, rasterizer, shot, antialiased=antialiased)
+    shown = found if front is None else found * front
+    return round(float(shown.sum()) / shot.view.full.pixels, DIGITS)
 
 
 def influence(

@@ -11,6 +11,7 @@ from abcd_ns.engine.space.influence import (
     coarser,
     influence,
     overlap,
+    share_shown,
     weights,
     weights_by_pixel,
     worth_training,
@@ -64,9 +65,11 @@ def test_what_stands_in_front_takes_its_share(rasterizer):
     gaussians, (view,) = random_gaussians(20, seed=2, size=0.2), ring_of_views(1)
     shot = Shot(view, view.full)
     (bare,) = weights(gaussians, rasterizer, [shot])
-    (half,) = weights(gaussians, rasterizer, [shot], [torch.full((view.height, view.width), 0.5)])
-    assert float(bare.sum()) > 1
-    torch.testing.assert_close(half, bare / 2)
+    whole = share_shown(gaussians, rasterizer, shot, None)
+    half = share_shown(gaussians, rasterizer, shot, torch.full((view.height, view.width), 0.5))
+    assert whole == pytest.approx(float(bare.sum()) / view.full.pixels, abs=2e-6)
+    assert half == pytest.approx(whole / 2, abs=2e-6)
+    assert whole > 1e-3
 
 
 def test_weights_by_pixel_are_what_is_painted_white_among_what_is_frozen(rasterizer):
