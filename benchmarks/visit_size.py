@@ -98,7 +98,7 @@ def measure(args: Args, folder: Path) -> tuple[Counter, dict[str, float]]:
         if coordinator.state.visit == 1 and coordinator.state.active is None:
             clock.seconds.clear()
         take_step(coordinator, photo)
-        if coordinator.visit.steps.layers is not None:
+        if coordinator.visit.layers is not None:
             layers = coordinator.layer_bytes
     state, drawn = coordinator.state, coordinator.batch * args.steps
     known = {"views": events[-1].views, "drawn": drawn, "layer_bytes": layers}

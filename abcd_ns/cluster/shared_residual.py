@@ -23,7 +23,7 @@ from abcd_ns.engine.space.influence import Influence, weights_by_pixel
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample
-from abcd_ns.engine.train.step.drawing import StepDrawing
+from abcd_ns.engine.train.visit_training import VisitTraining
 from abcd_ns.engine.types import Gaussians
 
 FAINT = 0.01
@@ -81,13 +81,13 @@ class SharedResidual:
     def __init__(
         self,
         run: TrainingRun,
-        steps: StepDrawing,
+        training: VisitTraining,
         own: Callable[[], Gaussians],
         beside: Mapping[int, float],
         room: LayerRoom,
     ) -> None:
-        self._run, self._steps, self._own, self._beside = run, steps, own, beside
-        self._degree, self._store = steps.degree, LayerStore(run.device, room.device, room.ram)
+        self._run, self._training, self._own, self._beside = run, training, own, beside
+        self._degree, self._store = training.degree, LayerStore(run.device, room.device, room.ram)
         if beside:
             gaussians = own().to(run.device)
             for view in beside:
@@ -110,7 +110,7 @@ class SharedResidual:
     @torch.no_grad()
     def _draw(self, own: Gaussians, view: int) -> Float[Tensor, "1 h w 5"]:
         """What the rasterizer drew of a view, and the block's shares of it."""
-        run, sample = self._run, self._steps.whole(view)
+        run, sample = self._run, self._training.whole(view)
         options = {"antialiased": run.config.antialiased}
         (raster,) = run.rasterizer.draw(own, [sample.shot], sh_degree=self._degree, **options)
         weights = weights_by_pixel(own, run.rasterizer, sample.shot, **options)

@@ -112,7 +112,7 @@ class VisitWorker:
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
         training = VisitTraining(run, OnLease(run, task, len(state)), LayerSource(run, layers))
         training.attach(run.active)
-        shared = SharedResidual(run, training.steps, scene.as_drawn, task.beside, pictures)
+        shared = SharedResidual(run, training, scene.as_drawn, task.beside, pictures)
         while not training.is_over:
             self._take_step(training, shared)
         active, block = run.active, run.active.geometry.block

@@ -61,7 +61,7 @@ def test_all_blocks_begin_with_the_picture_of_the_whole_scene_and_share_it(make,
     def watched(shared, own, view):
         found = draw(shared, own, view)
         block = shared._run.active.geometry.block
-        sample = shared._steps.whole(view)
+        sample = shared._training.whole(view)
         if (block, view) not in begun:
             begun[block, view] = sample, found[0].float(), shared._degree
         return found

@@ -81,7 +81,7 @@ def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat, b
     for width in (48, 96):
         options = {"gaussians": 60, "width": width, "size": 0.2, "blocks": blocks, "pass_gaussians": 1}
         coordinator, _ = run_on(tmp_path / str(width), **options)
-        layers, view = coordinator.visit.steps.layers, coordinator.state.active.geometry.views[0]
+        layers, view = coordinator.visit.layers, coordinator.state.active.geometry.views[0]
         layers._store = LayerStore(DEVICE, 1 << 30)
         held = simulated_gsplat.live_bytes
         simulated_gsplat.reset_peak()

@@ -1,7 +1,7 @@
 """Block coordinate descent: visits blocks one after the other and trains each within its surroundings.
 
 The coordinator is made of what gives it blocks (`Visits`), layers (`LayerSource`) and gradients
-(`StepDrawing`). What is not live lies at rest in the store; listeners are told what happens.
+(`VisitTraining`). What is not live lies at rest in the store; listeners are told what happens.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Planner, Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.step.batch import Batch, Rendered, Sample, Target
+from abcd_ns.engine.train.step.batch import Batch, Pictures, Rendered, Sample, Target
 from abcd_ns.engine.train.step.last_shedding import LastShedding
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
@@ -84,12 +84,7 @@ class Coordinator(Trainer):
         """Draw the active block between its layers; differentiable in the live parameters."""
         return self.visit.render(batch)
 
-    def loss(
-        self,
-        batch: Batch,
-        pictures: Sequence[Float[Tensor, "_h _w 3"]],
-        photos: Sequence[Float[Tensor, "_h _w 3"]],
-    ) -> Float[Tensor, ""]:
+    def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         """The loss of a step, over what says something about the block."""
         return self.visit.loss(batch, pictures, photos)
 
@@ -169,8 +164,7 @@ class Coordinator(Trainer):
     @property
     def layer_bytes(self) -> int:
         """Bytes that the layers of the visit that is under way take."""
-        layers = self.visit.steps.layers
-        return layers.nbytes if layers else 0
+        return self.visit.layers.nbytes if self.visit.layers else 0
 
     def rest(self, within: float) -> None:
         """Put the live block to rest under a name of its own, and the run's state."""

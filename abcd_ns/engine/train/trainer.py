@@ -13,7 +13,7 @@ from torch import Tensor
 from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import RunState, Stopwatch
-from abcd_ns.engine.train.step.batch import Batch, Rendered
+from abcd_ns.engine.train.step.batch import Batch, Pictures, Rendered
 from abcd_ns.engine.types import View
 
 
@@ -42,12 +42,7 @@ class Trainer(ABC):
         """The pictures of a batch, with gradients."""
 
     @abstractmethod
-    def loss(
-        self,
-        batch: Batch,
-        pictures: Sequence[Float[Tensor, "_h _w 3"]],
-        photos: Sequence[Float[Tensor, "_h _w 3"]],
-    ) -> Float[Tensor, ""]:
+    def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         """The loss of a step."""
 
     @abstractmethod

@@ -1,24 +1,44 @@
 """The training of one visit's block, from its first step to its last: by whoever has the block."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import StepTaken, VisitBegan
+from abcd_ns.engine.events import PhotosWanted, StepTaken, VisitBegan
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.gaussians.param_swap import Pace
-from abcd_ns.engine.space.influence import InfluenceTable
+from abcd_ns.engine.gaussians.param_swap import Pace, live_gaussians
+from abcd_ns.engine.layers.visit_layers import VisitLayers
+from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import RESERVE
-from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST, gradients_of
+from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST, Use, gradients_of
+from abcd_ns.engine.train.density.shedding import PASSES, weighed
+from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.planner import Visits
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.schedule import exponential_decay, settling, warm_up_is_over
-from abcd_ns.engine.train.step.batch import Batch, Rendered
-from abcd_ns.engine.train.step.drawing import StepDrawing
+from abcd_ns.engine.train.schedule import (
+    endless_order,
+    exponential_decay,
+    settling,
+    view_order,
+    views_per_step,
+    warm_up_is_over,
+)
+from abcd_ns.engine.train.step.batch import (
+    COMING,
+    Backgrounds,
+    Batch,
+    Pictures,
+    Rendered,
+    Sample,
+    part_to_draw,
+)
 from abcd_ns.engine.train.step.live_block import LiveBlock
+from abcd_ns.engine.train.step.normal_consistency import BEGINS, normal_consistency
+from abcd_ns.engine.types import Crop, View
 
 
 class VisitTraining:
@@ -37,17 +57,20 @@ class VisitTraining:
         source: LayerSource,
         live: LiveBlock | None = None,
     ) -> None:
-        self.run, self._visits = run, visits
-        self.steps = StepDrawing(run, source)
+        self.run, self._visits, self._source = run, visits, source
         self.live = LiveBlock(run) if live is None else live  # one that is empty yet is false
+        self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
+        self._backgrounds = Backgrounds(run.config, run.device)
+        self._order: tuple[int, ...] = ()
 
     @property
     def batch(self) -> int:
         """Views in a step of the visit that is under way."""
-        return self.steps.batch
+        config = self.run.config
+        return views_per_step(config.batch, self.run.blocks, config.limits.batch_limit)
 
     def attach(self, active: ActiveVisit) -> None:
         """Make the block of the run's active visit live and draw its layers, at its beginning or where a save
@@ -61,15 +84,29 @@ class VisitTraining:
             self.influence = InfluenceTable(run.scene.tree, run.views, state.influence, run.device)
         run.announce(VisitBegan(active.number, state.sweep, block, active.steps, seen, gaussians))
         before = run.stopwatch.seconds
-        self.steps.begin_visit(active)
+        # None where nobody knows how many steps it will have, and its views are drawn in turn.
+        taken = 0 if active.is_alone else active.steps * self.batch
+        self._order = view_order(active.views, taken, active.number, run.config.seed)
+        self.layers = self._source.draw(active, self._order[active.done * self.batch :])
         active.layer_seconds += run.stopwatch.seconds - before
-        if active.done == 0 and self.steps.layers is not None:
-            state.count_drawn(gaussians, self.steps.layers.frozen)
+        if active.done == 0 and self.layers is not None:
+            state.count_drawn(gaussians, self.layers.frozen)
         if active.done == 0 and active.looked_at:
-            state.influence[block].update(self.steps.shown_in(active.looked_at))
+            state.influence[block].update(self._shown_in(active.looked_at))
+
+    def _shown_in(self, views: Sequence[int]) -> dict[int, float]:
+        """The influence that the block has on each of these views by now."""
+        run, shown, live = self.run, {}, live_gaussians(self.run.params)
+        for view in views:
+            seen, options = self.whole(view), {"antialiased": run.config.antialiased}
+            shown[view] = share_shown(live, run.rasterizer, seen.shot, seen.in_front, **options)
+        return shown
+
+    # -- a step --------------------------------------------------------------------------------------
 
     def next_batch(self) -> Batch:
-        """Set the learning rates, and say what to train on next."""
+        """Set the learning rates, and say what to train on next; listeners are told the views of the steps to
+        come, too."""
         run = self.run
         decay = exponential_decay(run.share, 1.0, run.config.means_lr_decay)
         # A first visit, perhaps the only one, has all.
@@ -77,20 +114,36 @@ class VisitTraining:
         trained = self.live.clocks.adam_views
         damping = run.health.damping * (settling(run.progress, trained) if settles else 1.0)
         self._pace.set(self.batch, trained, decay, damping)
-        return self.steps.next_batch()
+        step, first = run.state.step, run.active.done * self.batch
+        views = self._views_of(range(first, first + self.batch + COMING))
+        run.announce(PhotosWanted(views))
+        now = enumerate(views[: self.batch])
+        return Batch(step, tuple(self._sample(view, place, step) for place, view in now))
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
-        return self.steps.render(batch)
+        rendered = self._draw(batch.samples)
+        if not self.run.active.shown:
+            for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
+                self.run.health.see(share_of_picture(sample.in_front, own))
+        return rendered
 
-    def loss(
-        self,
-        batch: Batch,
-        pictures: Sequence[Float[Tensor, "_h _w 3"]],
-        photos: Sequence[Float[Tensor, "_h _w 3"]],
-    ) -> Float[Tensor, ""]:
-        """The loss of a step, over what says something about the block."""
-        return self.steps.loss(batch, *self._visits.compared(batch, pictures, photos))
+    def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
+        """The loss of a step: photometric over what of the crops says something about the block, the mean of
+        the samples', plus what surfels and the density strategy ask for."""
+        run = self.run
+        losses = batch.losses(*self._visits.compared(batch, pictures, photos), run.config)
+        loss = sum(losses[1:], start=losses[0]) / len(losses)
+        run.health.note(
+            [(s.view.index, found.detach()) for s, found in zip(batch.samples, losses, strict=True)]
+        )
+        if run.config.normal_consistency > 0 and run.share >= BEGINS:
+            surfels = live_gaussians(run.params)
+            off = normal_consistency(surfels, batch.samples, run.rasterizer)
+            loss = loss + run.config.normal_consistency * off
+        if run.config.density.strategy == "mcmc":
+            loss = loss + run.density.regularisation(run.params, run.count())
+        return loss
 
     def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
@@ -108,7 +161,7 @@ class VisitTraining:
         self.live.count_step(self.batch, taken)
         clock = self.live.density_clock(taken, self.batch, self._visits.room())
         self.live.refine(rendered.infos if sound else (), clock)
-        if self.live.is_due_to_shed(taken):
+        if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.live.shed()
             self.live.lower_degrees()
             self.live.hold_back_giants()
@@ -159,5 +212,68 @@ class VisitTraining:
         if not active.is_whole:
             self.live.count_visit()
         state = self.run.health.end_visit(active, self.live.detached)
-        self.steps.end_visit()
+        self.layers = None
         return state
+
+    # -- what is drawn -------------------------------------------------------------------------------
+
+    def whole(self, view: int) -> Sample:
+        """All that a view shows of the block in this visit."""
+        run, active = self.run, self.run.active
+        seen, crop = run.views_at(active.reduction)[view], active.geometry.crops[view]
+        return self._sample_of(seen, crop, 0, run.state.step)
+
+    @property
+    def degree(self) -> int:
+        """The degree of spherical harmonics in this step."""
+        active = self.run.active
+        changes = active.is_alone or self.run.config.recipe.sh_restart
+        return self.run.sh_degree if changes else active.sh_degree
+
+    def _views_of(self, places: range) -> tuple[int, ...]:
+        """What is drawn at these places of the visit; fewer where it ends before."""
+        if not self._order:
+            views, seed = self.run.active.views, self.run.config.seed
+            return tuple(endless_order(views, place, seed) for place in places)
+        return self._order[places.start : places.stop]
+
+    def _sample(self, view: int, place: int, step: int) -> Sample:
+        """What is drawn at one place of a step: all that a view shows of the block, or a part."""
+        seen, active = self.run.views_at(self.run.reduction)[view], self.run.active
+        whole = seen.full if active.is_all else active.geometry.crops[view]
+        crop = part_to_draw(self.run.config, whole, step, place)
+        sample = self._sample_of(seen, crop, place, step)
+        return replace(sample, share=crop.pixels / whole.pixels)
+
+    def _sample_of(self, view: View, crop: Crop, place: int, step: int) -> Sample:
+        if self.layers and not self.layers.shows(view):
+            raise RuntimeError(f"View {view.index} has moved since its layers were drawn.")
+        layers, window = self.layers.around(view.index, crop) if self.layers else (None, None)
+        return Sample(view, crop, layers, window, self._backgrounds.at(step, place))
+
+    def _draw(self, samples: Sequence[Sample]) -> Rendered:
+        run = self.run
+        rasters = run.rasterizer.draw(
+            live_gaussians(run.params),
+            [sample.shot for sample in samples],
+            sh_degree=self.degree,
+            antialiased=run.config.antialiased,
+            absgrad=run.density.absgrad,
+            weigh=run.density.weighs,
+        )
+        if run.density.weighs:
+            pairs = zip(rasters, samples, strict=True)
+            rasters = tuple(weighed(raster, sample.in_front, sample.share) for raster, sample in pairs)
+        infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
+        run.density.before_backward(infos)
+        light = run.light
+        lights = [None if light is None else light.of(sample.view.index) for sample in samples]
+        drawn = zip(samples, rasters, lights, strict=True)
+        pictures = tuple(sample.picture(raster, transform) for sample, raster, transform in drawn)
+        uses = [
+            Use(sample.view.index, transform, sample.weight / self.batch)
+            for sample, transform in zip(samples, lights, strict=True)
+            if transform is not None
+        ]
+        views = tuple(sample.view for sample in samples)
+        return Rendered(pictures, tuple(raster.transmittance for raster in rasters), infos, uses, views)

@@ -73,9 +73,9 @@ def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start):
         coordinator = make_coordinator(folder, start, views, blocks=2, steps=10, layer_bytes=room)
         while not coordinator.finished:
             train_step(coordinator, photos)
-            if coordinator.visit.steps.layers is not None:
-                assert coordinator.visit.steps.layers.nbytes <= room
-                drawn.append((room, coordinator.visit.steps.layers.nbytes))
+            if coordinator.visit.layers is not None:
+                assert coordinator.visit.layers.nbytes <= room
+                drawn.append((room, coordinator.visit.layers.nbytes))
         results.append(whole_scene(coordinator))
     assert equal(results[0], results[1])
     assert equal(results[0], results[2])

@@ -160,7 +160,7 @@ def test_poses_stay_through_a_visit_and_its_layers_show_them(make, photos):
         train(made, photos, steps=1)
         if made.state.active is not None:
             assert torch.equal(poses_of(made.run), seen[-1])
-            layers, view = made.visit.steps.layers, made.state.active.views[0]
+            layers, view = made.visit.layers, made.state.active.views[0]
             kept = layers.around(view)[0].front
             fresh = made.source.draw(made.state.active, [view]).around(view)[0].front
             assert torch.equal(kept.color, fresh.color)

@@ -1,7 +1,7 @@
 """Shedding: a Gaussian that fills less of its views than its price is taken out.
 
 What a Gaussian weighs in a picture is the sum over pixels of alpha T, the transmittance of whatever lies
-before its block included: so many pixels it fills. Drawings that train it tell for nothing (see `weighing`).
+before its block included: so many pixels it fills. Drawings that train it tell for nothing (see `weighed`).
 Added up over the views of its block it says what would be missing without it, as RadSplat (Niemeyer et al.,
 2024) and LightGaussian (Fan et al., NeurIPS 2024) prune by the largest and by the sum of such weights when
 training ends. Here they go while it goes on, at a price that rises as growth comes to its end: those that
@@ -9,11 +9,15 @@ remain take their place, and each step costs less. Nor do those grow that could 
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from abcd_ns.engine.render import Raster
 
 WEIGHED = ("weight", "passes")
 """What is added up for each Gaussian: its weight, px, and how often it was drawn in all the views that it is
@@ -28,6 +32,32 @@ GROWS = 4.0
 """Times its price that a Gaussian fills before it is cloned or split: more than both halves must."""
 PASSES = 4
 """A block that is the whole scene sheds whenever each of its views was drawn so often."""
+
+
+class _Weigh(torch.autograd.Function):
+    """The colour as it is; whatever the loss, the depth's gradient is what a pixel counts for."""
+
+    @staticmethod
+    def forward(ctx: Any, color: Tensor, depth: Tensor, counts: Tensor) -> Tensor:  # noqa: ARG004
+        ctx.save_for_backward(counts)
+        return color.view_as(color)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        return grad, ctx.saved_tensors[0], None
+
+
+def weighed(raster: Raster, in_front: Float[Tensor, "h w"] | None, share: float) -> Raster:
+    """The same drawing; backward leaves what each Gaussian weighs in its picture in `info["weights"].grad`.
+
+    Args:
+        raster: drawn with `weigh`.
+        in_front: transmittance of what lies before it; None for nothing.
+        share: of the pixels that might have been drawn, those that are.
+    """
+    counts = torch.ones_like(raster.depth) if in_front is None else in_front.to(raster.depth)
+    return replace(raster, color=_Weigh.apply(raster.color, raster.depth, counts.detach() / share))
 
 
 def weigh(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:

@@ -22,6 +22,8 @@ from abcd_ns.engine.types import Crop, View
 
 Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
 """What a sample's picture should be, 0..1, and where that counts: [h, w, 1], None for everywhere."""
+Pictures = Sequence[Float[Tensor, "_h _w 3"]]
+"""One for each sample of a step, 0..1."""
 BACKGROUNDS = 1024
 """Steps whose backgrounds are copied to a device together."""
 COMING = 8
@@ -117,12 +119,7 @@ class Batch:
     step: int
     samples: tuple[Sample, ...]
 
-    def losses(
-        self,
-        pictures: Sequence[Float[Tensor, "_h _w 3"]],
-        photos: Sequence[Float[Tensor, "_h _w 3"]],
-        config: TrainingConfig,
-    ) -> list[Float[Tensor, ""]]:
+    def losses(self, pictures: Pictures, photos: Pictures, config: TrainingConfig) -> list[Float[Tensor, ""]]:
         """Of each sample."""
         triples = zip(self.samples, pictures, photos, strict=True)
         return [sample.loss(picture, photo, config) for sample, picture, photo in triples]

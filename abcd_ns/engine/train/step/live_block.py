@@ -12,7 +12,6 @@ from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
-from abcd_ns.engine.train.density.shedding import PASSES
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.train.memory import check_room
@@ -120,15 +119,6 @@ class LiveBlock:
         if self._held is None or self._held[0] is not gone:
             self._held = gone, are_gone(gone, rest)
         rest.grad.masked_fill_(self._held[1], 0.0)
-
-    def is_due_to_shed(self, taken: int) -> bool:
-        """Whether all that is trained at once has been drawn often enough since it last shed.
-
-        Args:
-            taken: the last step's views.
-        """
-        every, steps = PASSES * len(self._run.active.geometry.views), self.clocks.steps
-        return self._run.active.is_all and steps // every > (steps - taken) // every
 
     def density_clock(self, taken: int, batch: int, room: int | None) -> DensityClock:
         """All that decides whether to refine after a step.
