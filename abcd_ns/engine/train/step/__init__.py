@@ -1,1 +1,1 @@
-"""One step: what it draws, and the live block that it changes."""
+"""What a step is given, the live block that it changes, and whole pictures between steps."""
