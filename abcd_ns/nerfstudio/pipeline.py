@@ -207,7 +207,7 @@ class AbcdPipeline(VanillaPipeline):
         training = replace(config.training, limits=limits)
         if resumed:
             state = RunState.from_json(store.state)
-            cut_at_rest(scene, state, training.limits.block_limit, training.limits.sole_limit)
+            cut_at_rest(scene, state, training.limits)
         run = TrainingRun(
             training,
             Budget(asked.total_steps, config.max_seconds),

@@ -87,8 +87,7 @@ class TrainingConfig:
     def room(self, scene: int, block: int, blocks: int) -> int | None:
         """Gaussians that may be added to a block of so many in a scene of so many and of so many blocks; None
         for any number."""
-        limits = self.limits
-        limit = limits.block_limit if blocks > 1 else limits.sole_limit or limits.block_limit
+        limit = self.limits.of_block(blocks)
         rooms = [] if self.density.limit is None else [self.density.limit - scene]
         rooms += [limit - block] if limit else []
         return min(rooms, default=None)

@@ -196,8 +196,7 @@ def rest_after_visit(
         updates: what comes to rest of it.
         sweep: that it belongs to.
     """
-    limits = run.config.limits.block_limit, run.config.limits.sole_limit
-    tree, parts = cut_full(run.scene, updates, run.state, *limits, run.announce)
+    tree, parts = cut_full(run.scene, updates, run.state, run.config.limits, run.announce)
     run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
     block = None if active.is_whole else active.geometry.block
     staying = len(state) if block is None else len(updates[block])

@@ -70,3 +70,7 @@ class Limits:
     the beginning."""
     pass_gaussians: int = 0
     """Frozen Gaussians drawn in one pass at most; 0 takes twice the largest block, at least 200,000."""
+
+    def of_block(self, blocks: int) -> int:
+        """Gaussians that a block may hold in a scene of so many; 0 is no limit."""
+        return (self.sole_limit if blocks == 1 else 0) or self.block_limit

@@ -9,6 +9,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.splitting import FULL, cut_at_rest, split_full
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.training_loop import train, train_step
@@ -28,7 +29,7 @@ def test_parts_are_small_enough_and_hold_everything(limit):
     owner = tree.assign(gaussians.means)
     settled = {b: BlockState.fresh(gaussians[owner == b]) for b in range(3)}
     settled = {b: BlockState(s.gaussians, s.exp_avg, s.exp_avg_sq, {}, Clocks(b)) for b, s in settled.items()}
-    cut, parts, parents = split_full(tree, settled, limit)
+    cut, parts, parents = split_full(tree, settled, Limits(limit))
     assert all(len(state) <= FULL * limit for state in parts.values())
     assert set().union(*map(rows, parts.values())) == rows(BlockState.fresh(gaussians))
     assert cut.num_blocks == len(parts) == 3 + len(parents)
@@ -45,7 +46,7 @@ def test_what_cannot_be_parted_is_left_as_it_is():
     gaussians = random_gaussians(50)
     gaussians.means[:] = 0.5
     tree = build_kd(gaussians.means, 1)
-    cut, parts, parents = split_full(tree, {0: BlockState.fresh(gaussians)}, 10)
+    cut, parts, parents = split_full(tree, {0: BlockState.fresh(gaussians)}, Limits(10))
     assert (cut, list(parts), parents) == (tree, [0], {})
 
 
@@ -53,7 +54,7 @@ def test_the_reserve_is_no_block():
     gaussians = random_gaussians(50)
     tree = build_kd(gaussians.means, 1)
     waiting = BlockState.fresh(gaussians)
-    assert split_full(tree, {RESERVE: waiting}, 10) == (tree, {RESERVE: waiting}, {})
+    assert split_full(tree, {RESERVE: waiting}, Limits(10)) == (tree, {RESERVE: waiting}, {})
 
 
 def test_a_part_is_visited_next_to_the_block_it_came_from():
@@ -133,9 +134,9 @@ def test_what_need_not_be_cut_is_not_written_again(tmp_path, views, start):
     coordinator = make_coordinator(tmp_path, start, views, blocks=1)
     scene, store = coordinator.scene, coordinator.scene.store
     generation = store.generation
-    cut_at_rest(scene, RunState(), limit=20, sole=10**6)
+    cut_at_rest(scene, RunState(), Limits(20, sole_limit=10**6))
     assert (store.generation, scene.tree.num_blocks) == (generation, 1)
-    cut_at_rest(scene, RunState(), limit=20)
+    cut_at_rest(scene, RunState(), Limits(20))
     assert scene.tree.num_blocks > 1
 
 
@@ -150,7 +151,7 @@ def test_a_block_that_was_the_whole_scene_is_cut_though_its_visit_was_under_way(
     state = RunState.from_json(store.state)
     assert state.active.saved
     scene.clear_live()
-    cut_at_rest(scene, state, limit=40, sole=50)
+    cut_at_rest(scene, state, Limits(40, sole_limit=50))
     assert scene.tree.num_blocks > 2
     assert sum(map(scene.count, range(scene.tree.num_blocks))) == len(start)
     store.close()
@@ -173,7 +174,7 @@ def test_of_several_blocks_all_are_cut_but_the_one_whose_visit_was_under_way(tmp
     block, step = state.active.geometry.block, state.step
     scene.clear_live()
     before = scene.rows(block)
-    cut_at_rest(scene, state, limit=40)
+    cut_at_rest(scene, state, Limits(40))
     assert state.active is not None
     assert scene.rows(block) == before
     assert scene.rows(1 - block) <= FULL * 40
@@ -192,12 +193,12 @@ def test_a_run_goes_on_with_a_smaller_limit(tmp_path, views, photos, start):
         train_step(first, photos)
     before = rows(BlockState.fresh(whole_scene(first)))
     scene, store = first.scene, first.scene.store
-    cut_at_rest(scene, RunState.from_json(store.state), 40)
+    cut_at_rest(scene, RunState.from_json(store.state), Limits(40))
     assert scene.tree.num_blocks > 2
     assert max(map(scene.count, range(scene.tree.num_blocks))) <= FULL * 40
     assert rows(BlockState.fresh(whole_scene(first))) == before
     generation = store.generation
-    cut_at_rest(scene, RunState.from_json(store.state), 40)
+    cut_at_rest(scene, RunState.from_json(store.state), Limits(40))
     assert store.generation == generation
     store.close()
     again = make_coordinator(tmp_path, start, views, resume=True, block_limit=40, **options)

@@ -8,6 +8,7 @@ from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.settle import inbox_without, with_mail, without
 from abcd_ns.engine.store.special_blocks import INBOX, LIVE, BlockName
+from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
 
 FULL = 0.75
@@ -15,16 +16,14 @@ FULL = 0.75
 
 
 def split_full(
-    tree: BlockTree, settled: dict[BlockName, BlockState], limit: int, sole: int = 0
+    tree: BlockTree, settled: dict[BlockName, BlockState], limits: Limits
 ) -> tuple[BlockTree, dict[BlockName, BlockState], dict[int, int]]:
-    """Cut each block with more than FULL of `limit` Gaussians in equal halves, and those again if need be.
+    """Cut each block with more than FULL of its limit in equal halves, and those again if need be.
 
     Both parts keep the block's clocks. Gaussians that coincide stay together, however many they are.
 
     Args:
         settled: blocks that are about to be put to rest; what has a special name is left alone.
-        limit: 0 is none.
-        sole: the limit of a block that is the whole scene; 0 is `limit`.
 
     Returns:
         The tree with the cuts, everything to be put to rest, and of each new block the one that it was part
@@ -36,7 +35,7 @@ def split_full(
     while waiting:
         block = waiting.pop(0)
         state = settled[block]
-        if not is_full(len(state), tree.num_blocks, limit, sole):
+        if not is_full(len(state), tree.num_blocks, limits):
             continue
         means = state.gaussians.means
         new, cut = tree.num_blocks, tree.split(block, *best_split(means, tree.cell(block)))
@@ -49,13 +48,14 @@ def split_full(
     return tree, settled, parents
 
 
-def is_full(gaussians: int, blocks: int, limit: int, sole: int) -> bool:
+def is_full(gaussians: int, blocks: int, limits: Limits) -> bool:
     """Whether a block of so many Gaussians, in a scene of so many blocks, is to be cut; see `split_full`."""
-    return limit > 0 and gaussians > FULL * (max(limit, sole) if blocks == 1 else limit)
+    limit = limits.of_block(blocks)
+    return limit > 0 and gaussians > FULL * limit
 
 
 def with_full(
-    scene: StoredScene, settled: dict[BlockName, BlockState], limit: int, busy: set[int]
+    scene: StoredScene, settled: dict[BlockName, BlockState], limits: Limits, busy: set[int]
 ) -> dict[BlockName, BlockState]:
     """What is about to be put to rest, and the blocks that are full with those that wait for their visit: for
     these there might be no room in it.
@@ -64,13 +64,15 @@ def with_full(
         busy: blocks that are being trained.
     """
     inbox = settled.get(INBOX)
-    if not limit or inbox is None:
+    if not limits.block_limit or inbox is None:
         return settled
     waiting = split_by_block(inbox, scene.tree.assign(inbox.gaussians.means))
     at_rest = {block: mail for block, mail in waiting.items() if block not in busy}
     # A block whose visit has just ended may have mail, too: what came while it was out.
     rows = {block: len(settled[block]) if block in settled else scene.rows(block) for block in at_rest}
-    full = {block: mail for block, mail in at_rest.items() if rows[block] + len(mail) > FULL * limit}
+    full = {
+        block: mail for block, mail in at_rest.items() if rows[block] + len(mail) > FULL * limits.block_limit
+    }
     joined = {
         block: join([settled[block] if block in settled else scene.state(block), mail])
         for block, mail in full.items()
@@ -82,50 +84,46 @@ def cut_full(
     scene: StoredScene,
     settled: dict[BlockName, BlockState],
     state: RunState,
-    limit: int,
-    sole: int,
+    limits: Limits,
     announce: Announcer,
 ) -> tuple[BlockTree, dict[BlockName, BlockState]]:
     """Cut blocks that have outgrown their limit; the parts inherit what the run knows of the whole.
 
     Args:
-        settled, limit, sole: as of `split_full`.
+        settled: as of `split_full`.
 
     Returns:
         The tree with the cuts, and everything to be put to rest.
     """
     busy = {visit.geometry.block for visit in state.in_flight}
-    tree, settled, parents = split_full(scene.tree, with_full(scene, settled, limit, busy), limit, sole)
+    tree, settled, parents = split_full(scene.tree, with_full(scene, settled, limits, busy), limits)
     for new, parent in parents.items():
         state.inherit(new, parent)
         announce(BlockSplit(parent, new))
     return tree, settled
 
 
-def cut_at_rest(scene: StoredScene, state: RunState, limit: int, sole: int = 0) -> None:
+def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
     """Cut the blocks of a run that goes on with smaller limits than it had; nothing where all are in order.
 
     A block among others whose visit was under way is left for its end, as the warm-up is; that of a block
     that was the whole scene is over.
-
-    Args:
-        limit, sole: as of `split_full`.
     """
     active = state.active
-    for block in range(scene.tree.num_blocks) if limit else ():
+    for block in range(scene.tree.num_blocks) if limits.block_limit else ():
         in_visit = active is not None and (active.is_whole or active.geometry.block == block)
         if in_visit and not active.sole:
             continue
         lives = in_visit and active.saved
         rows = scene.rows(LIVE) if lives else scene.count(block)
-        if not is_full(rows, scene.tree.num_blocks, limit, sole):
+        if not is_full(rows, scene.tree.num_blocks, limits):
             continue
         if lives:
             live = scene.state(LIVE)
             large = {block: live, LIVE: live.nobody}
         else:
             large = {block: with_mail(scene, block), **inbox_without(scene, {block})}
-        tree, parts = cut_full(scene, large, state, limit, sole, Announcer())
+        tree, parts = cut_full(scene, large, state, limits, Announcer())
         if tree is not scene.tree:
             state.active = active = None if active is None or active.sole else active
             scene.rest(tree, parts, state.to_json())

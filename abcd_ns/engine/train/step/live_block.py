@@ -152,9 +152,8 @@ class LiveBlock:
     @property
     def has_outgrown(self) -> bool:
         """Whether the one block of the scene has just grown to where it must be cut."""
-        limits = self._run.config.limits.block_limit, self._run.config.limits.sole_limit
         grown = self._run.active.sole and self.clocks.refined == self.clocks.steps
-        return grown and is_full(len(self), 1, *limits)
+        return grown and is_full(len(self), 1, self._run.config.limits)
 
     def hold_back_giants(self) -> None:
         """Shrink what is too large for every camera."""
