@@ -127,10 +127,6 @@ class Planner(Visits):
                 active.began, active.reduction = began, reduction
                 return active
 
-    @staticmethod
-    def _is_hidden(state: RunState, block: int) -> bool:
-        return block in state.health and state.health[block].hidden
-
     def _visit(
         self,
         state: RunState,
@@ -218,7 +214,8 @@ class Planner(Visits):
         passes = passes_at_once(passes, at_once, blocks)
         batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
         if state.sweep % LOOK_AGAIN:
-            used = {block: views for block, views in used.items() if not self._is_hidden(state, block)}
+            hidden = {block for block, record in state.health.items() if record.hidden}
+            used = {block: views for block, views in used.items() if block not in hidden}
         steps = (passes / batch, remaining, config.seed, config.recipe.visit_steps)
         state.queue = list(plan_sweep(state.sweep, used, *steps))
 
@@ -226,17 +223,18 @@ class Planner(Visits):
         """A block that no view saw may be seen once others have come into it."""
         for block, seen in state.views.items():
             if not seen and self._scene.mail(block) is not None:
-                state.views[block] = len(self._survey(block, self._may_see(block, 1)).views)
+                state.views[block] = self._views_that_see(block)
 
     def _views_of_blocks(self, state: RunState) -> dict[int, int]:
         """As far as influences are known they tell; a visit looks again."""
-        views, share = {}, self._config.influence_share
+        views = {}
         for block in range(self._scene.tree.num_blocks):
-            known = state.influence.get(block) if share < 1 else None
-            views[block] = len(
-                worth_training(known, share) if known else self._survey(block, self._may_see(block, 1)).views
-            )
+            known = self._known_to_show(state, block, state.influence.get(block, ()))
+            views[block] = len(known) or self._views_that_see(block)
         return views
+
+    def _views_that_see(self, block: int) -> int:
+        return len(self._survey(block, self._may_see(block, 1)).views)
 
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
