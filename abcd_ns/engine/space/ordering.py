@@ -19,14 +19,8 @@ def node_children_in_order(tree: BlockTree, node: int, center: Float[Tensor, "3"
 
     The centre is compared with the threshold in float64, by the rule that BlockTree.assign uses for
     points: exactly on the plane counts as right.
-
-    Raises:
-        ValueError: the node is a leaf.
     """
-    axis = int(tree.axis[node])
-    if axis < 0:
-        raise ValueError(f"node {node} is the leaf of block {int(tree.block[node])}: it has no children")
-    left, right = int(tree.left[node]), int(tree.right[node])
+    axis, left, right = (int(column[node]) for column in (tree.axis, tree.left, tree.right))
     return (left, right) if float(center[axis]) < float(tree.threshold[node]) else (right, left)
 
 

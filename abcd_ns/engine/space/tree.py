@@ -214,13 +214,12 @@ def _is_tree(tree: BlockTree) -> bool:
     inner = tree.axis >= 0
     children = torch.cat([tree.left[inner], tree.right[inner]])
     # Every node but the root is the child of exactly one earlier node: then there are no cycles or islands.
-    if size == 0 or sorted(children.tolist()) != list(range(1, size)) or int(tree.parent[0]) != -1:
+    if size == 0 or sorted(children.tolist()) != list(range(1, size)):
         return False
     parents = inner.nonzero()[:, 0].repeat(2)
     leaves = torch.stack([tree.axis + 1, tree.left + 1, tree.right + 1, tree.threshold != 0])[:, ~inner]
     return bool(
         (children > parents).all()
-        and (tree.parent[children] == parents).all()
         and (tree.axis <= 2).all()
         and (tree.block[inner] == -1).all()
         and not leaves.any()

@@ -25,8 +25,6 @@ def footprint(extent: Sequence[float], view: View, margin: int = 0, align: int =
     Returns:
         The crop, or None if nothing is in the image.
     """
-    if margin < 0 or align < 1:
-        raise ValueError(f"a footprint needs margin >= 0 and align >= 1, got {margin} and {align}")
     x0, y0, x1, y1 = extent
     if x0 > x1:
         return None

@@ -3,12 +3,11 @@
 from fractions import Fraction
 from itertools import pairwise
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.space.ordering import front_to_back, node_children_in_order
+from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.partition import build_grid
 from abcd_ns.engine.space.tree import BlockTree
 from tests.engine.space.test_tree import SEEDS, lattice_points, random_tree
@@ -116,9 +115,3 @@ def test_a_camera_on_the_plane_belongs_to_the_right():
     center = torch.tensor([threshold, 0.0, 0.0], dtype=torch.float64)
     assert front_to_back(tree, center) == (1, 0)
     assert front_to_back(tree, torch.nextafter(center, center - 1)) == (0, 1)
-
-
-def test_a_leaf_has_no_children():
-    tree, center = random_tree(0, 3), torch.zeros(3)
-    with pytest.raises(ValueError, match="is the leaf of block 1"):
-        node_children_in_order(tree, tree.node_of(1), center)

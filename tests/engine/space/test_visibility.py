@@ -78,11 +78,6 @@ def test_footprint_ignores_what_is_culled_whatever_its_place():
     assert crop == Crop(3, 3, 4, 4)
 
 
-def test_footprint_refuses_a_bad_margin():
-    with pytest.raises(ValueError, match="margin >= 0 and align >= 1"):
-        footprint((0.0, 0.0, 1.0, 1.0), small_view(), margin=-1)
-
-
 def random_gaussians(seed: int, n: int) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
     return Gaussians(
