@@ -197,14 +197,14 @@ def _one_pass(count: int, number: int, seed: int) -> tuple[int, ...]:
     return tuple(shuffled)
 
 
-def exponential_decay(progress: float, initial: float, final: float) -> float:
-    """initial (final / initial)^progress for progress 0..1, as 3DGS decays the rate of the means."""
-    return initial * (final / initial) ** min(max(progress, 0.0), 1.0)
+def exponential_decay(progress: float, final: float) -> float:
+    """The share that is left, final^progress for progress 0..1, as 3DGS decays the rate of the means."""
+    return final ** min(max(progress, 0.0), 1.0)
 
 
 def settling(progress: float, views: int) -> float:
     """The share of learning rates that is left, see SETTLES, to a block that was trained on so many views."""
-    fallen = exponential_decay((progress - SETTLES) / (1 - SETTLES), 1.0, SETTLED)
+    fallen = exponential_decay((progress - SETTLES) / (1 - SETTLES), SETTLED)
     return fallen ** min(views / SETTLING_VIEWS, 1.0)
 
 

@@ -108,7 +108,7 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next; listeners are told the views of the steps to
         come, too."""
         run = self.run
-        decay = exponential_decay(run.share, 1.0, run.config.means_lr_decay)
+        decay = exponential_decay(run.share, run.config.means_lr_decay)
         # A first visit, perhaps the only one, has all.
         settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views
@@ -183,7 +183,7 @@ class VisitTraining:
         run = self.run
         if run.light is None:
             return
-        damping = exponential_decay(run.progress, 1.0, LAST)
+        damping = exponential_decay(run.progress, LAST)
         share = 1.0 if run.active.is_alone else AMONG_OTHERS
         run.light.step(gradients_of(rendered.lights), share * damping)
 

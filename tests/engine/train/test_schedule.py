@@ -93,10 +93,10 @@ def test_visits_are_the_shorter_the_more_are_out_at_once(passes, at_once, blocks
 
 
 def test_learning_rate_decays_exponentially():
-    assert exponential_decay(0.0, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-4)
-    assert exponential_decay(0.5, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-5)
-    assert exponential_decay(1.0, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-6)
-    assert exponential_decay(7.0, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-6)
+    assert exponential_decay(0.0, 0.01) == pytest.approx(1.0)
+    assert exponential_decay(0.5, 0.01) == pytest.approx(0.1)
+    assert exponential_decay(1.0, 0.01) == pytest.approx(0.01)
+    assert exponential_decay(7.0, 0.01) == pytest.approx(0.01)
 
 
 def test_rates_of_one_block_fall_at_the_end_of_the_run():
