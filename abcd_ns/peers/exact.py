@@ -113,7 +113,7 @@ class ExactTrainer(Trainer):
     def render(self, batch: Batch) -> Rendered:
         """Pass 1: all blocks' layers, folded; differentiable in the pictures alone."""
         self._batch, self._layers_of = batch, [{} for _ in batch.samples]
-        self._degree = self.sh_degree
+        self._degree = self.run.sh_degree
         with torch.no_grad():
             for block, _, gaussians in self._cells():
                 for place in range(len(batch.samples)):
@@ -222,7 +222,7 @@ class ExactTrainer(Trainer):
             grid = self.run.rasterizer.window_grid(sample.crop)
             window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
-        options = {"antialiased": self.config.antialiased, "absgrad": self.density.absgrad}
+        options = {"antialiased": self.config.antialiased, "absgrad": self.run.density.absgrad}
         return self.run.rasterizer.draw(gaussians, [shot], sh_degree=self._degree, **options)[0]
 
     def _in_order(self, place: int) -> list[Layer]:
@@ -245,13 +245,13 @@ class ExactTrainer(Trainer):
         for name in PARAM_NAMES:
             self.params[name].grad = gradients.params[name][rows].to(self.device)
         if self.config.density.strategy == "mcmc":
-            self.density.regularisation(self.params, self.count()).backward()
+            self.run.density.regularisation(self.params, self.count()).backward()
         for optimizer in self.optimizers.values():
             optimizer.step()
         clocks = replace(
             state.clocks, steps=state.clocks.steps + taken, adam_views=state.clocks.adam_views + taken
         )
-        growth = self.density.after_step(
+        growth = self.run.density.after_step(
             self.params,
             self.optimizers,
             {name: value.to(self.device) for name, value in state.growth.items()},

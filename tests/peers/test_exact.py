@@ -106,7 +106,7 @@ def test_several_steps_are_those_of_a_plain_loop_over_everything(tmp_path, views
         for name, rate in rates.items():
             decay = blocks.config.means_lr_decay ** (step / 12) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * rates_of_young(step, 1)
-        raster = blocks.run.rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.sh_degree)
+        raster = blocks.run.rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.run.sh_degree)
         picture = composite(raster.layer, sample.background).clamp(0, 1)
         for optimizer in adam.values():
             optimizer.zero_grad()

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import RunState, Stopwatch
 from abcd_ns.engine.train.step.batch import Batch, Pictures, Rendered
@@ -96,11 +95,6 @@ class Trainer(ABC):
         return self.run.stopwatch
 
     @property
-    def density(self) -> DensityControl:
-        """What grows and prunes."""
-        return self.run.density
-
-    @property
     def progress(self) -> float:
         """Share of the run that is done, 0..1."""
         return self.run.progress
@@ -109,11 +103,6 @@ class Trainer(ABC):
     def finished(self) -> bool:
         """Whether the budget is used up."""
         return self.progress >= 1.0
-
-    @property
-    def sh_degree(self) -> int:
-        """The degree of spherical harmonics in use."""
-        return self.run.sh_degree
 
     @property
     def layer_limit(self) -> int:

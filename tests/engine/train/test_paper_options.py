@@ -71,7 +71,7 @@ def test_the_degree_begins_at_0_in_every_visit_and_layers_have_the_highest(tmp_p
     degrees = []
     while not coordinator.finished:
         coordinator.next_batch()
-        degrees.append(coordinator.sh_degree)
+        degrees.append(coordinator.run.sh_degree)
         assert coordinator.state.active.sh_degree == 1
         train_step(coordinator, photos)
     assert degrees == [0, 0, 1, 1] * 4
