@@ -64,16 +64,11 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
         growth: the strategy's statistics, each [n]; copied.
         clocks: the block's clocks, up to date.
     """
-    held = [params, *({n: _moment(n, params, optimizers, moment) for n in PARAM_NAMES} for moment in MOMENTS)]
-    values = [part[name] for part in held for name in PARAM_NAMES]
-    copies = iter(_on_cpu([*values, *growth.values()]))
-    parts = [Gaussians(**{name: next(copies) for name in PARAM_NAMES}) for _ in held]
+    adam = {name: optimizers[name].state[params[name]] for name in PARAM_NAMES}
+    moments = [adam[name][moment] for moment in MOMENTS for name in PARAM_NAMES]
+    copies = iter(_on_cpu([*(params[name] for name in PARAM_NAMES), *moments, *growth.values()]))
+    parts = [Gaussians(**{name: next(copies) for name in PARAM_NAMES}) for _ in ("", *MOMENTS)]
     return BlockState(*parts, {name: next(copies) for name in growth}, clocks)
-
-
-def _moment(name: str, params: Params, optimizers: Optimizers, moment: str) -> Tensor:
-    found = optimizers[name].state.get(params[name], {}).get(moment)
-    return torch.zeros_like(params[name]) if found is None else found
 
 
 def _on_cpu(values: list[Tensor]) -> list[Tensor]:
@@ -97,21 +92,18 @@ def live_gaussians(params: Params) -> Gaussians:
     return Gaussians(**{name: params[name] for name in PARAM_NAMES})
 
 
-def make_adam(params: Params) -> Optimizers:
-    """One Adam for each parameter, as 3DGS uses it."""
-    return {
-        name: torch.optim.Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
-        for name in PARAM_NAMES
-    }
-
-
 def nothing_live(
     sh_degree: int, device: torch.device | str = "cpu"
 ) -> tuple[dict[str, Parameter], Optimizers]:
-    """Empty parameters and their Adam, for a coordinator that nerfstudio does not call."""
+    """Empty parameters and one Adam for each, as 3DGS uses it: for a coordinator that nerfstudio does not
+    call."""
     empty = Gaussians.empty(sh_degree, device)
     params = {name: Parameter(value) for name, value in empty.items()}
-    return params, make_adam(params)
+    optimizers = {
+        name: torch.optim.Adam([value], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
+        for name, value in params.items()
+    }
+    return params, optimizers
 
 
 class Pace:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
-from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, make_adam
+from abcd_ns.engine.gaussians.param_swap import attach, detach, live_gaussians, nothing_live
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import random_gaussians
 
@@ -32,8 +32,7 @@ def assert_same(a: BlockState, b: BlockState) -> None:
 
 
 def live(state: BlockState):
-    params = {n: torch.nn.Parameter(v) for n, v in Gaussians.empty(1).items()}
-    optimizers = make_adam(params)
+    params, optimizers = nothing_live(1)
     attach(state, params, optimizers)
     return params, optimizers
 

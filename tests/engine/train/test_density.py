@@ -7,7 +7,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
-from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, make_adam
+from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
 from abcd_ns.engine.render.primitive import SPLATS, SURFELS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.clock import DensityClock
@@ -20,8 +20,7 @@ from tests.reference.scenes import random_gaussians, ring_of_views
 
 
 def live(gaussians: Gaussians):
-    params = {n: torch.nn.Parameter(v) for n, v in Gaussians.empty(gaussians.sh_degree).items()}
-    optimizers = make_adam(params)
+    params, optimizers = nothing_live(gaussians.sh_degree)
     attach(BlockState.fresh(gaussians), params, optimizers)
     return params, optimizers
 

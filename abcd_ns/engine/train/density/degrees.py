@@ -77,10 +77,9 @@ def lower(
     found = lowered(live_gaussians(params).detach(), growth, views)
     dc.copy_(found.features_dc)
     rest.copy_(found.features_rest)
-    adam, gone = optimizers["features_rest"].state.get(rest, {}), are_gone(found.gone, rest)
+    adam, gone = optimizers["features_rest"].state[rest], are_gone(found.gone, rest)
     for moment in MOMENTS:
-        if moment in adam:
-            adam[moment].masked_fill_(gone, 0.0)
+        adam[moment].masked_fill_(gone, 0.0)
     return {**growth, GONE: found.gone}
 
 

@@ -212,9 +212,9 @@ class Health:
     @torch.no_grad()
     def _mend(self) -> None:
         for name, optimizer in self._optimizers.items():
-            adam = optimizer.state.get(self._params[name], {})
+            adam = optimizer.state[self._params[name]]
             for moment in MOMENTS:
-                if moment in adam and not math.isfinite(float(torch.linalg.vector_norm(adam[moment]))):
+                if not math.isfinite(float(torch.linalg.vector_norm(adam[moment]))):
                     bad = ~torch.isfinite(adam[moment]).flatten(1).all(dim=1)
                     adam[moment][bad] = 0.0
                     self.count("moments", int(bad.sum()))
@@ -240,10 +240,9 @@ class Health:
         return stand_ins(live[~unsound(live)], len(rows))
 
     def _forget_moments(self, name: str, rows: Tensor) -> None:
-        adam = self._optimizers[name].state.get(self._params[name], {})
+        adam = self._optimizers[name].state[self._params[name]]
         for moment in MOMENTS:
-            if moment in adam:
-                adam[moment][rows] = 0.0
+            adam[moment][rows] = 0.0
 
     # -- accounts ------------------------------------------------------------------------------------
 
