@@ -12,7 +12,7 @@ from abcd_ns.engine.render.primitive import SPLATS, SURFELS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl, for_primitive
-from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
+from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
 from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
@@ -188,15 +188,6 @@ def test_relocation_keeps_the_mass_along_a_ray():
         return float(torch.trapezoid(1 - (1 - o * torch.exp(-(x**2) / (2 * s * s))) ** n, x))
 
     assert mass(float(new), float(scale[0, 0]), copies) == pytest.approx(mass(opacity, sigma, 1), rel=1e-4)
-
-
-def test_covariances_against_the_definition():
-    gaussians = random_gaussians(5, dtype=torch.float64)
-    scales = gaussians.scales.exp()
-    found, _ = covariances(gaussians.quats, scales)
-    eigenvalues = torch.linalg.eigvalsh(found)
-    assert torch.allclose(eigenvalues, (scales**2).sort(dim=1).values)
-    assert torch.allclose(found, found.transpose(1, 2))
 
 
 def test_surfels_grow_by_plain_gradients_and_2dgs_threshold():

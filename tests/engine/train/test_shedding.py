@@ -12,7 +12,7 @@ from abcd_ns.engine.events import Mended
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.density.shedding import PASSES, faded, fills, may_grow, price_at, weigh, worthless
+from abcd_ns.engine.train.density.shedding import PASSES, faded, fills, may_grow, price_at, weigh
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import (
@@ -47,7 +47,7 @@ def some_hidden(seed: int = 1) -> Gaussians:
     looks=st.integers(0, 200),
 )
 def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_price(weight, views, price, looks):
-    found = worthless(statistics(weight, [looks / views] * len(weight)), price).tolist()
+    found = (fills(statistics(weight, [looks / views] * len(weight))) <= price).tolist()
     for value, goes in zip(weight, found, strict=True):
         per_view = value / max(looks, 1)
         if abs(per_view * views - price) > 1e-3:
@@ -58,7 +58,7 @@ def test_a_gaussian_goes_if_its_mean_weight_in_all_views_is_below_the_price(weig
 def test_who_goes_does_not_grow_and_who_was_not_weighed_may(weight, price, passes):
     growth = statistics([weight if passes else 0.0], [passes])
     grows = may_grow(growth, price)
-    assert not bool((grows & worthless(growth, price) & (growth["weight"] > 0)).any())
+    assert not bool((grows & (fills(growth) <= price) & (growth["weight"] > 0)).any())
     assert bool(grows) or passes > 0
 
 
@@ -76,8 +76,8 @@ def test_the_warm_ups_views_and_a_blocks_own_say_the_same(whole, block, before, 
         total += looks * torch.cat((one["weight"], one["passes"]))
     growth = {"weight": total[:1], "passes": total[1:]}
     torch.testing.assert_close(fills(growth), torch.tensor([20.0]), rtol=1e-4, atol=0.0)
-    assert bool(worthless(growth, 20.1))
-    assert not bool(worthless(growth, 19.9))
+    assert bool(fills(growth) <= 20.1)
+    assert not bool(fills(growth) <= 19.9)
 
 
 def test_what_was_seen_long_ago_counts_for_less():

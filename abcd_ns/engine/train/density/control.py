@@ -12,6 +12,7 @@ from functools import reduce
 from typing import Any, Literal
 
 import torch
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
 from jaxtyping import Bool
@@ -21,8 +22,8 @@ from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
 from abcd_ns.engine.render.primitive import Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.relocation import binomials, compute_relocation, covariances
-from abcd_ns.engine.train.density.shedding import LAST, WEIGHED, faded, may_grow, price_at, weigh, worthless
+from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
+from abcd_ns.engine.train.density.shedding import LAST, WEIGHED, faded, fills, may_grow, price_at, weigh
 
 # Step numbers as gsplat sees them. It refines on multiples of REFINE; it resets opacities on multiples of
 # NEVER and prunes by size in scene units, which takes backgrounds, after it.
@@ -245,7 +246,7 @@ class DensityControl:
         if not self.weighs or any(name not in growth for name in WEIGHED):
             return growth
         price = price_at(self.config.price, progress, self.config.refine_stop)
-        drop = worthless(growth, price) | (torch.sigmoid(params["opacities"][:, 0]) < MIN_ALPHA)
+        drop = (fills(growth) <= price) | (torch.sigmoid(params["opacities"][:, 0]) < MIN_ALPHA)
         growth = faded(growth)
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)
@@ -272,7 +273,7 @@ class DensityControl:
         )
         state: dict[str, Any] = {"scene_scale": 1.0, **growth}
         if self.refines(clock, infos):
-            grows, room = self._may_grow(growth), clock.room
+            grows, room = may_grow(growth, config.price), clock.room
             growth = {**growth, "grad2d": torch.where(grows, growth["grad2d"], 0.0)}
             if wide is not None:
                 growth, room = _split(params, optimizers, growth, wide & grows, room)
@@ -284,12 +285,6 @@ class DensityControl:
         if self.resets(clock):
             gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
         return {name: value for name, value in state.items() if isinstance(value, Tensor)}
-
-    def _may_grow(self, growth: dict[str, Tensor]) -> Bool[Tensor, "n"]:
-        """Who fills enough to become two."""
-        if not self.weighs or any(name not in growth for name in WEIGHED):
-            return torch.ones_like(growth["grad2d"], dtype=torch.bool)
-        return may_grow(growth, self.config.price)
 
     def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:
         room = len(params["means"]) if clock.room is None else clock.room
@@ -356,7 +351,7 @@ def _operators_for(device: torch.device) -> Iterator[None]:
     lent: list[tuple[Any, str, Any]] = [(torch.cuda, "empty_cache", lambda: None)]
     if device.type != "cuda":
         lent.append((gsplat_ops, "compute_relocation", compute_relocation))
-        lent.append((gsplat_ops, "quat_scale_to_covar_preci", covariances))
+        lent.append((gsplat_ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci))
     originals = [(owner, name, getattr(owner, name)) for owner, name, _ in lent]
     try:
         for each in lent:

@@ -38,13 +38,8 @@ AT_ONCE, OF_EACH = 1 << 22, 32
 where that is more, half of what gradients take. However large a block is, an accelerator has few parts."""
 
 
-class _Cameras(NamedTuple):
-    """Views, on the device of the Gaussians."""
-
-    viewmats: Float[Tensor, "v 4 4"]
-    intrinsics: Float[Tensor, "v 3 3"]
-    ends: Float[Tensor, "v 3"]
-    """Width and height, px, and the near plane."""
+_Cameras = tuple[Float[Tensor, "v 4 4"], Float[Tensor, "v 3 3"], Float[Tensor, "v 3"]]
+"""World-to-camera matrices and intrinsics of views; width and height, px, and the near plane."""
 
 
 class Lowered(NamedTuple):
@@ -103,10 +98,10 @@ def lowered(gaussians: Gaussians, growth: Mapping[str, Tensor], views: Sequence[
 
 
 def _beside(means: Tensor, views: Sequence[View]) -> _Cameras:
-    """In one copy."""
+    """On the device of the Gaussians, in one copy."""
     numbers = torch.stack([_numbers(view) for view in views])
     viewmats, intrinsics, ends = upload(numbers.to(means.dtype), means.device).split((16, 9, 3), dim=1)
-    return _Cameras(viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3), ends)
+    return viewmats.view(-1, 4, 4), intrinsics.view(-1, 3, 3), ends
 
 
 def _numbers(view: View) -> Float[Tensor, "28"]:

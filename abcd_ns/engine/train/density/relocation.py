@@ -38,20 +38,6 @@ def compute_relocation(
     return new.reshape(opacities.shape), scales * factor[:, None]
 
 
-def covariances(
-    quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"], **_unused: bool
-) -> tuple[Float[Tensor, "n 3 3"], None]:
-    """R diag(s^2) R^T, in the form of gsplat's `quat_scale_to_covar_preci` with compute_preci=False."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(dim=1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    rotated = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1) * scales[:, None, :]
-    return rotated @ rotated.transpose(1, 2), None
-
-
 @cache
 def binomials(most: int = 51) -> Float[Tensor, "m m"]:
     """C(i, k) for i, k < most; zero where k > i."""

@@ -76,7 +76,8 @@ def weigh(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
 
 
 def fills(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
-    """Pixels that each fills in all of its block's views together; NaN for who was not drawn in all yet.
+    """Pixels that each fills in all of its block's views together; NaN for who was not drawn in all yet: such
+    a one is not judged, for no comparison finds it to be less.
 
     Args:
         growth: with WEIGHED.
@@ -85,22 +86,10 @@ def fills(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
     return torch.where(passes >= WHOLE, weight / passes, torch.nan)
 
 
-def worthless(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians fill less than `price` pixels; nobody is judged before a pass.
-
-    Args:
-        growth: with WEIGHED.
-    """
-    return fills(growth) <= price
-
-
 def may_grow(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians fill GROWS prices, as far as is known by now; those never weighed may grow.
-
-    Args:
-        growth: with WEIGHED.
-    """
-    weight, passes = (growth[name] for name in WEIGHED)
+    """Which Gaussians fill GROWS prices, as far as is known by now; those never weighed may grow."""
+    unknown = torch.zeros_like(growth["grad2d"])
+    weight, passes = (growth.get(name, unknown) for name in WEIGHED)
     return weight >= GROWS * price * passes
 
 
