@@ -95,9 +95,8 @@ class Health:
         self._skips, self._psnr = True, math.nan
 
     def see(self, share: Float[Tensor, ""]) -> None:
-        """Take note of how large a part of a picture the live block was."""
-        if self._active is not None and not self._active.shown:
-            self._shares.append(share)
+        """Take note of how large a part of a picture the live block was, while none has shown it."""
+        self._shares.append(share)
 
     def note(self, losses: Sequence[tuple[int, Float[Tensor, ""]]]) -> None:
         """Remember the loss of each view in this step: (view, loss) pairs."""
@@ -250,10 +249,6 @@ class Health:
         """All that the step tells, as one small tensor."""
         losses, self._losses = self._losses, []
         shares, self._shares = self._shares, []
-        if self._active is None:
-            losses = []
-        if self._active is None or self._active.shown:
-            shares = []
         parts = {"losses": [loss for _, loss in losses], "shares": shares, "psnrs": list(psnrs)}
         if self._guard is not None:
             parts["bad"], self._guard.found = self._guard.found, []

@@ -89,12 +89,12 @@ class LiveBlock:
             infos: of the step's drawings; none where its gradients were no numbers.
         """
         run = self._run
-        wide = None
-        if run.config.recipe.split_wide and run.density.refines(clock, infos):
+        wide, refines = None, run.density.refines(clock, infos)
+        if run.config.recipe.split_wide and refines:
             scales, means = run.params["scales"], run.params["means"]
             wide = wider_than(WIDE_ANGLE, scales, means, run.views.values())[0].any(dim=1)
         self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock, wide)
-        if run.density.refines(clock, infos):
+        if refines:
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.hold_back_giants()
 
