@@ -36,15 +36,12 @@ class BlockScene(Protocol):
 
     def gaussians(self, block: int) -> Gaussians:
         """The block's Gaussians, without a graph, wherever they are kept."""
-        ...
 
     def count(self, block: int) -> int:
         """How many Gaussians the block has."""
-        ...
 
     def bounds(self, block: int) -> Box | None:
         """`bounds_of` the block's Gaussians."""
-        ...
 
     def drawn(self, block: int, device: torch.device | str, which: Which | None = None) -> Gaussians:
         """As `gaussians`, on a device; of them those that are picked, if all are not wanted."""
@@ -57,23 +54,18 @@ class VisitScene(BlockScene, Protocol):
 
     def state(self, name: BlockName) -> BlockState:
         """A block at rest and whole, without its mail."""
-        ...
 
     def mail(self, block: int) -> BlockState | None:
         """The Gaussians that wait for the next visit to a block; their clocks mean nothing."""
-        ...
 
     def rows(self, name: BlockName) -> int:
         """Gaussians at rest under a name, the mail of a block left out; nothing is read."""
-        ...
 
     def gaussians_at_rest(self, block: int) -> Gaussians:
         """The block as a visit will find it, whatever is live."""
-        ...
 
     def set_live(self, block: int | None, live: Callable[[], Gaussians]) -> None:
         """From now on `block`, or with None the whole scene, is what `live` returns, not what is at rest."""
-        ...
 
 
 class MemoryScene(BlockScene):
