@@ -85,8 +85,8 @@ class Shown:
 
     def _columns(self, name: BlockName, names: tuple[str, ...]) -> dict[str, Tensor]:
         if "features_rest" not in names:
-            return self.store.load_names(name, (*names, WAITS))
-        packed = Packed(self.store.load_names(name, DRAWN), self.store.meta(name))
+            return self.store.load(name, (*names, WAITS))[0]
+        packed = Packed(*self.store.load(name, DRAWN))
         return {**dict(packed.gaussians().items()), WAITS: packed.tensors[WAITS]}
 
     def _placed(self, means: Tensor) -> Tensor:

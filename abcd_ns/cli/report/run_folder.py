@@ -224,7 +224,7 @@ def _read_store(
 def _filled(store: ParameterStore, block: int) -> float | None:
     """Pixels; None where nobody was weighed, as by methods that keep everything."""
     with suppress(KeyError):
-        weight, passes = store.load_names(block, [f"growth.{name}" for name in WEIGHED]).values()
+        weight, passes = store.load(block, [f"growth.{name}" for name in WEIGHED])[0].values()
         if bool((passes > 0).any()):
             return float((weight / passes)[passes > 0].median())
     return None

@@ -142,26 +142,22 @@ class ParameterStore:
         """A copy of the block's JSON; no file is read."""
         return copy.deepcopy(self._shard(block).meta)
 
-    def load(self, block: BlockName) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """All tensors of a block, on the CPU and owning their memory, and its JSON; checked each time.
+    def load(
+        self, block: BlockName, names: Iterable[str] | None = None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The tensors of a block, on the CPU and owning their memory, and its JSON.
 
-        Raises:
-            KeyError: no such block.
-            StoreError: the shard is missing, unreadable or altered.
-        """
-        tensors, shard = self._read(block, None)
-        return tensors, copy.deepcopy(shard.meta)
-
-    def load_names(self, block: BlockName, names: Iterable[str]) -> dict[str, Tensor]:
-        """Only these tensors of a block; the rest of the shard is not read once it was checked.
-
-        The checksum is verified once for each file in the life of this object, by whichever method is first.
+        Args:
+            names: of the tensors that are wanted; the rest of the shard is not read once it was checked. None
+                for all, which are checked each time; whoever wants some checks each file once in the life of
+                this object.
 
         Raises:
             KeyError: no such block or tensor.
             StoreError: the shard is missing, unreadable or altered.
         """
-        return self._read(block, list(names))[0]
+        tensors, shard = self._read(block, None if names is None else list(names))
+        return tensors, copy.deepcopy(shard.meta)
 
     def commit(
         self,

@@ -262,10 +262,7 @@ class StoredScene(VisitScene):
                 return self._unsaved[name]
             found = self._memory.whole(name) if whole else self._memory.drawn(name)
             if found is None:
-                if whole:
-                    found = Packed(*self.store.load(name))
-                else:
-                    found = Packed(self.store.load_names(name, DRAWN), self.store.meta(name))
+                found = Packed(*self.store.load(name, None if whole else DRAWN))
                 self._memory.put(name, found)
                 self._memory.shrink(self.unsaved_bytes)
             return found
