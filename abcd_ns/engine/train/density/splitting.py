@@ -50,8 +50,7 @@ def split_full(
 
 def is_full(gaussians: int, blocks: int, limits: Limits) -> bool:
     """Whether a block of so many Gaussians, in a scene of so many blocks, is to be cut; see `split_full`."""
-    limit = limits.of_block(blocks)
-    return limit > 0 and gaussians > FULL * limit
+    return limits.block_limit > 0 and gaussians > FULL * limits.of_block(blocks)
 
 
 def with_full(
