@@ -2,7 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from io import StringIO
 
 import matplotlib
@@ -27,9 +27,11 @@ DARK = {
 """What the charts' colours turn into on a dark page."""
 _SVG, _XLINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}"
 _METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+_REFERENCE = re.compile(r"(url\(#|^#)([^)]+)")
+"""An attribute's way to name an element by its id."""
 
 
-def inline_svg(figure: Figure, name: str, label: str, titles: Mapping[str, str] | None = None) -> str:
+def inline_svg(figure: Figure, name: str, label: str, titles: Mapping[str, str]) -> str:
     """The figure as an <svg> element.
 
     Args:
@@ -47,11 +49,18 @@ def inline_svg(figure: Figure, name: str, label: str, titles: Mapping[str, str] 
     for style in [found for found in root.iter(f"{_SVG}defs") if found.find(f"{_SVG}style") is not None]:
         # It would hold for the whole page; page.css has it for charts.
         style.clear()
-    _add_titles(root, titles or {})
-    _rename_ids(root, name)
-    for element in root.iter():
+    values = [value for element in root.iter() for value in element.attrib.values()]
+    used = {own for value in values for _, own in _REFERENCE.findall(value)}
+    for element in list(root.iter()):
+        if (text := titles.get(element.get("id", ""))) is not None:
+            element.insert(0, title := ET.Element("title"))
+            title.text = text
         element.tag = element.tag.removeprefix(_SVG)
-        element.attrib.update(_themed(element.attrib))
+        element.attrib = {
+            key.removeprefix(_XLINK): f"{name}-{value}" if key == "id" else _of_page(value, name)
+            for key, value in element.attrib.items()
+            if key != "id" or value in used
+        }
     return ET.tostring(root, encoding="unicode")
 
 
@@ -60,43 +69,14 @@ def theme_css() -> str:
     return " ".join(f"{_variable(light)}: {dark};" for light, dark in DARK.items())
 
 
-def _add_titles(root: ET.Element, titles: Mapping[str, str]) -> None:
-    for group in root.iter(f"{_SVG}g"):
-        if (text := titles.get(group.get("id", ""))) is not None:
-            title = ET.Element(f"{_SVG}title")
-            title.text = text
-            group.insert(0, title)
+def _of_page(value: str, name: str) -> str:
+    """An attribute in which ids are the figure's own, and colours those of the page's theme."""
 
-
-def _rename_ids(root: ET.Element, name: str) -> None:
-    """Drop ids that nothing refers to, and make the others the figure's own."""
-    used = {found for element in root.iter() for value in element.attrib.values() for found in _refers(value)}
-    for element in root.iter():
-        if element.attrib.get("id") not in used:
-            element.attrib.pop("id", None)
-        for key, value in list(element.attrib.items()):
-            if key == "id":
-                element.attrib[key] = f"{name}-{value}"
-            elif key == f"{_XLINK}href":
-                del element.attrib[key]
-                element.attrib["href"] = f"#{name}-{value[1:]}" if value.startswith("#") else value
-            else:
-                element.attrib[key] = value.replace("url(#", f"url(#{name}-")
-
-
-def _refers(value: str) -> Iterator[str]:
-    yield from re.findall(r"url\(#([^)]+)\)", value)
-    if value.startswith("#"):
-        yield value[1:]
-
-
-def _themed(attributes: Mapping[str, str]) -> dict[str, str]:
     def follow(match: re.Match[str]) -> str:
         color = match.group().lower()
         return f"var({_variable(color)}, {color})" if color in DARK else color
 
-    style = attributes.get("style")
-    return {} if style is None else {"style": re.sub(r"#[0-9a-fA-F]{6}\b", follow, style)}
+    return re.sub(r"#[0-9a-fA-F]{6}\b", follow, _REFERENCE.sub(rf"\1{name}-\2", value))
 
 
 def _variable(color: str) -> str:
