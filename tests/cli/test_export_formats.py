@@ -17,8 +17,8 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 
 from abcd_ns.cli.export.command import export
-from abcd_ns.cli.export.formats import SUFFIXES, scene_file, suffix_of
-from abcd_ns.cli.export.glb import EXTENSION, Z_TO_Y, glb_file
+from abcd_ns.cli.export.formats import SUFFIXES, suffix_of, write_scene
+from abcd_ns.cli.export.glb import EXTENSION, Z_TO_Y, write_glb
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.errors import UserError
 from tests.cli.test_export import FRAME, run, scene  # noqa: F401
@@ -26,9 +26,8 @@ from tests.reference.scenes import random_gaussians
 
 
 def write(path, gaussians, suffix, parts=2, up=Z_TO_Y):
-    with scene_file(path, suffix, len(gaussians), gaussians.sh_degree, up) as append:
-        for rows in torch.arange(len(gaussians)).chunk(parts):
-            append(gaussians[rows])
+    pieces = (gaussians[rows] for rows in torch.arange(len(gaussians)).chunk(parts))
+    write_scene(path, suffix, len(gaussians), gaussians.sh_degree, up, pieces)
     return path
 
 
@@ -117,11 +116,8 @@ def test_a_glb_stands_upright_in_either_frame(run, scene, tmp_path, frame):  # n
 
 
 def test_more_than_a_glb_can_hold_is_refused(tmp_path):
-    with (
-        pytest.raises(UserError, match=r"and a \.glb holds 4; use --by-block"),
-        glb_file(tmp_path / "large.glb", 20_000_000, 3, "", Z_TO_Y),
-    ):
-        pass
+    with pytest.raises(UserError, match=r"and a \.glb holds 4; use --by-block"):
+        write_glb(tmp_path / "large.glb", 20_000_000, 3, Z_TO_Y, [])
     assert list(tmp_path.iterdir()) == []
 
 

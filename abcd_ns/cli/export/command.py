@@ -9,17 +9,16 @@ from typing import Annotated, Literal
 
 import torch
 import tyro
-from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
-from torch import Tensor
 
-from abcd_ns.cli.export.formats import PACKED, rounding, scene_file, suffix_of
+from abcd_ns.cli.export.formats import PACKED, rounding, suffix_of, write_scene
 from abcd_ns.cli.export.glb import Z_TO_Y
 from abcd_ns.cli.export.packed import BYTES_AT_ONCE
 from abcd_ns.cli.export.shown import Box, Shown
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
+from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import STATE, STORE
 
@@ -129,9 +128,11 @@ def stored(run: Path, out: Path) -> Iterator[ParameterStore]:
 
 
 def _write(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -> list[Path]:
-    with scene_file(out, suffix, sum(counts.values()), scene.sh_degree, _up(scene)) as append:
-        for block in _steps(counts, "writing"):
-            append(scene.gaussians(block))
+    # Turned so that y is up; in the run's own frame z is.
+    up = Z_TO_Y if scene.to is None else Z_TO_Y @ scene.to.rotation.T
+    parts = (scene.gaussians(block) for block in _steps(counts, "writing"))
+    with replacing(out) as partial:
+        write_scene(partial, suffix, sum(counts.values()), scene.sh_degree, up, parts)
         rounding(suffix, scene.largest)
     return [out]
 
@@ -146,11 +147,6 @@ def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -
         shutil.rmtree(out)
         raise
     return written
-
-
-def _up(scene: Shown) -> Float[Tensor, "3 3"]:
-    """Turns what is written so that y is up; in the run's own frame z is."""
-    return Z_TO_Y if scene.to is None else Z_TO_Y @ scene.to.rotation.T
 
 
 def _steps(blocks: Iterable[int], what: str) -> Iterator[int]:

@@ -1,25 +1,21 @@
 """The formats of an exported scene, chosen by the file's suffix."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns import __version__
-from abcd_ns.cli.export.glb import glb_file
-from abcd_ns.cli.export.packed import check_installed, packed_file
-from abcd_ns.cli.export.ply import ply_file
-from abcd_ns.engine.store.atomic import replacing
+from abcd_ns.cli.export.glb import write_glb
+from abcd_ns.cli.export.packed import check_installed, write_packed
+from abcd_ns.cli.export.ply import write_ply
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 
 PACKED = (".compressed.ply", ".spz", ".sog")
 SUFFIXES = (*PACKED, ".ply", ".glb")
 """The longer of two that fit comes first."""
-GENERATOR = f"abcd_ns {__version__}"
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
 """What .spz rounds positions to, and how far from the origin they may be: 24 bits, 12 of them below one."""
 
@@ -57,32 +53,19 @@ def rounding(suffix: str, largest: float) -> float:
     return SPZ_STEP / 2
 
 
-@contextmanager
-def scene_file(
-    path: Path, suffix: str, count: int, sh_degree: int, up: Float[Tensor, "3 3"]
-) -> Iterator[Callable[[Gaussians], None]]:
-    """Yields what takes the next Gaussians; the file appears under its name once all are in it.
+def write_scene(
+    path: Path, suffix: str, count: int, sh_degree: int, up: Float[Tensor, "3 3"], parts: Iterable[Gaussians]
+) -> None:
+    """Write Gaussians as they come.
 
     Args:
         suffix: of SUFFIXES.
         count: how many there will be; most formats say so at their beginning.
         up: turns the Gaussians' frame so that y is up.
     """
-    written = 0
-    with replacing(path) as partial:
-        if suffix == ".ply":
-            made = ply_file(partial, count, sh_degree, GENERATOR)
-        elif suffix == ".glb":
-            made = glb_file(partial, count, sh_degree, GENERATOR, up)
-        else:
-            made = packed_file(partial, count, sh_degree, suffix[1:], GENERATOR)
-        with made as append:
-
-            def counted(gaussians: Gaussians) -> None:
-                nonlocal written
-                written += len(gaussians)
-                append(gaussians)
-
-            yield counted
-            if written != count:
-                raise RuntimeError(f"{path}: {written} Gaussians, where {count} were announced")
+    if suffix == ".ply":
+        write_ply(path, count, sh_degree, parts)
+    elif suffix == ".glb":
+        write_glb(path, count, sh_degree, up, parts)
+    else:
+        write_packed(path, count, sh_degree, suffix[1:], parts)

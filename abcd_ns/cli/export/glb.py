@@ -7,8 +7,7 @@ spherical harmonic. A viewer that does not know it shows points in their colours
 
 import json
 import struct
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from itertools import accumulate
 from math import isqrt
 from pathlib import Path
@@ -19,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.cli.export.ply import GENERATOR
 from abcd_ns.engine.gaussians.frames import quaternion
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
@@ -86,11 +86,10 @@ def _linear(color: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     return torch.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
-@contextmanager
-def glb_file(
-    path: Path, count: int, sh_degree: int, comment: str, up: Float[Tensor, "3 3"]
-) -> Iterator[Callable[[Gaussians], None]]:
-    """Yields what takes the next Gaussians, `count` in all, and writes them to `path`.
+def write_glb(
+    path: Path, count: int, sh_degree: int, up: Float[Tensor, "3 3"], parts: Iterable[Gaussians]
+) -> None:
+    """Write Gaussians as they come, `count` in all.
 
     Args:
         up: turns the frame that the Gaussians are in, so that y is up. A node of the file says it: the
@@ -99,9 +98,9 @@ def glb_file(
     Raises:
         UserError: they are too many for one file.
     """
-    parts = attributes(sh_degree)
-    starts = list(accumulate((part.stride * count for part in parts), initial=0))
-    document = _document(parts, starts, count, comment, up)
+    columns = attributes(sh_degree)
+    starts = list(accumulate((column.stride * count for column in columns), initial=0))
+    document = _document(columns, starts, count, up)
     words = 4 * -(-(len(json.dumps(document)) + _SPARE) // 4)
     head = 12 + 8 + words + 8
     total = head + starts[-1]
@@ -112,17 +111,13 @@ def glb_file(
     done, low, high = 0, np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
     with path.open("wb") as file:
         file.truncate(total)
-
-        def append(gaussians: Gaussians) -> None:
-            nonlocal done, low, high
+        for gaussians in parts:
             found = values(gaussians)
-            for part, start, value in zip(parts, starts, found, strict=False):
-                file.seek(head + start + done * part.stride)
-                file.write(np.ascontiguousarray(value).tobytes())
+            for column, start, value in zip(columns, starts, found, strict=False):
+                file.seek(head + start + done * column.stride)
+                file.write(value.tobytes())
             done += len(gaussians)
             low, high = np.minimum(low, found[0].min(0)), np.maximum(high, found[0].max(0))
-
-        yield append
         document["accessors"][0] |= {"min": low.tolist(), "max": high.tolist()}
         file.seek(0)
         file.write(struct.pack("<4sIII4s", b"glTF", 2, total, words, b"JSON"))
@@ -131,16 +126,16 @@ def glb_file(
 
 
 def _document(
-    parts: list[Attribute], starts: list[int], count: int, comment: str, up: Float[Tensor, "3 3"]
+    columns: list[Attribute], starts: list[int], count: int, up: Float[Tensor, "3 3"]
 ) -> dict[str, Any]:
     w, x, y, z = quaternion(up).tolist()
     primitive = {
         "mode": 0,
-        "attributes": {part.name: number for number, part in enumerate(parts)},
+        "attributes": {column.name: number for number, column in enumerate(columns)},
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
     return {
-        "asset": {"version": "2.0", "generator": comment},
+        "asset": {"version": "2.0", "generator": GENERATOR},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -148,12 +143,12 @@ def _document(
         "meshes": [{"primitives": [primitive]}],
         "buffers": [{"byteLength": starts[-1]}],
         "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": part.stride * count, "target": 34962}
-            for part, start in zip(parts, starts, strict=False)
+            {"buffer": 0, "byteOffset": start, "byteLength": column.stride * count, "target": 34962}
+            for column, start in zip(columns, starts, strict=False)
         ],
         "accessors": [
-            {"bufferView": number, "componentType": part.component, "count": count, "type": part.kind}
-            | ({"normalized": True} if part.component == _BYTE else {})
-            for number, part in enumerate(parts)
+            {"bufferView": number, "componentType": column.component, "count": count, "type": column.kind}
+            | ({"normalized": True} if column.component == _BYTE else {})
+            for number, column in enumerate(columns)
         ],
     }

@@ -1,7 +1,6 @@
 """Smaller files, by the package gaussforge, all at once: .spz, .sog and .compressed.ply."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +23,8 @@ def check_installed() -> None:
         ) from None
 
 
-@contextmanager
-def packed_file(
-    path: Path, count: int, sh_degree: int, kind: str, comment: str
-) -> Iterator[Callable[[Gaussians], None]]:
-    """Yields what takes the next Gaussians, `count` in all, and writes them to `path` when all are there.
+def write_packed(path: Path, count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians]) -> None:
+    """Write Gaussians, `count` in all, once all are there.
 
     Args:
         kind: "spz", "sog" or "compressed.ply".
@@ -39,16 +35,12 @@ def packed_file(
     import gaussforge
 
     table, done = np.empty((count, len(columns(sh_degree))), dtype="<f4"), 0
-
-    def append(gaussians: Gaussians) -> None:
-        nonlocal done
+    for gaussians in parts:
         table[done : done + len(gaussians)] = rows(gaussians)
         done += len(gaussians)
-
-    yield append
     if kind == "compressed.ply":
         _transpose(table, sh_degree)
-    whole = header(count, sh_degree, comment) + table.tobytes()
+    whole = header(count, sh_degree) + table.tobytes()
     del table
     found = gaussforge.GaussForge().convert(whole, "ply", kind)
     if "error" in found:

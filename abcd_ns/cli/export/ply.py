@@ -1,12 +1,14 @@
 """The .ply file of 3D Gaussian Splatting, written part by part: no more than a part is ever in memory."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from abcd_ns import __version__
 from abcd_ns.engine.types import Gaussians
+
+GENERATOR = f"abcd_ns {__version__}"
 
 
 def columns(sh_degree: int) -> list[str]:
@@ -37,16 +39,16 @@ def rows(gaussians: Gaussians) -> np.ndarray:
     return np.concatenate([value.float().cpu().numpy() for value in values], axis=1).astype("<f4", copy=False)
 
 
-def header(count: int, sh_degree: int, comment: str) -> bytes:
+def header(count: int, sh_degree: int) -> bytes:
     """What stands before the rows of so many Gaussians."""
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}", f"element vertex {count}"]
     lines += [f"property float {name}" for name in columns(sh_degree)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 
 
-@contextmanager
-def ply_file(path: Path, count: int, sh_degree: int, comment: str) -> Iterator[Callable[[Gaussians], None]]:
-    """Yields what takes the next Gaussians, `count` in all, and writes them to `path`."""
+def write_ply(path: Path, count: int, sh_degree: int, parts: Iterable[Gaussians]) -> None:
+    """Write Gaussians as they come, `count` in all."""
     with path.open("wb") as file:
-        file.write(header(count, sh_degree, comment))
-        yield lambda gaussians: file.write(np.ascontiguousarray(rows(gaussians)).tobytes())
+        file.write(header(count, sh_degree))
+        for gaussians in parts:
+            file.write(rows(gaussians).tobytes())

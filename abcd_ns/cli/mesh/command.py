@@ -11,7 +11,6 @@ import torch
 import tyro
 
 from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_data
-from abcd_ns.cli.export.formats import GENERATOR
 from abcd_ns.cli.export.shown import Box, check_trained
 from abcd_ns.cli.mesh.depth_maps import draw
 from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
@@ -85,7 +84,7 @@ def mesh(
         seen = _seen(store, pipeline_config(run, read_settings(run), data))
         fused, side = _surface(*seen, wanted)
         with replacing(out) as partial:
-            write_ply(partial, fused, GENERATOR)
+            write_ply(partial, fused)
     size, (vertices, faces) = out.stat().st_size / 2**20, (len(fused.vertices), len(fused.faces))
     print(f"{out}: {vertices:,} vertices, {faces:,} faces, {size:.1f} MiB, voxels of {side:.3g}")
     tell_rounding(".ply", float(np.abs(fused.vertices).max()), float(np.ptp(fused.vertices, axis=0).max()))

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from abcd_ns.cli.export.ply import GENERATOR
+
 SPECK = 0.001
 """Clusters with fewer faces than this share of the largest one's are left out."""
 
@@ -56,13 +58,13 @@ def with_faces(mesh: Piece, kept: np.ndarray) -> Piece:
     return Piece(mesh.vertices[used], mesh.colors[used], faces.reshape(-1, 3))
 
 
-def write_ply(path: Path, mesh: Piece, comment: str) -> None:
+def write_ply(path: Path, mesh: Piece) -> None:
     """Binary, with a colour for each vertex."""
     vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
     vertices["position"], vertices["color"] = mesh.vertices, (mesh.colors * 255).round()
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.faces
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {comment}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}"]
     lines += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
     lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
     lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
