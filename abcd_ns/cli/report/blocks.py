@@ -43,16 +43,14 @@ def describe_blocks(run: RunFolder) -> list[Block]:
 
 
 def _describe(run: RunFolder, block: int, gaussians: int | None) -> Block:
-    visits = run.story.of_block(block)
-    known = run.state.views if run.state is not None else {}
-    health = run.state.health if run.state is not None else {}
+    visits, health = run.story.of_block(block), run.state.health
     return Block(
         number=block + 1,
         gaussians=gaussians,
         parameters=run.parameters.get(block),
         shed=None if block not in health else health[block].shed,
         filled=run.filled.get(block),
-        views=known.get(block),
+        views=run.state.views.get(block),
         visits=sum(visit.done for visit in visits),
         seconds=sum(visit.seconds for visit in visits),
         layer_seconds=sum(visit.layer_seconds for visit in visits),
@@ -61,15 +59,15 @@ def _describe(run: RunFolder, block: int, gaussians: int | None) -> Block:
     )
 
 
-def _state(story: Story, state: RunState | None, block: int, gaussians: int | None) -> str:
+def _state(story: Story, state: RunState, block: int, gaussians: int | None) -> str:
     if not story.visits:
         return "trained in every step"
-    if state is not None and state.active is not None and state.active.geometry.block == block:
+    if state.active is not None and state.active.geometry.block == block:
         return "in training when saved"
     if gaussians == 0:
         return "empty"
     if any(visit.done for visit in story.of_block(block)):
         return "trained"
-    if state is not None and state.views.get(block) == 0:
+    if state.views.get(block) == 0:
         return "no view shows it"
     return "in the warm-up only" if any(visit.block is None for visit in story.visits) else "not yet visited"

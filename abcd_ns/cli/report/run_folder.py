@@ -61,7 +61,7 @@ class RunFolder:
     story: Story
     checkpoint: Checkpoint | None
     """None where the run ended before its first."""
-    state: RunState | None
+    state: RunState = field(default_factory=RunState)
     """Where the planner stood at the checkpoint, or else when the run was last heard of."""
     filled: Mapping[int, float] = field(default_factory=dict)
     """By block, the pixels that a Gaussian fills in all its views, the median, as known then."""
@@ -203,15 +203,15 @@ def _newest(folder: Path) -> Checkpoint | None:
 
 def _read_store(
     folder: Path, checkpoint: Checkpoint | None
-) -> tuple[RunState | None, dict[int, float], dict[int, int]]:
+) -> tuple[RunState, dict[int, float], dict[int, int]]:
     if not folder.is_dir():
-        return None, {}, {}
+        return RunState(), {}, {}
     try:
         store = ParameterStore.open(folder, read_only=True)
         if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
-        state = RunState.from_json(store.state) if store.state else None
-        seen = [] if state is None else [block for block, views in state.views.items() if views]
+        state = RunState.from_json(store.state)
+        seen = [block for block, views in state.views.items() if views]
         filled = {block: px for block in seen if (px := _filled(store, block)) is not None}
         parameters = {
             block: store.meta(block)["parameters"] for block in store.blocks if isinstance(block, int)

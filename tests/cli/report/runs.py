@@ -82,7 +82,7 @@ def made_up_checkpoint(path: Path) -> Checkpoint:
 def made_up_run(tmp_path: Path, **settings) -> RunFolder:
     """A run without a folder."""
     story = read_story(write_log(tmp_path / "log.jsonl", log_lines()))
-    return RunFolder(tmp_path, made_up_settings(**settings), story, made_up_checkpoint(tmp_path), None)
+    return RunFolder(tmp_path, made_up_settings(**settings), story, made_up_checkpoint(tmp_path))
 
 
 def made_up_score(row: int, psnr: float, name: str | None = None) -> ViewScore:
