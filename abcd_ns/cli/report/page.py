@@ -2,7 +2,7 @@
 
 import base64
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +29,16 @@ from abcd_ns.machine import Versions, without_home
 GENERATOR = "abcd report"
 """Begins the page's generator, by which a page of ours is known."""
 HERE = Path(__file__).parent
+CAPTIONS = {
+    "Quality": "PSNR of the held-out views, and of the crops that were trained on.",
+    "Visits": (
+        "Which block was trained when; each visit begins with drawing its layers. Dotted: a sweep ends."
+    ),
+    "Gaussians": "In the whole scene.",
+    "Quality by block": "On training crops, at the end of each visit.",
+    "Memory": "Of the process.",
+    "Budgets": "What is kept at hand, as a share of what may be.",
+}
 SPARK_WIDTH, SPARK_HEIGHT, SPARK_EDGE = 112, 22, 3
 SPARK_DB = 1.0
 """The height of a sparkline stands for at least so much, that noise may look small."""
@@ -58,7 +68,8 @@ def render_page(run: RunFolder, held_out: HeldOut | None, plan: Plan | None, not
     return pages.get_template("page.html").render(
         generator=f"{GENERATOR} {__version__}",
         script=Markup(script),
-        script_hash=_csp_hash(script),
+        # As a Content-Security-Policy names the one script that may run.
+        script_hash="sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         css=Markup((HERE / "page.css").read_text(encoding="utf-8")),
         dark_charts=Markup(theme_css()),
         scene=settings.scene,
@@ -82,11 +93,6 @@ def render_page(run: RunFolder, held_out: HeldOut | None, plan: Plan | None, not
     )
 
 
-def _csp_hash(script: str) -> str:
-    """As a Content-Security-Policy names the one script that may run."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-
-
 def _versions(versions: Versions) -> list[tuple[str, str]]:
     commit, plus, changes = (versions.commit or NOTHING).partition("+")
     known = {**vars(versions), "commit": commit[:12] + plus + changes}
@@ -105,50 +111,31 @@ def _charts(run: RunFolder, held_out: HeldOut | None) -> list[Chart]:
     story, method = run.story, run.settings.method
     psnr = None if held_out is None else held_out.mean("psnr_merged")
     measured = None if psnr is None or run.checkpoint is None else (run.checkpoint.step, psnr)
-    drawn = (
-        (
-            "quality",
-            "Quality",
-            "PSNR of the held-out views, and of the crops that were trained on.",
-            charts.draw_quality(story, measured, method),
-        ),
-        (
-            "visits",
-            "Visits",
-            "Which block was trained when; each visit begins with drawing its layers. Dotted: a sweep ends.",
-            charts.draw_visits(story),
-        ),
-        ("gaussians", "Gaussians", "In the whole scene.", charts.draw_gaussians(story)),
-        (
-            "block-quality",
-            "Quality by block",
-            "On training crops, at the end of each visit.",
-            charts.draw_block_quality(story),
-        ),
-        ("memory", "Memory", "Of the process.", charts.draw_memory(story)),
-        (
-            "budgets",
-            "Budgets",
-            "What is kept at hand, as a share of what may be.",
-            charts.draw_budgets(story),
-        ),
-    )
+    figures = {
+        "Quality": charts.draw_quality(story, measured, method),
+        "Visits": charts.draw_visits(story),
+        "Gaussians": charts.draw_gaussians(story),
+        "Quality by block": charts.draw_block_quality(story),
+        "Memory": charts.draw_memory(story),
+        "Budgets": charts.draw_budgets(story),
+    }
     titles = charts.visit_titles(story)
-    return [_chart(name, title, text, figure, titles) for name, title, text, figure in drawn if figure]
+    return [_chart(title, CAPTIONS[title], figure, titles) for title, figure in figures.items() if figure]
 
 
 def _plans(plan: Plan | None) -> list[Chart]:
-    if plan is None:
+    if plan is None or not len(plan.means):
         return []
     text = "Cells, Gaussians (grey)" + (", cameras (orange: held out)." if len(plan.cameras) else ".")
-    drawn = [("plan", "From above", text, draw_plan(plan))]
+    drawn = [_chart("From above", text, draw_plan(plan))]
     if plan.is_stacked:
-        drawn.append(("side", "From the side", "Where cells lie above others.", draw_plan(plan, 0, 2)))
-    return [_chart(name, title, text, figure, {}) for name, title, text, figure in drawn if figure]
+        drawn.append(_chart("From the side", "Where cells lie above others.", draw_plan(plan, 0, 2)))
+    return drawn
 
 
-def _chart(name: str, title: str, text: str, figure: Figure, titles: dict[str, str]) -> Chart:
-    return Chart(title, text, Markup(inline_svg(figure, name, f"Chart: {title}. {text}", titles)))
+def _chart(title: str, text: str, figure: Figure, titles: Mapping[str, str] | None = None) -> Chart:
+    name = title.lower().replace(" ", "-")
+    return Chart(title, text, Markup(inline_svg(figure, name, f"Chart: {title}. {text}", titles or {})))
 
 
 # -- what the template writes with -------------------------------------------------------------------

@@ -74,14 +74,12 @@ def make_plan(tree: BlockTree, means: Float[Tensor, "n 3"], cameras: Sequence[Ca
 
 
 @in_style
-def draw_plan(plan: Plan, across: int = 0, along: int = 1) -> Figure | None:
-    """The scene as seen along the third axis; nothing without Gaussians.
+def draw_plan(plan: Plan, across: int = 0, along: int = 1) -> Figure:
+    """The scene, of some Gaussians at least, as seen along the third axis.
 
     Args:
         across, along: the axes of the drawing, 0 to 2.
     """
-    if len(plan.means) == 0:
-        return None
     low, high = _bounds(plan, [across, along])
     extent = high - low
     height = min(max((WIDTH - EDGE) * extent[1] / extent[0], LOWEST), LARGEST)
