@@ -81,12 +81,8 @@ def pick(scores: Sequence[ViewScore], wanted: int) -> dict[int, str]:
 
 def data_uri(picture: PictureArray, lossless: bool) -> str:
     """A picture, uint8 [h, w, 3], as a PNG or JPEG that stands in the page itself."""
-    stream = BytesIO()
-    if lossless:
-        Image.fromarray(picture).save(stream, "PNG", optimize=True)
-    else:
-        Image.fromarray(picture).save(stream, "JPEG", quality=JPEG_QUALITY, optimize=True)
-    kind = "png" if lossless else "jpeg"
+    stream, kind = BytesIO(), "png" if lossless else "jpeg"
+    Image.fromarray(picture).save(stream, kind, quality=JPEG_QUALITY, optimize=True)
     return f"data:image/{kind};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
@@ -120,14 +116,10 @@ def _show(drawn: Drawn, scored: ViewScore, place: str, count: int) -> Shown:
     height, width = photo.shape[:2]
     scale = min(1.0, (PAGE_PIXELS / (3 * count * height * width)) ** 0.5)
     size = (max(round(width * scale), 1), max(round(height * scale), 1))
-    images = [_reduce(image, size) for image in (photo, picture, error_picture(picture, photo))]
+    images = [Image.fromarray(image) for image in (photo, picture, error_picture(picture, photo))]
+    reduced = [np.asarray(image.resize(size, Image.Resampling.LANCZOS)) for image in images]
     lossless = size[0] * size[1] <= LOSSLESS_PIXELS
-    return Shown(scored, place, *(data_uri(image, lossless) for image in images), *size)
-
-
-def _reduce(picture: PictureArray, size: tuple[int, int]) -> PictureArray:
-    image = Image.fromarray(picture)
-    return np.asarray(image if image.size == size else image.resize(size, Image.Resampling.LANCZOS))
+    return Shown(scored, place, *(data_uri(image, lossless) for image in reduced), *size)
 
 
 def _to_bytes(picture: Tensor) -> PictureArray:
