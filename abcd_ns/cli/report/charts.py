@@ -102,12 +102,11 @@ def draw_gaussians(story: Story) -> Figure | None:
 @in_style
 def draw_memory(story: Story) -> Figure | None:
     """RAM of the process and memory on the device, over time."""
+    on_gpu = [line for line in story.samples if line.device_bytes is not None]
     series = {
         "RAM": [(line.seconds, line.rss_bytes / GIB) for line in story.samples],
-        "GPU": [(line.seconds, (line.device_bytes or 0) / GIB) for line in story.samples],
+        "GPU": [(line.seconds, line.device_bytes / GIB) for line in on_gpu],
     }
-    if all(line.device_bytes is None for line in story.samples):
-        del series["GPU"]
     colors = {"RAM": STEPS, "GPU": LAYERS}
     return _draw_series(story, series, colors, "memory (GiB)", lambda name, y: f"{name}\n{y:.2f} GiB")
 
@@ -224,9 +223,8 @@ def _label(
     colors: dict[str, str],
     write: Callable[[str, float], str],
 ) -> None:
-    two_lines = any("\n" in write(name, y) for name, (_, y) in ends.items())
-    gap = 0.17 if two_lines else 0.075
-    label_ends(axes, ends, 1.03 * max(story.seconds, 1e-3), colors, write, gap)
+    """Each line's end, in two lines of text."""
+    label_ends(axes, ends, 1.03 * max(story.seconds, 1e-3), colors, write, gap=0.17)
 
 
 def _label_median(axes: Axes, story: Story, blocks: Sequence[Sequence[tuple[float, float]]]) -> None:
