@@ -108,8 +108,6 @@ def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[
 def _plan(run: RunFolder, pipeline: AbcdPipeline | None) -> Plan | None:
     if run.checkpoint is None:
         return None
-    cameras = []
-    if pipeline is not None:
-        data = pipeline.datamanager
-        cameras = [data.train_dataset.cameras, data.eval_dataset.cameras]
+    data = None if pipeline is None else pipeline.datamanager
+    cameras = [data.train_dataset.cameras, data.eval_dataset.cameras] if data else []
     return make_plan(run.checkpoint.tree, run.checkpoint.means, cameras)

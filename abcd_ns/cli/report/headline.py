@@ -1,7 +1,6 @@
 """What a run came to, in a few numbers."""
 
 from dataclasses import dataclass
-from datetime import timedelta
 
 from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder
@@ -9,6 +8,7 @@ from abcd_ns.cli.report.story import Story
 from abcd_ns.cli.words import many
 from abcd_ns.engine.train.memory import FLOAT
 from abcd_ns.lab.results.tables import GIB, MIB, NOTHING
+from abcd_ns.viewer.texts import clock
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def headline(run: RunFolder, held_out: HeldOut | None) -> list[Fact]:
         Fact("steps", f"{story.step:,}"),
         Fact(
             "training time",
-            _clock(story.seconds),
+            f"{story.seconds:.1f} s" if story.seconds < 100 else clock(story.seconds),
             more=f"{share:.0%} for layers" if story.layer_seconds else "",
         ),
         *_workers(story),
@@ -102,7 +102,3 @@ def _memory(run: RunFolder) -> list[Fact]:
     if machine.gpu is not None:
         facts.append(Fact("peak GPU memory", f"{device / GIB:.2f}", "GiB", machine.gpu))
     return facts
-
-
-def _clock(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds < 100 else str(timedelta(seconds=int(seconds)))
