@@ -35,22 +35,16 @@ def bulk(means: Float[Tensor, "n 3"]) -> Box:
     return Box(low - margin, high + margin)
 
 
-def clipped(cell: Box, bounds: Box) -> Box | None:
-    """The part of a cell within the bounds; None if it lies outside."""
-    lower, upper = torch.maximum(cell.lower, bounds.lower), torch.minimum(cell.upper, bounds.upper)
-    return Box(lower, upper) if bool((lower < upper).all()) else None
-
-
 def boxes_of(tree: BlockTree, bounds: Box) -> dict[int, Box]:
     """By block, its box within the bounds, a little apart from others; blocks outside are missing."""
-    gap = GAP * float((bounds.upper - bounds.lower).norm())
-    found = {block: clipped(tree.cell(block), bounds) for block in range(tree.num_blocks)}
-    return {block: _inset(box, gap) for block, box in found.items() if box is not None}
-
-
-def center(box: Box) -> Float[np.ndarray, "3"]:
-    """The middle of a box, in the viewer's units."""
-    return ((box.lower + box.upper) / 2).numpy() * SCENE_SCALE
+    gap, found = GAP * float((bounds.upper - bounds.lower).norm()), {}
+    for block in range(tree.num_blocks):
+        cell = tree.cell(block)
+        lower, upper = torch.maximum(cell.lower, bounds.lower), torch.minimum(cell.upper, bounds.upper)
+        if bool((lower < upper).all()):
+            inset = torch.clamp((upper - lower) / 4, max=gap / 2)
+            found[block] = Box(lower + inset, upper - inset)
+    return found
 
 
 def frame_mesh(box: Box, thickness: float) -> tuple[Float[np.ndarray, "v 3"], UInt32[np.ndarray, "f 3"]]:
@@ -72,8 +66,3 @@ def frame_mesh(box: Box, thickness: float) -> tuple[Float[np.ndarray, "v 3"], UI
     vertices = np.concatenate([start + _CORNERS * (stop - start) for start, stop in beams])
     faces = np.concatenate([_FACES + 8 * k for k in range(len(beams))])
     return (vertices * SCENE_SCALE).astype(np.float32), faces.astype(np.uint32)
-
-
-def _inset(box: Box, gap: float) -> Box:
-    room = torch.clamp((box.upper - box.lower) / 4, max=gap / 2)
-    return Box(box.lower + room, box.upper - room)

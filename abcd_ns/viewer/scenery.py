@@ -12,7 +12,7 @@ from torch import Tensor
 
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.types import View
-from abcd_ns.viewer.boxes import SCENE_SCALE, center, frame_mesh
+from abcd_ns.viewer.boxes import SCENE_SCALE, frame_mesh
 from abcd_ns.viewer.run_history import Status
 
 COLORS = {
@@ -74,7 +74,7 @@ class Scenery:
         ]
         if len(self._boxes) <= MOST_LABELS:
             text = f"{block + 1} {status.value}" if active else str(block + 1)
-            position = tuple(center(box).tolist())
+            position = tuple(((box.lower + box.upper) / 2 * SCENE_SCALE).tolist())
             nodes.append(
                 self._scene.add_label(f"/abcd/label_{block + 1}", text, position=position, visible=shown)
             )
