@@ -1,6 +1,6 @@
 """The panel's controls in the browser, by the calls that viser 0.2 and 1 have in common."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,8 @@ class Controls:
                 self._sweep = gui.add_progress_bar(0.0, color="teal")
             self._show = gui.add_dropdown("Show", options=tuple(show.value for show in Show))
             self._block = gui.add_dropdown("Block", options=(FOLLOW,) if trains else ("1",))
-            self._boxes = gui.add_checkbox("Boxes", initial_value=True)
-            self._cameras = gui.add_checkbox("Its cameras", initial_value=False)
+            self.boxes = gui.add_checkbox("Boxes", initial_value=True)
+            self.cameras = gui.add_checkbox("Its cameras", initial_value=False)
             with gui.add_folder("Table", expand_by_default=True):
                 self._texts["blocks"] = gui.add_markdown("")
             with gui.add_folder("Memory", expand_by_default=trains):
@@ -45,7 +45,7 @@ class Controls:
                     # A root for pictures' files, which viser asks for although there are none.
                     self._texts["curve"] = gui.add_markdown(curve_image([], CURVE), image_root=Path())
                     gui.add_markdown(CURVE)
-        for handle in (self._show, self._block, self._boxes, self._cameras):
+        for handle in (self._show, self._block, self.boxes, self.cameras):
             handle.on_update(lambda _: changed())
 
     @property
@@ -57,16 +57,6 @@ class Controls:
     def block(self) -> int | None:
         """The chosen block; None for the one in training."""
         return None if self._block.value == FOLLOW else int(self._block.value) - 1
-
-    @property
-    def boxes(self) -> bool:
-        """Whether to show boxes."""
-        return bool(self._boxes.value)
-
-    @property
-    def cameras(self) -> bool:
-        """Whether to show the cameras of the chosen block."""
-        return bool(self._cameras.value)
 
     def set_blocks(self, count: int) -> None:
         """Offer so many blocks for choice."""
@@ -83,10 +73,6 @@ class Controls:
         """Move the bars; 0..1."""
         _move(self._run, run)
         _move(self._sweep, sweep)
-
-    def draw_curve(self, points: Sequence[tuple[float, float]]) -> None:
-        """Redraw the curve of accuracy over time."""
-        self.write(curve=curve_image(points, CURVE))
 
 
 def _move(bar: Any, share: float) -> None:

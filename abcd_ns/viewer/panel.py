@@ -29,7 +29,8 @@ from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
 from abcd_ns.viewer.boxes import boxes_of, bulk
-from abcd_ns.viewer.controls import Controls
+from abcd_ns.viewer.chart import curve_image
+from abcd_ns.viewer.controls import CURVE, Controls
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Choice
 from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, seconds_left, sweep_share
@@ -150,7 +151,7 @@ class AbcdPanel(ViewerControl):
         self._updated = time.monotonic()
         rows = self._rows()
         self._controls.write(blocks=block_table(rows), memory=memory_table(self._memory()))
-        self._scenery.show_boxes({row.block: row.status for row in rows}, self._controls.boxes)
+        self._scenery.show_boxes({row.block: row.status for row in rows}, self._controls.boxes.value)
         self._show_cameras()
         if self._coordinator is not None:
             self._report(self._coordinator)
@@ -169,7 +170,7 @@ class AbcdPanel(ViewerControl):
             history.end(seconds)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
             self._curve_drawn = self._updated
-            self._controls.draw_curve(history.curve)
+            self._controls.write(curve=curve_image(history.curve, CURVE))
 
     def _where(self, state: RunState) -> str:
         active = state.active
@@ -229,7 +230,7 @@ class AbcdPanel(ViewerControl):
         return visit.block
 
     def _show_cameras(self) -> None:
-        block = self._chosen_block() if self._controls.cameras else None
+        block = self._chosen_block() if self._controls.cameras.value else None
         if block != self._cameras_of or block is None:
             self._scenery.show_cameras([] if block is None else self._views_of(block))
         self._cameras_of = block
