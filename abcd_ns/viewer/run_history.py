@@ -71,10 +71,9 @@ class RunHistory:
         seen = [block for block, views in state.views.items() if views > 0]
         visits = {block: state.sweep + (block not in waiting) for block in seen}
         over = sum(block not in waiting for block in seen)
-        history = RunHistory(
-            visits={b: n for b, n in visits.items() if n}, sweep_began=seconds, sweep_visits=over
-        )
-        history.sweep = state.sweep if state.views else None
+        sweep = state.sweep if state.views else None
+        visits = {block: count for block, count in visits.items() if count}
+        history = RunHistory(visits, sweep=sweep, sweep_began=seconds, sweep_visits=over)
         if (active := state.active) is not None:
             block = None if active.is_whole else active.geometry.block
             seen = len(active.trained_on)
