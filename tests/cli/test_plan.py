@@ -1,14 +1,15 @@
 """`abcd plan`: its figures add up, and what would not fit is said."""
 
 import dataclasses
+import itertools
 import math
 
 import pytest
 import torch
 from rich.console import Console
 
-from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast, warnings_of
-from abcd_ns.cli.plan.forecast import Share, device_shares, disk_shares, views_of_blocks
+from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast
+from abcd_ns.cli.plan.forecast import Forecast, Share, device_shares, disk_shares, views_of_blocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
@@ -49,7 +50,7 @@ def test_a_forecast_adds_up():
     low, high = found.hours
     assert low < high == pytest.approx(low * 1000 / 400)
     needs = DeviceNeeds(48 * 36, 4, levels=3)  # where the CPU is the device, nothing else is kept there
-    assert sum(share.nbytes for share in found.device) == needs.bytes_for(250)
+    assert sum(share.nbytes for share in found.shares["device"]) == needs.bytes_for(250)
     assert not found.warnings
 
 
@@ -59,7 +60,7 @@ def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
         capture(), Wanted(blocks=2, max_gaussians=3_000_000, device_budget_gb=0.5), Console(quiet=True)
     )
     assert found.fit.limits == dict.fromkeys(FITTED, 0) | {"batch_limit": 4}
-    assert "1,500,000 Gaussians" in found.device[0].what
+    assert "1,500,000 Gaussians" in found.shares["device"][0].what
     assert any("on the device" in line for line in found.warnings)
 
 
@@ -78,7 +79,7 @@ def test_a_device_budget_decides_how_many_blocks():
     )
     assert few.fit.blocks_at_the_end == few.fit.blocks == many.fit.blocks == 1
     assert many.fit.blocks_at_the_end > 2
-    assert sum(share.nbytes for share in many.device) <= 3 * GB
+    assert sum(share.nbytes for share in many.shares["device"]) <= 3 * GB
 
 
 def test_large_photos_are_planned_for_as_they_are_trained_on():
@@ -88,7 +89,7 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
         dataclasses.replace(small, views=large), Wanted(device_budget_gb=0.15), Console(quiet=True)
     )
     assert 0 < found.fit.crop_pixels < 260_000
-    assert sum(share.nbytes for share in found.device) <= 0.15 * GB
+    assert sum(share.nbytes for share in found.shares["device"]) <= 0.15 * GB
     assert not found.warnings
 
 
@@ -109,16 +110,25 @@ def test_disk_holds_two_generations_and_a_checkpoint():
     assert device_shares(fit, needs)[0].nbytes == 1000 * needs.gaussian_bytes
 
 
-@pytest.mark.parametrize("where", ["device", "ram", "disk"])
-def test_what_does_not_fit_is_said_with_what_to_do(where):
-    shares = {"device": FITS, "ram": FITS, "disk": FITS, where: (Share("too much", 2**60),)}
-    (line,) = warnings_of(Fit(2, 100, 100, GB, 100, 4), (5, 5), **shares)
-    assert {"device": "on the device", "ram": "of RAM", "disk": "of disk"}[where] in line
+@pytest.fixture(scope="module")
+def fits() -> Forecast:
+    """Of two blocks, all of it."""
+    found = forecast(capture(), Wanted(blocks=2), Console(quiet=True))
+    return dataclasses.replace(found, shares=dict.fromkeys(found.shares, FITS))
+
+
+@pytest.mark.parametrize(
+    ("where", "said"), [("device", "on the device"), ("RAM", "of RAM"), ("disk", "of disk")]
+)
+def test_what_does_not_fit_is_said_with_what_to_do(fits, where, said):
+    too_much = dataclasses.replace(fits, shares=fits.shares | {where: (Share("too much", 2**60),)})
+    (line,) = too_much.warnings
+    assert said in line
     assert ": " in line
 
 
-def test_blocks_that_hardly_any_view_sees_are_counted():
-    (line,) = warnings_of(Fit(3, 100, 100, GB, 100, 4), (0, 2, 3), device=FITS, ram=FITS, disk=FITS)
+def test_blocks_that_hardly_any_view_sees_are_counted(fits):
+    (line,) = dataclasses.replace(fits, views_of_block=(0, 2, 3)).warnings
     assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
 
 
@@ -132,7 +142,7 @@ def test_the_screen_is_short_and_says_more_when_asked(capsys):
         assert word in short
     print_forecast(found, Console(width=120), verbose=True)
     shown = capsys.readouterr().out
-    for share in (*found.device, *found.ram, *found.disk):
+    for share in itertools.chain(*found.shares.values()):
         assert share.what in shown
         assert share.what not in short
     assert "views by block" in shown
@@ -148,7 +158,7 @@ def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
     block, around = (share.nbytes for share in found.sent)
     assert block == 2 * 3 * 100 * numbers  # with both moments, there and back
     assert around == 500 * numbers
-    more = sum(s.nbytes for s in found.ram) - sum(s.nbytes for s in alone.ram)
+    more = sum(s.nbytes for s in found.shares["RAM"]) - sum(s.nbytes for s in alone.shares["RAM"])
     assert more == 600 * numbers + 6 * block  # six visits are out at once
     print_forecast(alone, Console(width=120))
     assert "sent" not in capsys.readouterr().out

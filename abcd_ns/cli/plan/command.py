@@ -17,12 +17,12 @@ from torch import Tensor
 from abcd_ns import methods
 from abcd_ns.cli.plan.forecast import (
     Forecast,
-    Shares,
     device_shares,
     disk_shares,
     ram_shares,
     sent_shares,
     time_steps,
+    total,
     views_of_blocks,
 )
 from abcd_ns.cli.terminal import print_facts
@@ -31,7 +31,6 @@ from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.space.partition import build_kd
-from abcd_ns.engine.train.health_record import FEW_VIEWS
 from abcd_ns.engine.train.memory import levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
@@ -163,21 +162,24 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
     with console.status("Timing a step"):
         seconds = time_steps(gaussians, spread, training, batch)
     photo_bytes = sum(3 * view.full.pixels for view in views)
-    shares = {
-        "device": device_shares(fit, needs),
-        "ram": ram_shares(fit, needs, photo_bytes, default_budget(), wanted.workers),
-        "disk": disk_shares(fit, needs),
-    }
     return Forecast(
         fit=fit,
         points=len(points),
         batch=batch,
         views_of_block=seen,
         points_of_block=tuple(counts.tolist()),
-        **shares,
+        shares={
+            "device": device_shares(fit, needs),
+            "RAM": ram_shares(fit, needs, photo_bytes, default_budget(), wanted.workers),
+            "disk": disk_shares(fit, needs),
+        },
+        free={
+            "device": fit.budget,
+            "RAM": psutil.virtual_memory().available,
+            "disk": shutil.disk_usage(Path.cwd()).free,
+        },
         steps=wanted.steps,
         seconds_per_step=seconds,
-        warnings=tuple(warnings_of(fit, seen, **shares)),
         workers=wanted.workers,
         sent=sent_shares(fit, needs) if wanted.workers > 1 else (),
     )
@@ -193,23 +195,6 @@ def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:
     return replace(fit, blocks=blocks_to_begin_with(fit, wanted.workers if wanted.workers > 1 else 0))
 
 
-def warnings_of(fit: Fit, seen: tuple[int, ...], device: Shares, ram: Shares, disk: Shares) -> list[str]:
-    """What would not fit, each with what to do about it."""
-    lines, in_ram, on_disk = [], psutil.virtual_memory().available, shutil.disk_usage(Path.cwd()).free
-    for shares, free, where, how, cure in (
-        (device, fit.budget, "on the device", "may be taken", "leave --blocks out, or give more of them"),
-        (ram, in_ram, "of RAM", "are free", "limit the scene by --max-gaussians, or free memory"),
-        (disk, on_disk, "of disk", "are free in this folder", "use `ns-train --output-dir` on another disk"),
-    ):
-        if (needed := _total(shares)) > free:
-            lines.append(f"{needed / GB:.1f} GB {where}, but {free / GB:.1f} GB {how}: {cure}.")
-    if few := sum(count <= FEW_VIEWS for count in seen):
-        lines.append(
-            f"{few} of {len(seen)} blocks are seen by fewer than {FEW_VIEWS + 1} views: use fewer blocks."
-        )
-    return lines
-
-
 def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> None:
     """A few lines and a table for people; `verbose` says where the figures come from."""
     fit = found.fit
@@ -220,23 +205,16 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
         "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views}",
     }
-    for title, shares, free in (
-        ("device", found.device, fit.budget),
-        ("RAM", found.ram, psutil.virtual_memory().available),
-        ("disk", found.disk, shutil.disk_usage(Path.cwd()).free),
-    ):
-        rows[title] = f"{_total(shares) / GB:.2f} GB at most, {free / GB:.1f} GB may be taken"
-        if verbose:
-            rows |= {f"  {share.what}": f"{share.nbytes / GB:.2f} GB" for share in shares}
+    for place, shares in found.shares.items():
+        rows[place] = f"{_gb(total(shares))} at most, {found.free[place] / GB:.1f} GB may be taken"
+        rows |= {f"  {share.what}": _gb(share.nbytes) for share in shares if verbose}
     if found.workers > 1:
         rows["workers"] = f"{found.workers}, each with as much of a GPU, or of the RAM, as the device above"
-        rows["sent a visit"] = f"{_total(found.sent) / GB:.2f} GB at most"
-        if verbose:
-            rows |= {f"  {share.what}": f"{share.nbytes / GB:.2f} GB" for share in found.sent}
+        rows["sent a visit"] = f"{_gb(total(found.sent))} at most"
+        rows |= {f"  {share.what}": _gb(share.nbytes) for share in found.sent if verbose}
     if verbose:
         for what, values in (("points", found.points_of_block), ("views", found.views_of_block)):
-            spread = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"
-            rows[f"{what} by block"] = spread
+            rows[f"{what} by block"] = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"
         rows["a step on the points"] = f"{found.seconds_per_step:.3f} s"
         rows["limits"] = fit.in_words() if fit.sole else "none of a block's Gaussians, as --blocks is given"
     print_facts(rows, console)
@@ -246,8 +224,8 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         console.print("\nAll of it fits. What takes the room: abcd plan --verbose", highlight=False)
 
 
-def _total(shares: Shares) -> int:
-    return sum(share.nbytes for share in shares)
+def _gb(nbytes: int) -> str:
+    return f"{nbytes / GB:.2f} GB"
 
 
 def _hours(hours: float) -> str:

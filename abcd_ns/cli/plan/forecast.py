@@ -11,16 +11,23 @@ from abcd_ns.engine.render import Shot, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.health_record import FEW_VIEWS
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.fit import Fit, RamShares
+from abcd_ns.nerfstudio.fit import GB, Fit, RamShares
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
 GENERATIONS = 2
 """Of the store on disk: the one in use, and the one that the last checkpoint pins."""
 TIMED_STEPS = 3
+PLACES = {
+    "device": ("on the device", "may be taken", "leave --blocks out, or give more of them"),
+    "RAM": ("of RAM", "are free", "limit the scene by --max-gaussians, or free memory"),
+    "disk": ("of disk", "are free in this folder", "use `ns-train --output-dir` on another disk"),
+}
+"""Where room is taken, and in which words it is said where there is not enough, with what to do about it."""
 LAYER_SHARE = 0.15
 """Time for layers by the time of steps: they took 11 to 15% of runs on a CPU (docs/results, 2026-11-23)."""
 
@@ -46,13 +53,13 @@ class Forecast:
     views_of_block: tuple[int, ...]
     """By block, the training views in which one of its points is."""
     points_of_block: tuple[int, ...]
-    device: Shares
-    ram: Shares
-    disk: Shares
+    shares: dict[str, Shares]
+    """By place, of PLACES."""
+    free: dict[str, int]
+    """Bytes that may be taken there."""
     steps: int
     seconds_per_step: float
     """Measured with the initial points."""
-    warnings: tuple[str, ...]
     workers: int = 1
     sent: Shares = ()
     """What a visit by a worker moves; nothing without workers."""
@@ -63,6 +70,24 @@ class Forecast:
         layers = 1 + LAYER_SHARE * (self.fit.blocks_at_the_end > 1)
         low = self.steps * self.seconds_per_step * layers / 3600
         return low, low * max(self.fit.gaussians / max(self.points, 1), 1.0)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What would not fit, each with what to do about it."""
+        lines, views = [], self.views_of_block
+        for place, (where, how, cure) in PLACES.items():
+            needed, free = total(self.shares[place]), self.free[place]
+            if needed > free:
+                lines.append(f"{needed / GB:.1f} GB {where}, but {free / GB:.1f} GB {how}: {cure}.")
+        if few := sum(count <= FEW_VIEWS for count in views):
+            seen = f"{few} of {len(views)} blocks are seen by fewer than {FEW_VIEWS + 1} views"
+            lines.append(f"{seen}: use fewer blocks.")
+        return lines
+
+
+def total(shares: Shares) -> int:
+    """Bytes."""
+    return sum(share.nbytes for share in shares)
 
 
 def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple[int, ...]:
