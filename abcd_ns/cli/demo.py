@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -142,7 +143,7 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
     facts = {
         "held-out PSNR": f"{scores['psnr']:.2f} dB",
         "held-out SSIM": f"{scores['ssim']:.3f}",
-        "Gaussians": f"{count_vertices(ply):,}",
+        "Gaussians": f"{_count(ply):,}",
         "peak RAM of training": f"{peak / 2**30:.2f} GiB",
         "time": f"{steps.seconds:.0f} s, training {trained:.0f} s of it",
         "the picture": str(pictures[0]),
@@ -209,19 +210,10 @@ def _draw(out: Path, pairs: Sequence[Pair]) -> list[Path]:
     return paths
 
 
-def count_vertices(ply: Path) -> int:
-    """How many Gaussians a .ply file says that it holds.
-
-    Raises:
-        ValueError: its header does not say.
-    """
+def _count(ply: Path) -> int:
+    """How many Gaussians the file that was exported says, in its header, that it holds."""
     with open(ply, "rb") as file:
-        for line in file:
-            if line.startswith(b"element vertex "):
-                return int(line.split()[2])
-            if line.startswith(b"end_header"):
-                break
-    raise ValueError(f"{ply} has no header of a .ply file with vertices")
+        return int(re.search(rb"^element vertex (\d+)$", file.read(1024), re.MULTILINE)[1])
 
 
 def _tool(name: str) -> str:

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from abcd_ns.cli import demo as demo_module
-from abcd_ns.cli.demo import count_vertices, demo
+from abcd_ns.cli.demo import demo
 from abcd_ns.errors import UserError
 
 STAND_IN = """#!{python}
@@ -192,10 +192,3 @@ def test_a_missing_nerfstudio_is_said_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     with pytest.raises(UserError, match="ns-train is missing; install nerfstudio"):
         demo_module._tool("ns-train")
-
-
-@pytest.mark.parametrize("content", [b"ply\nend_header\n", b"", b"no ply\n"])
-def test_a_ply_without_vertices_is_noticed(tmp_path, content):
-    (tmp_path / "a.ply").write_bytes(content)
-    with pytest.raises(ValueError, match="no header"):
-        count_vertices(tmp_path / "a.ply")
