@@ -1,15 +1,18 @@
-"""What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do."""
+"""What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do; --json."""
 
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 from rich.console import Console
 
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
+from abcd_ns.errors import UserError
+from abcd_ns.lab.results.records import encode, write_json
 
 Level = Literal["error", "warning", "note"]
 STYLES: dict[Level, str] = {"error": "bold red", "warning": "yellow", "note": "cyan"}
@@ -60,23 +63,41 @@ def print_findings(findings: Sequence[Finding], console: Console) -> None:
 
 def _print(finding: Finding, console: Console) -> None:
     # Names of files may hold newlines, and bytes that no terminal takes.
-    width, what, fix = min(console.width, WIDEST), one_line(finding.what), one_line(finding.fix)
+    what, fix = f"{finding.name}: {one_line(finding.what)}", one_line(finding.fix)
+    wide = {"width": min(console.width, WIDEST), "break_long_words": False, "break_on_hyphens": False}
     if finding.level == "error":
-        lines = [f"  {finding.name}: {what}"]
+        lines = [f"  {what}"]
     else:
-        lines = _wrap(f"{finding.name}: {what}", width, "  ", "    ")
+        lines = textwrap.wrap(what, initial_indent="  ", subsequent_indent="    ", **wide)
     if fix:
-        lines += _wrap(fix, width, "    -> ", "       ")
+        lines += textwrap.wrap(fix, initial_indent="    -> ", subsequent_indent="       ", **wide)
     for line in lines:
         print_plain(line, console)
 
 
-def _wrap(text: str, width: int, first: str, then: str) -> list[str]:
-    return textwrap.wrap(
-        text,
-        width,
-        initial_indent=first,
-        subsequent_indent=then,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+def check_json(path: Path | None) -> None:
+    """Whether a report could be written: refused before any work where it could not.
+
+    Raises:
+        UserError: `path` is a folder, or lies in none.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise UserError(f"--json {path} is a folder; name a file.")
+    if not path.parent.is_dir():
+        raise UserError(f"--json {path}: the folder {path.parent} does not exist; make it first.")
+
+
+def write_report(path: Path | None, report: Any) -> None:
+    """Write a frozen dataclass; None writes nothing.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    if path is None:
+        return
+    try:
+        write_json(path, encode(report))
+    except OSError as error:
+        raise UserError(f"--json {path} cannot be written ({error.strerror}); name another file.") from None

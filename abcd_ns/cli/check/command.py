@@ -9,8 +9,7 @@ from rich.console import Console
 from abcd_ns.cli.check import about_cameras, about_photos, about_points
 from abcd_ns.cli.check.summary import Summary, print_summary, summarize
 from abcd_ns.cli.check.survey import Survey, survey
-from abcd_ns.cli.findings import Finding, by_level, print_findings
-from abcd_ns.cli.json_option import check_json, write_report
+from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.prepare import DOWNSCALE
