@@ -1,14 +1,17 @@
-"""Text in the terminal as it is: names of files may look like markup or emoji."""
+"""Text for people: lists and counts in sentences, and what the terminal shows as it is."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+NAMED = 3
+"""Of a list, how many are named."""
+
 
 def print_plain(text: str, console: Console, style: str | None = None) -> None:
-    """Without markup and colours, and not wrapped, so that it can be copied."""
+    """Without markup, which names of files may look like, and not wrapped, so that it can be copied."""
     console.print(text, style=style, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
@@ -18,3 +21,19 @@ def print_facts(facts: Mapping[str, str], console: Console) -> None:
     for name, value in facts.items():
         table.add_row(Text(name), Text(value))
     console.print(table)
+
+
+def few(names: Sequence[str], count: int | None = None) -> str:
+    """The first names of a list, and how many more there are.
+
+    Args:
+        count: of the whole list, where `names` is only its beginning.
+    """
+    shown, count = list(names[:NAMED]), len(names) if count is None else count
+    more = [f"{count - len(shown)} more"] if count > len(shown) else []
+    return ", ".join(shown + more)
+
+
+def many(count: int, one: str, several: str) -> str:
+    """`count` and the noun in its number, as "1 photo has" or "2 photos have"."""
+    return f"{count:,} {one if count == 1 else several}"

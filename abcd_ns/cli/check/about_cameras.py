@@ -7,7 +7,7 @@ import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
 from abcd_ns.cli.findings import Finding, note, warning
-from abcd_ns.cli.words import few, many
+from abcd_ns.cli.terminal import few, many
 
 SMALL_BASELINE = 0.02
 """Extent of the cameras, as a share of the median distance to what they see, below which depth is a guess."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
 from abcd_ns.cli.findings import Finding, error, note, warning
-from abcd_ns.cli.words import few, many
+from abcd_ns.cli.terminal import few, many
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.prepare import DOWNSCALE, MAX_AUTO_SIDE
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from abcd_ns.cli.check.survey import Survey
 from abcd_ns.cli.findings import Finding, note, warning
-from abcd_ns.cli.words import many
+from abcd_ns.cli.terminal import many
 
 FEW = 500
 FAR_OFF = 100.0

@@ -8,8 +8,7 @@ from rich.console import Console
 
 from abcd_ns.cli.check.about_photos import photo_bytes
 from abcd_ns.cli.check.survey import Survey
-from abcd_ns.cli.terminal import print_facts
-from abcd_ns.cli.words import few
+from abcd_ns.cli.terminal import few, print_facts
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.scene import Lens

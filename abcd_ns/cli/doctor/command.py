@@ -11,8 +11,7 @@ from abcd_ns.cli.doctor.facts import Facts, gather, without_home
 from abcd_ns.cli.doctor.hardware import Hardware
 from abcd_ns.cli.doctor.kernels import Kernels
 from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
-from abcd_ns.cli.terminal import print_plain
-from abcd_ns.cli.words import many
+from abcd_ns.cli.terminal import many, print_plain
 
 SCHEMA = 1
 """Of the JSON file; changes with its fields."""

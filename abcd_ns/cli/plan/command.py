@@ -25,8 +25,7 @@ from abcd_ns.cli.plan.forecast import (
     total,
     views_of_blocks,
 )
-from abcd_ns.cli.terminal import print_facts
-from abcd_ns.cli.words import many
+from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
