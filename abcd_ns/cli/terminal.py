@@ -11,7 +11,7 @@ NAMED = 3
 
 
 def print_plain(text: str, console: Console, style: str | None = None) -> None:
-    """Without markup, which names of files may look like, and not wrapped, so that it can be copied."""
+    """Without markup and colours, as names of files may look like it, and not wrapped, to be copied."""
     console.print(text, style=style, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 

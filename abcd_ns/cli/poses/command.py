@@ -8,17 +8,10 @@ from typing import Annotated
 
 import pycolmap
 import tyro
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from abcd_ns.cli.poses.mapping import Model, Order, Stage, Task, find_poses
+from abcd_ns.cli.poses.mapping import FEATURES, MATCHES, POSES, Model, Order, Task, find_poses
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import Problems
 from abcd_ns.data.picture_files import SUFFIXES, check_complete, read_header
@@ -32,11 +25,7 @@ MANY = 400
 """With more photos, comparing each with each takes hours."""
 NAMED = 5
 """Photos without a pose that are named."""
-WORDS = {
-    Stage.FEATURES: "looking for features",
-    Stage.MATCHES: "comparing photos",
-    Stage.POSES: "finding poses",
-}
+WORDS = {FEATURES: "looking for features", MATCHES: "comparing photos", POSES: "finding poses"}
 
 
 def poses(
@@ -120,20 +109,25 @@ def _check_lens(lens: str) -> None:
 
 
 def _with_bars(task: Task, console: Console) -> Model | None:
-    columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as bars:
+    columns = (
+        progress.TextColumn("{task.description:<20}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+    )
+    with progress.Progress(*columns, console=console) as bars:
         shown = {stage: bars.add_task(words, total=None, start=False) for stage, words in WORDS.items()}
 
-        def show(stage: Stage, done: int) -> None:
-            for earlier in Stage:
-                if earlier < stage:  # it may have ended between two looks
-                    total = task.total(earlier)
-                    bars.update(shown[earlier], total=total, completed=total)
+        def show(stage: int, done: int) -> None:
+            for earlier in range(stage):  # it may have ended between two looks
+                total = task.total(earlier)
+                bars.update(shown[earlier], total=total, completed=total)
             bars.start_task(shown[stage])
             bars.update(shown[stage], total=task.total(stage), completed=done)
 
         found = find_poses(task, show)
-        bars.update(shown[Stage.POSES], completed=len(found.posed) if found else 0)
+        bars.update(shown[POSES], completed=len(found.posed) if found else 0)
         return found
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
-from enum import IntEnum
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Literal
@@ -25,17 +24,9 @@ OVERLAP = 12
 SECONDS_BETWEEN_LOOKS = 0.3
 
 Order = Literal["any", "video"]
-
-
-class Stage(IntEnum):
-    """What is being done."""
-
-    FEATURES = 0
-    MATCHES = 1
-    POSES = 2
-
-
-TABLES = {Stage.FEATURES: "images", Stage.MATCHES: "matches"}
+FEATURES, MATCHES, POSES = range(3)
+"""What is being done."""
+TABLES = {FEATURES: "images", MATCHES: "matches"}
 """Of the database: a row for all that a stage has done."""
 
 
@@ -58,10 +49,10 @@ class Task:
     def database(self) -> Path:
         return self.work / "database.db"
 
-    def total(self, stage: Stage) -> int:
+    def total(self, stage: int) -> int:
         """What a stage goes through: photos, or the pairs of them that are compared, about."""
         n = len(self.names)
-        if stage != Stage.MATCHES:
+        if stage != MATCHES:
             return n
         return n * (n - 1) // 2 if self.order == "any" else n * OVERLAP
 
@@ -78,7 +69,7 @@ class Model:
     """Mean reprojection error, pixels."""
 
 
-def find_poses(task: Task, show: Callable[[Stage, int], None]) -> Model | None:
+def find_poses(task: Task, show: Callable[[int, int], None]) -> Model | None:
     """Features, matches and poses; None where no two photos fit together.
 
     Args:
@@ -93,8 +84,8 @@ def find_poses(task: Task, show: Callable[[Stage, int], None]) -> Model | None:
     try:
         found = pool.submit(_work, task)
         while not wait([found], SECONDS_BETWEEN_LOOKS).done:
-            now = Stage(stage.value)
-            show(now, posed.value if now == Stage.POSES else _rows(task.database, TABLES[now]))
+            now = stage.value
+            show(now, posed.value if now == POSES else _rows(task.database, TABLES[now]))
         return found.result()
     except (RuntimeError, ValueError, IndexError, OSError) as error:
         raise UserError(f"pycolmap could not find poses: {first_line(error)}.") from error
@@ -126,27 +117,19 @@ def _work(task: Task) -> Model | None:
     """What the process does."""
     stage, posed = _shared
     pycolmap.set_random_seed(task.seed)
-    _extract(task)
-    stage.value = Stage.MATCHES
-    _match(task)
-    stage.value = Stage.POSES
-    return _best_model(task, posed)
-
-
-def _extract(task: Task) -> None:
     mode = pycolmap.CameraMode.SINGLE if task.one_lens else pycolmap.CameraMode.AUTO
     reader = pycolmap.ImageReaderOptions(camera_model=task.lens)
     pycolmap.extract_features(
         task.database, task.photos, image_names=list(task.names), camera_mode=mode, reader_options=reader
     )
-
-
-def _match(task: Task) -> None:
+    stage.value = MATCHES
     if task.order == "any":
         pycolmap.match_exhaustive(task.database)
-        return
-    pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
-    pycolmap.match_sequential(task.database, pairing_options=pairing)
+    else:
+        pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
+        pycolmap.match_sequential(task.database, pairing_options=pairing)
+    stage.value = POSES
+    return _best_model(task, posed)
 
 
 def _best_model(task: Task, posed: Synchronized) -> Model | None:
