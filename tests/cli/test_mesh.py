@@ -78,8 +78,7 @@ def maps(request, tmp_path_factory) -> DepthMaps:
 
 
 def fused(maps: DepthMaps, part_boxes: int) -> tuple[Fusion, Piece]:
-    fusion = Fusion(maps, VOXEL, part_boxes)
-    fusion.find_boxes(lambda: None)
+    fusion = Fusion(maps, VOXEL, lambda: None, part_boxes)
     return fusion, weld(list(fusion.pieces(lambda: None)))
 
 
@@ -114,8 +113,7 @@ def test_parts_make_the_same_surface_bit_for_bit_and_a_part_at_a_time_is_in_ram(
 
 
 def test_what_is_transparent_or_far_away_leaves_no_surface(maps, tmp_path):
-    far = Fusion(maps, VOXEL / 100)
-    far.find_boxes(lambda: None)
+    far = Fusion(maps, VOXEL / 100, lambda: None)
     assert list(far.pieces(lambda: None)) == []
     scene, views = sphere(), maps.views[:2]
     scene.opacities[:] = -5.0

@@ -140,9 +140,8 @@ def _surface(
         if not len(footprints):
             raise UserError("There is no surface: what the training views show is too transparent.")
         side = wanted.voxel or VOXEL_PIXELS * float(np.median(footprints))
-        fusion = Fusion(maps, side)
         with ProgressBar("looking for surfaces", len(views)) as bar:
-            fusion.find_boxes(bar.advance)
+            fusion = Fusion(maps, side, bar.advance)
         with ProgressBar("fusing", fusion.parts * len(views)) as bar:
             welded = weld([wanted.within(piece) for piece in fusion.pieces(bar.advance)])
     if (far := float((footprints > FAR * side).mean())) > MANY:

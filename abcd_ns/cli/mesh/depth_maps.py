@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.whole_pictures import WholePictures
+from abcd_ns.engine.layers.whole_pictures import Rasters
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.types import View
 
@@ -19,17 +19,6 @@ SAMPLES = 1000
 """Pixels of a view by which footprints are known."""
 
 
-def depth_of(picture: Raster, median: Float[Tensor, "h w"] | None = None) -> Float[Tensor, "h w"]:
-    """Camera z of what each pixel shows, world units. 0 where it shows too little.
-
-    Args:
-        median: taken where it is given; else the expected one.
-    """
-    opacity = 1 - picture.transmittance
-    depth = picture.depth / opacity.clamp_min(1e-6) if median is None else median
-    return torch.where(opacity >= LEAST_OPACITY, depth, 0.0)
-
-
 @dataclass
 class DepthMaps:
     """Of some views, in files of `folder`: 7 bytes a pixel."""
@@ -37,10 +26,13 @@ class DepthMaps:
     folder: Path
     views: list[View] = field(default_factory=list)
 
-    def add(self, view: View, picture: Raster, depth: Float[Tensor, "h w"]) -> None:
-        """Keep what a view sees."""
-        color = picture.color / (1 - picture.transmittance).clamp_min(LEAST_OPACITY)[..., None]
-        number = len(self.views)
+    def add(self, view: View, picture: Raster, median: Float[Tensor, "h w"] | None) -> None:
+        """Keep what a view sees: camera z, median or else expected, world units, 0 where it shows too little;
+        and colours."""
+        number, opacity = len(self.views), 1 - picture.transmittance
+        depth = picture.depth / opacity.clamp_min(1e-6) if median is None else median
+        depth = torch.where(opacity >= LEAST_OPACITY, depth, 0.0)
+        color = picture.color / opacity.clamp_min(LEAST_OPACITY)[..., None]
         np.save(self._file("depth", number), depth.float().cpu().numpy())
         np.save(self._file("color", number), (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
         self.views.append(view)
@@ -67,7 +59,7 @@ class DepthMaps:
 
 
 def draw(
-    pictures: WholePictures,
+    pictures: Rasters,
     views: Sequence[View],
     folder: Path,
     advance: Callable[[], None],
@@ -80,6 +72,6 @@ def draw(
     """
     maps = DepthMaps(folder)
     for view, picture in zip(views, pictures.draw(views), strict=True):
-        maps.add(view, picture, depth_of(picture, median and median(view)))
+        maps.add(view, picture, median and median(view))
         advance()
     return maps

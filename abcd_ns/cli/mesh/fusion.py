@@ -37,39 +37,33 @@ FAR = BOX / STRIDE
 
 
 class Fusion:
-    """Fuses depth maps.
+    """Fuses depth maps. Begins by finding the boxes in which views see a surface, and parts them.
 
     Args:
         voxel: their side, world units.
+        advance: called for each view that was looked at.
         part_boxes: of a part, about, those around it left out.
     """
 
-    def __init__(self, maps: DepthMaps, voxel: float, part_boxes: int = PART_BOXES) -> None:
-        self._maps, self._voxel, self._part_boxes = maps, voxel, part_boxes
-        self._seen, self._boxes = list[np.ndarray](), np.zeros((0, 3), np.int32)
-        self.most_boxes = 0
-        """In RAM at the same time, so far."""
-        self._tree = build_kd(torch.zeros(0, 3), 1)
-
-    @property
-    def parts(self) -> int:
-        """In how many parts space is fused."""
-        return self._tree.num_blocks
-
-    def find_boxes(self, advance: Callable[[], None]) -> None:
-        """Find the boxes in which views see a surface, and part them; the first thing to do."""
-        grid = self._grid(1)
-        for number, view in enumerate(self._maps.views):
-            depth, found = self._maps.depth(number), np.zeros((0, 3), np.int32)
+    def __init__(
+        self, maps: DepthMaps, voxel: float, advance: Callable[[], None], part_boxes: int = PART_BOXES
+    ) -> None:
+        self._maps, self._voxel, self._seen = maps, voxel, list[np.ndarray]()
+        grid, none = self._grid(1), np.zeros((0, 3), np.int32)
+        for number, view in enumerate(maps.views):
+            depth, found = maps.depth(number), none
             sampled = depth[::STRIDE, ::STRIDE]
             if ((sampled > 0) & (sampled < self._farthest(view))).any():
                 boxes = grid.compute_unique_block_coordinates(_image(depth), *self._optics(view))
                 found = np.unique(boxes.numpy(), axis=0)
             self._seen.append(found)
             advance()
-        self._boxes = np.unique(np.concatenate([np.zeros((0, 3), np.int32), *self._seen]), axis=0)
-        parts = max(1, -(-len(self._boxes) // self._part_boxes))
-        self._tree = build_kd(self._centers(self._boxes), parts)
+        self._boxes = np.unique(np.concatenate([none, *self._seen]), axis=0)
+        self.parts = max(1, -(-len(self._boxes) // part_boxes))
+        """In how many parts space is fused."""
+        self._tree = build_kd(self._centers(self._boxes), self.parts)
+        self.most_boxes = 0
+        """In RAM at the same time, so far."""
 
     def pieces(self, advance: Callable[[], None]) -> Iterator[Piece]:
         """The surface, part by part; `advance` is called for each view of each part."""
