@@ -41,7 +41,7 @@ def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) 
     crops = [(line.seconds, line.psnr) for line in story.samples if line.psnr is not None]
     if not held_out and not crops:
         return None
-    figure, axes = _axes(story)
+    figure, axes = _axes(story, "PSNR (dB)")
     ends, colors = {}, {"held out": COLORS.get(method, STEPS), "training": TRAINING}
     if crops:
         axes.plot(*zip(*crops, strict=True), ".", color=TRAINING, markersize=2.5, alpha=0.5)
@@ -49,7 +49,6 @@ def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) 
     if held_out:
         options = {"marker": "o", "markersize": 4.5, "markeredgecolor": "#ffffff", "markeredgewidth": 0.5}
         ends["held out"] = _line(axes, held_out, colors["held out"], linewidth=1.6, **options)
-    axes.set_ylabel("PSNR (dB)")
     axes.margins(y=0.08)
     _label(axes, story, ends, colors, lambda name, psnr: f"{name}\n{psnr:.2f} dB")
     return figure
@@ -63,14 +62,13 @@ def draw_visits(story: Story) -> Figure | None:
     """
     if not story.visits:
         return None
-    figure, axes = _axes(story, min(BOTTOM + TOP + max(ROW * (story.blocks + 1), LEAST), LARGEST))
+    figure, axes = _axes(story, "block", min(BOTTOM + TOP + max(ROW * (story.blocks + 1), LEAST), LARGEST))
     for visit in story.visits:
         _draw_visit(axes, visit, story.blocks)
     for line in story.sweeps:
         axes.axvline(line.seconds, color=QUIET, linewidth=0.9, linestyle=(0, (1, 2)), zorder=0)
     axes.set_ylim(story.blocks + 0.6, 0.4)
     axes.yaxis.set_major_locator(MultipleLocator(max(1, -(-story.blocks // MANY_BLOCKS))))
-    axes.set_ylabel("block")
     axes.grid(visible=False)
     for place, (color, text) in enumerate([(STEPS, "steps"), (LAYERS, "layers")]):
         axes.annotate(
@@ -85,7 +83,7 @@ def draw_gaussians(story: Story) -> Figure | None:
     points = [(line.seconds, line.gaussians) for line in (*story.trainings, *story.samples)]
     if len(points) < 2:
         return None
-    figure, axes = _axes(story)
+    figure, axes = _axes(story, "Gaussians")
     ends = {"Gaussians": _line(axes, sorted(points), STEPS)}
     limit = story.trainings[-1].limit
     if limit is not None and limit < 3 * max(count for _, count in points):
@@ -93,7 +91,6 @@ def draw_gaussians(story: Story) -> Figure | None:
         ends["limit"] = (story.seconds, limit)
     axes.set_ylim(bottom=0)
     axes.margins(y=0.1)
-    axes.set_ylabel("Gaussians")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     _label(axes, story, ends, {"Gaussians": STEPS, "limit": LAYERS}, lambda name, n: f"{short(n)}\n{name}")
     return figure
@@ -137,11 +134,10 @@ def draw_block_quality(story: Story) -> Figure | None:
     known = {block: points for block, points in blocks.items() if points}
     if story.blocks < 2 or not known:
         return None
-    figure, axes = _axes(story)
+    figure, axes = _axes(story, "PSNR on training crops (dB)")
     few = len(known) <= MANY_BLOCKS
     for points in known.values():
         _line(axes, points, STEPS if few else QUIET, linewidth=1.0 if few else 0.5, alpha=0.75, marker=".")
-    axes.set_ylabel("PSNR on training crops (dB)")
     axes.margins(y=0.08)
     if few:
         for block, points in known.items():
@@ -162,11 +158,12 @@ def smoothed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]
     return found
 
 
-def _axes(story: Story, height: float = HEIGHT) -> tuple[Figure, Axes]:
+def _axes(story: Story, what: str, height: float = HEIGHT) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(WIDTH, height))
     size = (WIDTH - LEFT - RIGHT) / WIDTH, (height - TOP - BOTTOM) / height
     axes = figure.add_axes((LEFT / WIDTH, BOTTOM / height, *size))
     axes.set_xlabel("training time (s)")
+    axes.set_ylabel(what)
     axes.set_xlim(0, max(story.seconds, 1e-3))
     axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.yaxis.set_major_locator(MaxNLocator(6))
@@ -208,10 +205,9 @@ def _draw_series(
     known = {name: points for name, points in series.items() if points}
     if not known:
         return None
-    figure, axes = _axes(story)
+    figure, axes = _axes(story, what)
     ends = {name: _line(axes, points, colors[name]) for name, points in known.items()}
     axes.set_ylim(0, max(1.1 * max(y for points in known.values() for _, y in points), high))
-    axes.set_ylabel(what)
     _label(axes, story, ends, colors, write)
     return figure
 
