@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -48,7 +49,7 @@ class Plan:
         """Whether some cells lie above others."""
         return bool((self.tree.axis == 2).any())
 
-    @property
+    @cached_property
     def counts(self) -> Int64[np.ndarray, "b"]:
         """Gaussians by block."""
         return np.bincount(self.owner, minlength=self.tree.num_blocks)
