@@ -42,11 +42,10 @@ def headline(where: str, progress: float, left: float | None) -> str:
 
 def workers_line(workers: Sequence[WorkerSeen]) -> str:
     """What each worker is doing, counted from 1."""
-    return "  \n".join(worker_words(worker) for worker in workers)
+    return "  \n".join(map(_of_worker, workers))
 
 
-def worker_words(worker: WorkerSeen) -> str:
-    """What a worker is doing."""
+def _of_worker(worker: WorkerSeen) -> str:
     what = "waits" if worker.visits else "is starting"
     if worker.block is not None:
         what = f"block {worker.block + 1}, step {worker.done} of {worker.steps}"

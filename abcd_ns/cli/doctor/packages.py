@@ -49,13 +49,11 @@ def look_at_packages(done: Callable[[], None]) -> Packages:
         done: called after each of `len(STARTED) + 1` imports.
     """
     broken = {}
-    for module in STARTED:
-        if (error := _start(module)) is not None:
+    for module in (*STARTED, EXPORT):
+        error = _start_apart(module) if module == EXPORT else _start(module)
+        if error is not None:
             broken[module] = error
         done()
-    if (error := _start_apart(EXPORT)) is not None:
-        broken[EXPORT] = error
-    done()
     methods = {entry.name for entry in entry_points(group="nerfstudio.method_configs")}
     return Packages(
         abcd_ns=__version__,
