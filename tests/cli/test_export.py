@@ -10,6 +10,7 @@ import torch
 from plyfile import PlyData
 
 from abcd_ns.cli.export.command import TRANSFORMS, export
+from abcd_ns.cli.export.shown import Shown
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.packed import Packed
@@ -147,6 +148,16 @@ def test_far_from_the_origin_lost_digits_are_told(run, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "rounds positions to 0." in said
     assert "--frame nerfstudio" in said
+
+
+def test_the_scenes_size_is_that_of_its_blocks_together(run, scene):
+    with ParameterStore.open(run / "abcd/store", read_only=True) as store:
+        shown = Shown(store, None, None)
+        blocks = [shown.gaussians(block).means.numpy() for block in shown.blocks]
+    kept = scene.means[torch.arange(len(scene)) != 7].numpy()
+    assert max(np.ptp(means, axis=0).max() for means in blocks) < np.ptp(kept, axis=0).max()
+    assert shown.size == pytest.approx(np.ptp(kept, axis=0).max())
+    assert shown.largest == pytest.approx(np.abs(kept).max())
 
 
 def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path):

@@ -48,12 +48,23 @@ class Shown:
         check_trained(self.store)
         self._tree = BlockTree.from_json(self.store.header["tree"])
         self.blocks = range(self._tree.num_blocks)
-        self.largest, self.size = 0.0, 0.0
+        self._corners = torch.zeros(0, 3, dtype=torch.float64)
+        """The lowest and highest coordinates so far."""
 
     @cached_property
     def sh_degree(self) -> int:
         """Of all its Gaussians."""
         return Gaussians(**self._load(0, PARAM_NAMES)).sh_degree
+
+    @property
+    def largest(self) -> float:
+        """Of all coordinates that were given so far, without their signs."""
+        return float(self._corners.abs().max())
+
+    @property
+    def size(self) -> float:
+        """The longest side of their box."""
+        return float((self._corners[1] - self._corners[0]).max())
 
     def count(self, block: int) -> int:
         """How many of the block's Gaussians are to be written."""
@@ -66,9 +77,8 @@ class Shown:
         found = found[self._kept(self._placed(found.means), found.opacities)]
         if not len(found):
             return found
-        exact = self._placed(found.means)
-        self.largest = max(self.largest, float(exact.abs().max()))
-        self.size = max(self.size, float((exact.amax(0) - exact.amin(0)).max()))
+        exact = torch.cat((self._corners, self._placed(found.means)))
+        self._corners = torch.stack((exact.amin(0), exact.amax(0)))
         return found if self.to is None else self.to.gaussians(found)
 
     def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
