@@ -53,8 +53,8 @@ def read_glb(path: Path) -> Gaussians:
     count, found = document["accessors"][0]["count"], []
     for part, view in zip(parts, document["bufferViews"], strict=True):
         if part.name != "COLOR_0":
-            values = np.frombuffer(content, "<f4", count * part.width, 28 + words + view["byteOffset"])
-            found.append(torch.from_numpy(values.reshape(count, part.width).copy()))
+            values = np.frombuffer(content, "<f4", count * part.stride // 4, 28 + words + view["byteOffset"])
+            found.append(torch.from_numpy(values.reshape(count, -1).copy()))
     means, quats, scales, opacities, dc, *rest = found
     return Gaussians(means, scales.log(), quats[:, [3, 0, 1, 2]], dc, torch.stack(rest, 1), opacities.logit())
 

@@ -39,25 +39,21 @@ class Attribute(NamedTuple):
 
     name: str
     kind: str
-    width: int
+    stride: int
+    """Bytes a Gaussian."""
     component: int = _FLOAT
-
-    @property
-    def stride(self) -> int:
-        """Bytes a Gaussian."""
-        return self.width * (4 if self.component == _FLOAT else 1)
 
 
 def attributes(sh_degree: int) -> list[Attribute]:
     """In the order of the file."""
     return [
-        Attribute("POSITION", "VEC3", 3),
+        Attribute("POSITION", "VEC3", 12),
         Attribute("COLOR_0", "VEC4", 4, _BYTE),
-        Attribute(f"{EXTENSION}:ROTATION", "VEC4", 4),
-        Attribute(f"{EXTENSION}:SCALE", "VEC3", 3),
-        Attribute(f"{EXTENSION}:OPACITY", "SCALAR", 1),
+        Attribute(f"{EXTENSION}:ROTATION", "VEC4", 16),
+        Attribute(f"{EXTENSION}:SCALE", "VEC3", 12),
+        Attribute(f"{EXTENSION}:OPACITY", "SCALAR", 4),
         *(
-            Attribute(f"{EXTENSION}:SH_DEGREE_{isqrt(k)}_COEF_{k - isqrt(k) ** 2}", "VEC3", 3)
+            Attribute(f"{EXTENSION}:SH_DEGREE_{isqrt(k)}_COEF_{k - isqrt(k) ** 2}", "VEC3", 12)
             for k in range((sh_degree + 1) ** 2)
         ),
     ]
