@@ -12,6 +12,7 @@ import math
 import re
 import socket
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,9 +67,8 @@ class Rules:
         name, configured = _plain_name(found.group(1)), _plain_name(self.host)
         if name in ("localhost", configured) and name not in WILDCARDS:
             return True
-        address = _address(name)
-        if address is not None:
-            return address.is_loopback or configured in WILDCARDS
+        with suppress(ValueError):  # it is a name
+            return ipaddress.ip_address(name).is_loopback or configured in WILDCARDS
         if configured in WILDCARDS and name in _own_names():
             return True
         return self.share and name.endswith(SHARE_DOMAIN)
@@ -123,13 +123,6 @@ def content_policy(hosts: Iterable[str]) -> str:
 
 def _plain_name(name: str) -> str:
     return name.strip("[]").lower().rstrip(".")
-
-
-def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    try:
-        return ipaddress.ip_address(name)
-    except ValueError:
-        return None
 
 
 def _own_names() -> tuple[str, ...]:

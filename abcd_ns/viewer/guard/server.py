@@ -71,11 +71,9 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
             path, headers = (first, second) if older else (second.path, second.headers)
             if (reason := rules.refusal(path, headers)) is not None:
                 _tell(reason)
-                return (
-                    (HTTPStatus.FORBIDDEN, {}, b"403")
-                    if older
-                    else first.respond(HTTPStatus.FORBIDDEN, "403")
-                )
+                if older:
+                    return HTTPStatus.FORBIDDEN, {}, b"403"
+                return first.respond(HTTPStatus.FORBIDDEN, "403")
             found = None if process_request is None else process_request(first, second)
             if inspect.isawaitable(found):
                 found = await found
