@@ -19,7 +19,7 @@ class Facts:
     hardware: Hardware | None
     """None where torch does not start."""
     kernels: Kernels | None
-    """None where torch or abcd_ns do not start."""
+    """None where torch or abcd_ns do not start, so that where there are kernels there is hardware."""
 
 
 def gather() -> Facts:

@@ -152,7 +152,7 @@ def gpu(facts: Facts) -> Iterator[Finding]:
 def cpu_kernels(facts: Facts) -> Iterator[Finding]:
     """CPU kernels that are not built."""
     kernels, hardware = facts.kernels, facts.hardware
-    if kernels is None or hardware is None or hardware.gpu is not None or kernels.built == kernels.wanted:
+    if kernels is None or hardware.gpu is not None or kernels.built == kernels.wanted:
         return
     if kernels.compiler:
         yield note(
@@ -172,7 +172,7 @@ def cpu_kernels(facts: Facts) -> Iterator[Finding]:
 def gsplat_extension(facts: Facts) -> Iterator[Finding]:
     """gsplat's CUDA kernels: whether they are there, or can be compiled."""
     kernels, hardware = facts.kernels, facts.hardware
-    if kernels is None or hardware is None or hardware.gpu is None or kernels.gsplat is not None:
+    if kernels is None or hardware.gpu is None or kernels.gsplat is not None:
         return
     tools = {"nvcc": kernels.nvcc, "ninja": kernels.ninja, "a C++ compiler": kernels.compiler}
     missing = [name for name, there in tools.items() if not there]
