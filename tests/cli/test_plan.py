@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 
 from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast
-from abcd_ns.cli.plan.forecast import Forecast, Share, device_shares, disk_shares, views_of_blocks
+from abcd_ns.cli.plan.forecast import Forecast, device_shares, disk_shares, views_of_blocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
@@ -17,7 +17,7 @@ from abcd_ns.nerfstudio.fit import FITTED, GB, Fit
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with
 from tests.reference.scenes import random_gaussians, ring_of_views
 
-FITS = (Share("something", 1),)
+FITS = {"something": 1}
 
 
 def capture(count: int = 400) -> Capture:
@@ -50,7 +50,7 @@ def test_a_forecast_adds_up():
     low, high = found.hours
     assert low < high == pytest.approx(low * 1000 / 400)
     needs = DeviceNeeds(48 * 36, 4, levels=3)  # where the CPU is the device, nothing else is kept there
-    assert sum(share.nbytes for share in found.shares["device"]) == needs.bytes_for(250)
+    assert sum(found.shares["device"].values()) == needs.bytes_for(250)
     assert not found.warnings
 
 
@@ -60,7 +60,7 @@ def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
         capture(), Wanted(blocks=2, max_gaussians=3_000_000, device_budget_gb=0.5), Console(quiet=True)
     )
     assert found.fit.limits == dict.fromkeys(FITTED, 0) | {"batch_limit": 4}
-    assert "1,500,000 Gaussians" in found.shares["device"][0].what
+    assert "1,500,000 Gaussians" in next(iter(found.shares["device"]))
     assert any("on the device" in line for line in found.warnings)
 
 
@@ -79,7 +79,7 @@ def test_a_device_budget_decides_how_many_blocks():
     )
     assert few.fit.blocks_at_the_end == few.fit.blocks == many.fit.blocks == 1
     assert many.fit.blocks_at_the_end > 2
-    assert sum(share.nbytes for share in many.shares["device"]) <= 3 * GB
+    assert sum(many.shares["device"].values()) <= 3 * GB
 
 
 def test_large_photos_are_planned_for_as_they_are_trained_on():
@@ -89,7 +89,7 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
         dataclasses.replace(small, views=large), Wanted(device_budget_gb=0.15), Console(quiet=True)
     )
     assert 0 < found.fit.crop_pixels < 260_000
-    assert sum(share.nbytes for share in found.shares["device"]) <= 0.15 * GB
+    assert sum(found.shares["device"].values()) <= 0.15 * GB
     assert not found.warnings
 
 
@@ -97,17 +97,17 @@ def test_a_device_keeps_layers_and_photos_besides():
     limit = DeviceNeeds(100, 4).block_limit(GB)
     fit = Fit(blocks=2, limit=limit, sole=10**9, budget=GB, gaussians=10**9, batch=4)
     shares = device_shares(fit, DeviceNeeds(100, 4))
-    assert [share.nbytes for share in shares[2:]] == [GB // 8, GB // 8]
-    assert GB - DeviceNeeds(100, 4).gaussian_bytes < sum(share.nbytes for share in shares) <= GB
+    assert list(shares.values())[2:] == [GB // 8, GB // 8]
+    assert GB - DeviceNeeds(100, 4).gaussian_bytes < sum(shares.values()) <= GB
     alone = device_shares(dataclasses.replace(fit, blocks=1), DeviceNeeds(100, 1, levels=0))
-    assert [share.nbytes for share in alone[2:]] == [0, GB // 8]
+    assert list(alone.values())[2:] == [0, GB // 8]
 
 
 def test_disk_holds_two_generations_and_a_checkpoint():
     fit = Fit(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000, batch=4)
     needs = DeviceNeeds(100, 1)
-    assert sum(share.nbytes for share in disk_shares(fit, needs)) == 1000 * 236 * (2 * 3 + 1)
-    assert device_shares(fit, needs)[0].nbytes == 1000 * needs.gaussian_bytes
+    assert sum(disk_shares(fit, needs).values()) == 1000 * 236 * (2 * 3 + 1)
+    assert next(iter(device_shares(fit, needs).values())) == 1000 * needs.gaussian_bytes
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def fits() -> Forecast:
     ("where", "said"), [("device", "on the device"), ("RAM", "of RAM"), ("disk", "of disk")]
 )
 def test_what_does_not_fit_is_said_with_what_to_do(fits, where, said):
-    too_much = dataclasses.replace(fits, shares=fits.shares | {where: (Share("too much", 2**60),)})
+    too_much = dataclasses.replace(fits, shares=fits.shares | {where: {"too much": 2**60}})
     (line,) = too_much.warnings
     assert said in line
     assert ": " in line
@@ -142,9 +142,9 @@ def test_the_screen_is_short_and_says_more_when_asked(capsys):
         assert word in short
     print_forecast(found, Console(width=120), verbose=True)
     shown = capsys.readouterr().out
-    for share in itertools.chain(*found.shares.values()):
-        assert share.what in shown
-        assert share.what not in short
+    for what in itertools.chain(*found.shares.values()):
+        assert what in shown
+        assert what not in short
     assert "views by block" in shown
     assert math.isfinite(found.hours[1])
 
@@ -155,16 +155,16 @@ def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
     )
     assert (alone.fit.blocks, found.fit.blocks) == (1, 6)
     numbers = DeviceNeeds(48 * 36, 4).parameter_bytes
-    block, around = (share.nbytes for share in found.sent)
+    block, around = found.sent.values()
     assert block == 2 * 3 * 100 * numbers  # with both moments, there and back
     assert around == 500 * numbers
-    more = sum(s.nbytes for s in found.shares["RAM"]) - sum(s.nbytes for s in alone.shares["RAM"])
+    more = sum(found.shares["RAM"].values()) - sum(alone.shares["RAM"].values())
     assert more == 600 * numbers + 6 * block  # six visits are out at once
     print_forecast(alone, Console(width=120))
     assert "sent" not in capsys.readouterr().out
     print_forecast(found, Console(width=120), verbose=True)
     shown = capsys.readouterr().out
-    assert all(share.what in shown for share in found.sent)
+    assert all(what in shown for what in found.sent)
 
 
 @pytest.mark.parametrize(

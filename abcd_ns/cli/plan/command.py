@@ -22,7 +22,6 @@ from abcd_ns.cli.plan.forecast import (
     ram_shares,
     sent_shares,
     time_steps,
-    total,
     views_of_blocks,
 )
 from abcd_ns.cli.terminal import many, print_facts
@@ -180,7 +179,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         steps=wanted.steps,
         seconds_per_step=seconds,
         workers=wanted.workers,
-        sent=sent_shares(fit, needs) if wanted.workers > 1 else (),
+        sent=sent_shares(fit, needs) if wanted.workers > 1 else {},
     )
 
 
@@ -205,12 +204,12 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views}",
     }
     for place, shares in found.shares.items():
-        rows[place] = f"{_gb(total(shares))} at most, {found.free[place] / GB:.1f} GB may be taken"
-        rows |= {f"  {share.what}": _gb(share.nbytes) for share in shares if verbose}
+        rows[place] = f"{_gb(sum(shares.values()))} at most, {found.free[place] / GB:.1f} GB may be taken"
+        rows |= {f"  {what}": _gb(nbytes) for what, nbytes in shares.items() if verbose}
     if found.workers > 1:
         rows["workers"] = f"{found.workers}, each with as much of a GPU, or of the RAM, as the device above"
-        rows["sent a visit"] = f"{_gb(total(found.sent))} at most"
-        rows |= {f"  {share.what}": _gb(share.nbytes) for share in found.sent if verbose}
+        rows["sent a visit"] = f"{_gb(sum(found.sent.values()))} at most"
+        rows |= {f"  {what}": _gb(nbytes) for what, nbytes in found.sent.items() if verbose}
     if verbose:
         for what, values in (("points", found.points_of_block), ("views", found.views_of_block)):
             rows[f"{what} by block"] = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"

@@ -1,7 +1,7 @@
 """What a run will need: blocks and the views that see them, memory, disk and time."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -32,15 +32,8 @@ LAYER_SHARE = 0.15
 """Time for layers by the time of steps: they took 11 to 15% of runs on a CPU (docs/results, 2026-11-23)."""
 
 
-@dataclass(frozen=True)
-class Share:
-    """Something that takes room."""
-
-    what: str
-    nbytes: int
-
-
-Shares = tuple[Share, ...]
+Shares = dict[str, int]
+"""Bytes, by what takes them."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +54,7 @@ class Forecast:
     seconds_per_step: float
     """Measured with the initial points."""
     workers: int = 1
-    sent: Shares = ()
+    sent: Shares = field(default_factory=dict)
     """What a visit by a worker moves; nothing without workers."""
 
     @property
@@ -76,18 +69,13 @@ class Forecast:
         """What would not fit, each with what to do about it."""
         lines, views = [], self.views_of_block
         for place, (where, how, cure) in PLACES.items():
-            needed, free = total(self.shares[place]), self.free[place]
+            needed, free = sum(self.shares[place].values()), self.free[place]
             if needed > free:
                 lines.append(f"{needed / GB:.1f} GB {where}, but {free / GB:.1f} GB {how}: {cure}.")
         if few := sum(count <= FEW_VIEWS for count in views):
             seen = f"{few} of {len(views)} blocks are seen by fewer than {FEW_VIEWS + 1} views"
             lines.append(f"{seen}: use fewer blocks.")
         return lines
-
-
-def total(shares: Shares) -> int:
-    """Bytes."""
-    return sum(share.nbytes for share in shares)
 
 
 def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple[int, ...]:
@@ -105,13 +93,12 @@ def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple
 def device_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
     """What a visit to a block of the expected size takes on the device."""
     largest = _largest(fit)
-    trained = largest * needs.gaussian_bytes
-    return (
-        Share(f"a block of {largest:,} Gaussians in training", trained),
-        Share("a step's pictures, or layers while they are drawn", needs.fixed_bytes),
-        Share("layers that are kept", needs.layer_bytes(fit.budget)),
-        Share("photos that are kept", needs.photo_bytes(fit.budget)),
-    )
+    return {
+        f"a block of {largest:,} Gaussians in training": largest * needs.gaussian_bytes,
+        "a step's pictures, or layers while they are drawn": needs.fixed_bytes,
+        "layers that are kept": needs.layer_bytes(fit.budget),
+        "photos that are kept": needs.photo_bytes(fit.budget),
+    }
 
 
 def _largest(fit: Fit) -> int:
@@ -123,32 +110,28 @@ def _largest(fit: Fit) -> int:
 def sent_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
     """What a visit by a worker moves: at most, for a machine keeps what it was sent until it changes."""
     block = _largest(fit) * needs.parameter_bytes
-    return (
-        Share("its block, with the optimiser's state, there and back", 2 * STATES * block),
-        Share("the blocks around it, as they are drawn", fit.gaussians * needs.parameter_bytes - block),
-    )
+    return {
+        "its block, with the optimiser's state, there and back": 2 * STATES * block,
+        "the blocks around it, as they are drawn": fit.gaussians * needs.parameter_bytes - block,
+    }
 
 
 def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int, workers: int) -> Shares:
     """What the rest takes in RAM, beside Python and torch."""
     scene = fit.gaussians * needs.parameter_bytes
     out = 2 * SLACK * workers * STATES * _largest(fit) * needs.parameter_bytes
-    lent = (Share("blocks that are out, there and back, and those around them", out + scene),)
-    return (
-        *(lent if workers > 1 else ()),
-        Share("decoded photos", min(photo_bytes, photo_budget)),
-        Share("frozen blocks", min(scene, RamShares.of(0).blocks)),
-        Share("the whole scene, while a checkpoint is written", scene),
-    )
+    lent = {"blocks that are out, there and back, and those around them": out + scene}
+    return (lent if workers > 1 else {}) | {
+        "decoded photos": min(photo_bytes, photo_budget),
+        "frozen blocks": min(scene, RamShares.of(0).blocks),
+        "the whole scene, while a checkpoint is written": scene,
+    }
 
 
 def disk_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
     """What a run leaves and holds on disk."""
     scene = fit.gaussians * needs.parameter_bytes
-    return (
-        Share("blocks with their optimiser's state", GENERATIONS * STATES * scene),
-        Share("checkpoint", scene),
-    )
+    return {"blocks with their optimiser's state": GENERATIONS * STATES * scene, "checkpoint": scene}
 
 
 def time_steps(gaussians: Gaussians, views: list[View], training: TrainingConfig, batch: int) -> float:
