@@ -64,7 +64,7 @@ def parse(line: str) -> None:
         return
     if words[0].startswith("--"):
         return
-    command = cli.find_command(words[0], cli.COMMANDS)
+    command = cli.find_command(words[0])
     if command.hands_on:
         tyro.cli(AnnotatedBaseConfigUnion, args=[*train.command_line(Path(words[1])), *words[2:]])
         return

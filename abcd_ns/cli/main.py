@@ -65,9 +65,9 @@ EXAMPLES = (
 )
 
 
-def help_text(commands: Sequence[Command]) -> str:
+def help_text() -> str:
     """The text of `abcd --help`."""
-    width = max(len(name) for name in ("--version", *(c.name for c in commands))) + 2
+    width = max(len(name) for name in ("--version", *(c.name for c in COMMANDS))) + 2
     example_width = max(len(example) for example, _ in EXAMPLES) + 2
     return "\n".join(
         [
@@ -76,7 +76,7 @@ def help_text(commands: Sequence[Command]) -> str:
             "Gaussian splatting, one block at a time.",
             "",
             "commands:",
-            *(f"  {c.name:<{width}}{c.help}" for c in commands),
+            *(f"  {c.name:<{width}}{c.help}" for c in COMMANDS),
             "",
             "options:",
             f"  {'--help':<{width}}show this text; after a command, its options",
@@ -88,13 +88,13 @@ def help_text(commands: Sequence[Command]) -> str:
     )
 
 
-def find_command(name: str, commands: Sequence[Command]) -> Command:
+def find_command(name: str) -> Command:
     """The command called `name`.
 
     Raises:
         UserError: there is none; the message offers the nearest name.
     """
-    by_name = {command.name: command for command in commands}
+    by_name = {command.name: command for command in COMMANDS}
     if name in by_name:
         return by_name[name]
     close = difflib.get_close_matches(name, by_name, n=1)
@@ -118,12 +118,11 @@ def print_error(message: str) -> None:
     print(f"\033[31m{message}\033[0m" if coloured else message, file=sys.stderr)
 
 
-def main(args: Sequence[str] | None = None, commands: Sequence[Command] = COMMANDS) -> int:
+def main(args: Sequence[str] | None = None) -> int:
     """Entry point of `abcd`.
 
     Args:
         args: the words after `abcd`; None takes them from the command line.
-        commands: the subcommands to offer.
 
     Returns:
         The exit code: 0, what the command returned, 2 for an error of the user's, 130 after Ctrl-C.
@@ -132,12 +131,12 @@ def main(args: Sequence[str] | None = None, commands: Sequence[Command] = COMMAN
     first = args[0] if args else "--help"
     try:
         if first in ("--help", "-h"):
-            print(help_text(commands))
+            print(help_text())
             return 0
         if first == "--version":
             print(f"abcd {__version__}")
             return 0
-        return run_command(find_command(first, commands), args[1:])
+        return run_command(find_command(first), args[1:])
     except UserError as error:
         print_error(f"error: {error}")
         return EXIT_USER_ERROR

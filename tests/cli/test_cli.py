@@ -42,7 +42,8 @@ def greet(monkeypatch):
     module.greet = _greet
     monkeypatch.setitem(sys.modules, module.__name__, module)
     command = cli.Command("greet", f"{module.__name__}:greet", "say hello")
-    return lambda *args: cli.main(["greet", *args], [command])
+    monkeypatch.setattr(cli, "COMMANDS", (command,))
+    return lambda *args: cli.main(["greet", *args])
 
 
 @pytest.mark.parametrize("args", [[], ["--help"], ["-h"]])

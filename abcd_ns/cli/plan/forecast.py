@@ -1,7 +1,7 @@
 """What a run will need: blocks and the views that see them, memory, disk and time."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -53,8 +53,8 @@ class Forecast:
     steps: int
     seconds_per_step: float
     """Measured with the initial points."""
-    workers: int = 1
-    sent: Shares = field(default_factory=dict)
+    workers: int
+    sent: Shares
     """What a visit by a worker moves; nothing without workers."""
 
     @property
