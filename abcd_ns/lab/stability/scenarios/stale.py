@@ -5,34 +5,12 @@ from dataclasses import replace
 import torch
 
 from abcd_ns.engine.gaussians.block_state import BlockState
-from abcd_ns.engine.space.culling import bounds_of
-from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.types import Gaussians
-
-
-class Snapshot(BlockScene):
-    """All blocks as they were at one moment."""
-
-    def __init__(self, scene: BlockScene) -> None:
-        self.tree = scene.tree
-        self._blocks = [
-            Gaussians(**{name: value.clone() for name, value in scene.gaussians(block).items()})
-            for block in range(scene.tree.num_blocks)
-        ]
-
-    def gaussians(self, block: int) -> Gaussians:
-        return self._blocks[block]
-
-    def count(self, block: int) -> int:
-        return len(self._blocks[block])
-
-    def bounds(self, block: int) -> Box | None:
-        return bounds_of(self._blocks[block])
 
 
 class OldNeighbours:
@@ -44,13 +22,13 @@ class OldNeighbours:
 
     def __init__(self, run: TrainingRun, every: int) -> None:
         self._run, self._every = run, every
-        self._seen: Snapshot | None = None
+        self._seen: MemoryScene | None = None
         self._taken_at = 0
 
-    def __call__(self) -> BlockScene:
-        visit = self._run.state.visit
+    def __call__(self) -> MemoryScene:
+        visit, scene = self._run.state.visit, self._run.scene
         if self._seen is None or visit - self._taken_at >= self._every:
-            self._seen, self._taken_at = Snapshot(self._run.scene), visit
+            self._seen, self._taken_at = MemoryScene(scene.tree, scene.everything("cpu")), visit
         return self._seen
 
 
