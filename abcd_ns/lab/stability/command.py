@@ -5,6 +5,8 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -91,9 +93,8 @@ def stability(
         paths[:] = write_report(results, out, draw_curves)
 
     with tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder, _bar(console) as progress:
-        meter = Meter(progress, sum(scenario.cost for scenario in chosen) + sum(map(len, wanted)))
-        lab = Lab(Path(folder), quick=quick, seed=seed, tick=meter.step)
-        outcomes = carry_out(lab, chosen, wanted, meter, keep)
+        lab = Lab(Path(folder), quick=quick, seed=seed)
+        outcomes = carry_out(lab, chosen, wanted, progress, keep)
     print_paths(paths, console)
     console.print(headline(outcomes), highlight=False, soft_wrap=True)
     return 0 if all(outcome.passed for outcome in outcomes) else 1
@@ -113,39 +114,17 @@ def choose(only: Sequence[str], known: dict[str, Scenario]) -> list[Scenario]:
     Raises:
         UserError: there is none of that id.
     """
-    wanted = {name.upper() for name in only}
-    for name in sorted(wanted - set(known)):
+    for name in sorted(set(only) - set(known)):
         hint = "; R1 to R5 need --data" if name.startswith("R") else ""
         raise UserError(f"--only {name}: there is no such scenario{hint}; there are {', '.join(known)}.")
-    return [scenario for name, scenario in known.items() if not wanted or name in wanted]
-
-
-class Meter:
-    """How far the command is: a bar, what is going on, and steps of training so far."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self.console, self._progress, self._steps = progress.console, progress, 0
-        self._task = progress.add_task("", total=total, steps=0)
-
-    def begin(self, what: str) -> None:
-        """Say what is going on."""
-        self._progress.update(self._task, description=what[:44])
-
-    def advance(self, by: int = 1) -> None:
-        """So much is done."""
-        self._progress.advance(self._task, by)
-
-    def step(self) -> None:
-        """One step of training was taken."""
-        self._steps += 1
-        self._progress.update(self._task, steps=self._steps)
+    return [scenario for name, scenario in known.items() if not only or name in only]
 
 
 def carry_out(
     lab: Lab,
     scenarios: Sequence[Scenario],
     wanted: Sequence[Study],
-    meter: Meter,
+    progress: Progress,
     keep: Callable[[Sequence[Outcome], Sequence[Curve]], None],
 ) -> list[Outcome]:
     """Every scenario and every curve, one after the other.
@@ -155,16 +134,19 @@ def carry_out(
     """
     outcomes: list[Outcome] = []
     curves: list[Curve] = []
+    total = sum(scenario.cost for scenario in scenarios) + sum(map(len, wanted))
+    task, taken = progress.add_task("", total=total, steps=0), count(1)
+    lab.tick = lambda: progress.update(task, steps=next(taken))
     for scenario in scenarios:
-        meter.begin(f"{scenario.id} {scenario.fails}")
+        progress.update(task, description=f"{scenario.id} {scenario.fails}"[:44])
         outcomes.append(examine(lab, scenario))
-        meter.advance(scenario.cost)
-        print_outcome(outcomes[-1], meter.console)
+        progress.advance(task, scenario.cost)
+        print_outcome(outcomes[-1], progress.console)
         keep(outcomes, curves)
     for study in wanted:
-        meter.begin(f"chart: {study.title}")
-        curves.append(study.make(lab, meter.advance))
-        meter.console.print(f"      chart: {study.title}", highlight=False)
+        progress.update(task, description=f"chart: {study.title}"[:44])
+        curves.append(study.make(lab, partial(progress.advance, task)))
+        progress.console.print(f"      chart: {study.title}", highlight=False)
         keep(outcomes, curves)
     return outcomes
 

@@ -120,13 +120,12 @@ class Trained:
 
 
 class Lab:
-    """Where scenarios are carried out: a folder for stores, a rasterizer, somebody to tell of progress.
+    """Where scenarios are carried out: a folder for stores, and a rasterizer.
 
     Args:
         compile: of the rasterizer; "never" where last bits must not depend on the machine.
         quick: a third of the work, to see that everything runs.
         seed: of every training that names none.
-        tick: called after every training step.
     """
 
     def __init__(
@@ -136,9 +135,10 @@ class Lab:
         compile: Literal["auto", "never"] = "auto",
         quick: bool = False,
         seed: int = 0,
-        tick: Callable[[], None] = lambda: None,
     ) -> None:
-        self.quick, self.seed, self.tick = quick, seed, tick
+        self.quick, self.seed = quick, seed
+        self.tick: Callable[[], object] = lambda: None
+        """Called after every training step."""
         self._scores: dict[tuple[str, Method], float] = {}
         self.rasterizer = TorchRasterizer(compile)
         self._folder = folder
