@@ -8,16 +8,14 @@ from abcd_ns.lab.results.results import Arm, Results, find_default
 
 NEAR_DB = 0.2
 """How far below the best a smaller number of Gaussians may be and still count as enough."""
-AS_IT_IS, PRICE, LIMIT, MCMC = "as it is", "by price", "by limit", "MCMC"
-"""The ways to a number: what the method comes to by itself; other prices; growth that is cut off at a limit;
-3DGS-MCMC's relocation up to a limit."""
+PRICE, LIMIT, MCMC = "by price", "by limit", "MCMC"
+"""The ways to a number: prices, the method's own among them; growth that is cut off at a limit; 3DGS-MCMC's
+relocation up to a limit."""
 
 
 def way_of(arm: Arm) -> str:
     """How the arm's number of Gaussians comes about."""
-    if arm.variant == "default":
-        return AS_IT_IS
-    if "training.density.price=" in arm.variant:
+    if arm.variant == "default" or "training.density.price=" in arm.variant:
         return PRICE
     return MCMC if "training.density.strategy=mcmc" in arm.variant else LIMIT
 
@@ -25,7 +23,7 @@ def way_of(arm: Arm) -> str:
 def label_of(arm: Arm) -> str:
     """What is set, in a word or two."""
     if arm.variant == "default":
-        return AS_IT_IS
+        return "as it is"
     name, number = arm.variant.rsplit("=", 1)
     if name.endswith("price"):
         return f"price {number}"
@@ -34,12 +32,10 @@ def label_of(arm: Arm) -> str:
 
 
 def curves(results: Results) -> dict[str, list[Arm]]:
-    """The arms of each way by their number of Gaussians; the method as it is lies on the curve of prices."""
-    found: dict[str, list[Arm]] = {}
-    for arm in sorted(results.arms, key=lambda arm: arm.gaussians):
-        way = way_of(arm)
-        found.setdefault(PRICE if way == AS_IT_IS else way, []).append(arm)
-    return {way: found[way] for way in (PRICE, LIMIT, MCMC) if way in found}
+    """The arms of each way by their number of Gaussians."""
+    arms = sorted(results.arms, key=lambda arm: arm.gaussians)
+    found = {way: [arm for arm in arms if way_of(arm) == way] for way in (PRICE, LIMIT, MCMC)}
+    return {way: arms for way, arms in found.items() if arms}
 
 
 def fewest_near_best(arms: Sequence[Arm]) -> Arm:
