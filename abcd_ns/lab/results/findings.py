@@ -14,19 +14,6 @@ GOAL_GROWTH = 0.05
 
 
 @dataclass(frozen=True)
-class Gap:
-    """Best and worst of several arms."""
-
-    best: Arm
-    worst: Arm
-
-    @property
-    def decibels(self) -> float:
-        """How far the worst is behind."""
-        return self.best.psnr - self.worst.psnr
-
-
-@dataclass(frozen=True)
 class Difference:
     """An arm against the default, seed by seed, dB."""
 
@@ -43,11 +30,11 @@ class Difference:
         return None if len(self.by_seed) < 2 else stdev(self.by_seed)
 
 
-def find_gap(arms: Sequence[Arm]) -> Gap | None:
-    """Best and worst by PSNR; None with fewer than two arms."""
+def best_and_worst(arms: Sequence[Arm]) -> tuple[Arm, Arm] | None:
+    """By PSNR; None with fewer than two arms."""
     if len(arms) < 2:
         return None
-    return Gap(max(arms, key=lambda arm: arm.psnr), min(arms, key=lambda arm: arm.psnr))
+    return max(arms, key=lambda arm: arm.psnr), min(arms, key=lambda arm: arm.psnr)
 
 
 def find_growth(results: Results, name: str) -> float | None:
@@ -85,13 +72,14 @@ def findings_of(results: Results) -> tuple[str, ...]:
 
 
 def _of_blocks(results: Results) -> tuple[str, ...]:
-    gap = find_gap(results.arms)
-    if gap is None:
+    found = best_and_worst(results.arms)
+    if found is None:
         return ()
-    verdict = "within" if gap.decibels <= GOAL_DB else "above"
+    (best, worst), gap = found, found[0].psnr - found[1].psnr
+    verdict = "within" if gap <= GOAL_DB else "above"
     return (
-        f"Best: {_blocks(gap.best)}, {gap.best.psnr:.2f} dB. Worst: {_blocks(gap.worst)}, "
-        f"{gap.worst.psnr:.2f} dB. Gap: {gap.decibels:.2f} dB, {verdict} the {GOAL_DB:g} dB of the goal.",
+        f"Best: {_blocks(best)}, {best.psnr:.2f} dB. Worst: {_blocks(worst)}, {worst.psnr:.2f} dB. "
+        f"Gap: {gap:.2f} dB, {verdict} the {GOAL_DB:g} dB of the goal.",
     )
 
 

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from abcd_ns.lab.results.findings import GOAL_DB, find_differences, find_gap
+from abcd_ns.lab.results.findings import GOAL_DB, best_and_worst, find_differences
 from abcd_ns.lab.results.frontier import LIMIT, MCMC, PRICE, curves
 from abcd_ns.lab.results.results import Arm, Results, find_default
 from abcd_ns.lab.results.run import Run
@@ -94,16 +94,17 @@ def _costs(results: Results) -> list[tuple[str, Value]]:
 
 def _draw_gap(axes: Axes, arms: Sequence[Arm]) -> None:
     """The band in which all must lie, and what best and worst are apart."""
-    gap = find_gap(arms)
-    if gap is None:
+    found = best_and_worst(arms)
+    if found is None:
         return
-    goal, left, right = gap.best.psnr - GOAL_DB, arms[0], arms[-1]
-    axes.axhspan(goal, gap.best.psnr, color="#ececec", zorder=0, linewidth=0)
+    best, worst = found
+    goal, left, right = best.psnr - GOAL_DB, arms[0], arms[-1]
+    axes.axhspan(goal, best.psnr, color="#ececec", zorder=0, linewidth=0)
     at_right = right.psnr < left.psnr  # where the line is farther below
     look = {"xycoords": ("axes fraction", "data"), "va": "top", "fontsize": 7, "color": "#777777"}
     place, side = (0.99, "right") if at_right else (0.01, "left")
     write_beside(axes, f"best - {GOAL_DB:g} dB", (place, goal), (0, -2), ha=side, **look)
-    for arm, word, above in ((gap.best, "best", 9), (gap.worst, "worst", -16)):
+    for arm, word, above in ((best, "best", 9), (worst, "worst", -16)):
         shift, side = (-4, "left") if arm is left else (4, "right") if arm is right else (0, "center")
         at, color = (arm.value, arm.psnr), COLORS[arm.method]
         write_beside(axes, f"{word} {arm.psnr:.2f}", at, (shift, above), ha=side, color=color, **HALO)
