@@ -12,7 +12,7 @@ from abcd_ns.lab.results.records import decode
 from abcd_ns.lab.results.results import Arm, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
-from abcd_ns.lab.results.tables import GIB, MEASURES, cell, notes, print_rows, rows
+from abcd_ns.lab.results.tables import GIB, cell, measures_of, notes, print_rows, rows
 from abcd_ns.lab.scale.charts import draw_scale
 
 Record = dict[str, Any]
@@ -21,9 +21,9 @@ SHADES = ("#0072B2", "#56A0D3", "#003A5D")
 STAGES = ("#0072B2", "#56A0D3", "#D55E00", "#007A5A", "#8A6A00", "#8A5A83", "#B3306B", "#888888", "#444444")
 
 
-COMPARED = ("PSNR, merged (dB)", "SSIM, merged", "Gaussians", "steps", "training (s)")
-COMPARED += ("peak GPU memory (GiB)", "peak GPU memory, reserved (GiB)")
-"""What a comparison's table shows of each arm."""
+COMPARED = ("psnr_merged", "ssim_merged", "gaussians", "steps", "train_seconds")
+COMPARED += ("peak_device_bytes", "peak_reserved_bytes")
+"""Fields of each arm's run that a comparison's table shows."""
 
 
 def draw(records: Sequence[Record], out: Path) -> list[Path]:
@@ -78,7 +78,7 @@ def _name(arm: Arm) -> str:
 
 
 def _rows_of_comparison(part: str, results: Results) -> list[list[str]]:
-    shown = [measure for measure in MEASURES if measure.title in COMPARED]
+    shown = measures_of(COMPARED)
     body = [[_name(arm), *(cell(arm.runs, measure) for measure in shown)] for arm in results.arms]
     return [[part, *(measure.title for measure in shown)], *body]
 

@@ -1,8 +1,9 @@
 """Results as tables: what is measured, in which words and with how many digits."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from statistics import fmean, stdev
 
@@ -23,7 +24,6 @@ TABLE_FILE = "table.md"
 NOTHING = "-"
 """Stands where there is no value."""
 MIB, GIB = 2**20, 2**30
-Value = Callable[[Run], float | None]
 Rows = list[list[str]]
 """Of a table, its titles first."""
 
@@ -34,58 +34,54 @@ class Measure:
 
     title: str
     """With its unit."""
-    value: Value
+    field: str
+    """Of `Run`; after a dot, of a part of it."""
     digits: int
-
-
-def _in(unit: int, name: str) -> Value:
-    return lambda run: None if getattr(run, name) is None else getattr(run, name) / unit
+    unit: int = 1
 
 
 MEASURES = (
-    Measure("PSNR, composited (dB)", lambda run: run.psnr, 2),
-    Measure("SSIM, composited", lambda run: run.ssim, 3),
-    Measure("LPIPS, composited", lambda run: run.lpips, 3),
-    Measure("PSNR, merged (dB)", lambda run: run.psnr_merged, 2),
-    Measure("SSIM, merged", lambda run: run.ssim_merged, 3),
-    Measure("ordering gap (dB)", lambda run: run.ordering_gap_db, 1),
-    Measure("Gaussians", lambda run: run.gaussians, 0),
-    Measure("parameters", lambda run: run.parameters, 0),
-    Measure("blocks", lambda run: run.blocks, 0),
-    Measure("steps", lambda run: run.steps, 0),
-    Measure("training (s)", lambda run: run.train_seconds, 1),
-    Measure("of it, layers (s)", lambda run: run.layer_seconds, 1),
-    Measure("whole process (s)", lambda run: run.total_seconds, 1),
-    Measure("peak GPU memory (GiB)", _in(GIB, "peak_device_bytes"), 2),
-    Measure("peak GPU memory, reserved (GiB)", _in(GIB, "peak_reserved_bytes"), 2),
-    Measure("peak RAM (GiB)", _in(GIB, "peak_rss_bytes"), 2),
-    Measure("blocks on disk (MiB)", _in(MIB, "store_bytes"), 1),
+    Measure("PSNR, composited (dB)", "psnr", 2),
+    Measure("SSIM, composited", "ssim", 3),
+    Measure("LPIPS, composited", "lpips", 3),
+    Measure("PSNR, merged (dB)", "psnr_merged", 2),
+    Measure("SSIM, merged", "ssim_merged", 3),
+    Measure("ordering gap (dB)", "ordering_gap_db", 1),
+    Measure("Gaussians", "gaussians", 0),
+    Measure("parameters", "parameters", 0),
+    Measure("blocks", "blocks", 0),
+    Measure("steps", "steps", 0),
+    Measure("training (s)", "train_seconds", 1),
+    Measure("of it, layers (s)", "layer_seconds", 1),
+    Measure("whole process (s)", "total_seconds", 1),
+    Measure("peak GPU memory (GiB)", "peak_device_bytes", 2, GIB),
+    Measure("peak GPU memory, reserved (GiB)", "peak_reserved_bytes", 2, GIB),
+    Measure("peak RAM (GiB)", "peak_rss_bytes", 2, GIB),
+    Measure("blocks on disk (MiB)", "store_bytes", 1, MIB),
 )
 """Of a comparison."""
 SCALE_MEASURES = (
-    Measure("Gaussians", lambda run: run.gaussians, 0),
-    Measure("peak RAM (MiB)", _in(MIB, "peak_rss_bytes"), 0),
-    Measure("peak GPU memory (MiB)", _in(MIB, "peak_device_bytes"), 0),
-    Measure("blocks on disk (GiB)", _in(GIB, "store_bytes"), 2),
-    Measure("visit (s)", lambda run: run.memory.visit_seconds, 1),
-    Measure("of it, layers (s)", lambda run: run.memory.layer_seconds, 1),
+    Measure("Gaussians", "gaussians", 0),
+    Measure("peak RAM (MiB)", "peak_rss_bytes", 0, MIB),
+    Measure("peak GPU memory (MiB)", "peak_device_bytes", 0, MIB),
+    Measure("blocks on disk (GiB)", "store_bytes", 2, GIB),
+    Measure("visit (s)", "memory.visit_seconds", 1),
+    Measure("of it, layers (s)", "memory.layer_seconds", 1),
 )
-_BY_TITLE = {measure.title: measure for measure in MEASURES}
-_QUALITY = (
-    "PSNR, merged (dB)",
-    "SSIM, merged",
-    "PSNR, composited (dB)",
-    "Gaussians",
-    "parameters",
-    "steps",
-    "training (s)",
-)
-_MEMORY = ("peak RAM (GiB)", "peak GPU memory (GiB)", "blocks on disk (MiB)")
-_OF_OPTIONS = ("PSNR, merged (dB)", "SSIM, merged", "Gaussians", "parameters", "steps", "training (s)")
+_QUALITY = ("psnr_merged", "ssim_merged", "psnr", "gaussians", "parameters", "steps", "train_seconds")
+_MEMORY = ("peak_rss_bytes", "peak_device_bytes", "store_bytes")
+_OF_OPTIONS = ("psnr_merged", "ssim_merged", "gaussians", "parameters", "steps", "train_seconds")
+
+
+def measures_of(fields: Sequence[str]) -> tuple[Measure, ...]:
+    """Those of a comparison that show these fields, in the order of the fields."""
+    return tuple(measure for field in fields for measure in MEASURES if measure.field == field)
+
+
 COLUMNS: dict[str, tuple[str, tuple[Measure, ...]]] = {
-    "study of blocks": ("blocks", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
-    "study of gaussians": ("Gaussians by", tuple(map(_BY_TITLE.get, (*_QUALITY, *_MEMORY)))),
-    "study of options": ("changed", tuple(map(_BY_TITLE.get, _OF_OPTIONS))),
+    "study of blocks": ("blocks", measures_of((*_QUALITY, *_MEMORY))),
+    "study of gaussians": ("Gaussians by", measures_of((*_QUALITY, *_MEMORY))),
+    "study of options": ("changed", measures_of(_OF_OPTIONS)),
     "study of scale": ("tiles", SCALE_MEASURES),
 }
 """The title of the first column, and the measures that follow, by kind of results."""
@@ -93,9 +89,10 @@ COLUMNS: dict[str, tuple[str, tuple[Measure, ...]]] = {
 
 def cell(runs: Sequence[Run], measure: Measure) -> str:
     """The measure of an arm's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
-    values = [measure.value(run) for run in runs]
+    values = [attrgetter(measure.field)(run) for run in runs]
     if not values or any(value is None for value in values):
         return NOTHING
+    values = [value / measure.unit for value in values]
     text = f"{fmean(values):,.{measure.digits}f}"
     return text if len(values) == 1 else f"{text} ± {stdev(values):,.{measure.digits}f}"
 
