@@ -23,18 +23,33 @@ from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio import pipeline
 from abcd_ns.nerfstudio.workers import make_worker
-from benchmarks.runs import Asked, config_of, runs_of
+from benchmarks.runs import config_of, runs_of
 from tests.cluster.in_process import InProcessWorkers
 
 
 @dataclass(kw_only=True)
-class Args(Asked):
+class Args:
     """What to compare."""
 
+    data: Path
+    """The scene, as of ns-train."""
+    downscale: int = 4
+    """Divides the photos' width and height."""
+    blocks: int = 8
+    """Of the scene."""
+    steps: int = 500
+    """Of each run, the warm-up included."""
     visits: tuple[int, ...] = (1, 2, 4, 8)
     """Numbers of visits at once to try."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """A run of each number of visits for each. Runs that `out` has are not made again."""
+    out: Path | None = None
+    """Where to write the results, JSON."""
+
+    @property
+    def of_all_runs(self) -> dict[str, int]:
+        """What they share, but for where the scene is; options of `config_of`."""
+        return {"downscale": self.downscale, "blocks": self.blocks, "steps": self.steps}
 
 
 @dataclass

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,29 +18,6 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
 from abcd_ns.machine import describe_machine, describe_versions
-
-
-@dataclass(kw_only=True)
-class Asked:
-    """What benchmarks of whole runs are asked for."""
-
-    data: Path
-    """The scene, as of ns-train."""
-    downscale: int = 4
-    """Divides the photos' width and height."""
-    blocks: int = 8
-    """Of the scene."""
-    steps: int = 500
-    """Of each run, the warm-up included."""
-    seeds: tuple[int, ...] = (0,)
-    """Each run once for each."""
-    out: Path | None = None
-    """Where to write the results, JSON."""
-
-    @property
-    def of_all_runs(self) -> dict[str, Any]:
-        """What they share, but for where the scene is; options of `config_of`."""
-        return {"downscale": self.downscale, "blocks": self.blocks, "steps": self.steps}
 
 
 def write_runs(out: Path | None, asked: Mapping[str, Any], runs: Sequence[Any]) -> None:

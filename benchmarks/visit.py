@@ -19,7 +19,7 @@ from torch.profiler import ProfilerActivity
 
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
-from abcd_ns.engine.render import Rasterizer, loss, make_rasterizer
+from abcd_ns.engine.render import loss, make_rasterizer
 from abcd_ns.engine.render.loss import psnrs
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
@@ -64,17 +64,7 @@ class Args:
     """Of the runs."""
 
 
-def begin(
-    capture: Stage,
-    blocks: int,
-    folder: Path,
-    *,
-    seed: int,
-    steps: int | None = None,
-    seconds: float | None = None,
-    rasterizer: Rasterizer | None = None,
-    antialiased: bool = False,
-) -> Coordinator:
+def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
     """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     loss.warm_up(device)
@@ -82,14 +72,13 @@ def begin(
     tree = build_kd(start.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
     keep = None if blocks == 1 else len(start) // blocks
-    store.commit(blocks_at_rest(tree, start, keep, seed))
-    config = TrainingConfig(seed=seed, antialiased=antialiased)
+    store.commit(blocks_at_rest(tree, start, keep, args.seed))
     run = TrainingRun(
-        config,
-        Budget(steps=steps, seconds=seconds),
+        TrainingConfig(seed=args.seed),
+        Budget(seconds=args.seconds),
         StoredScene(tree, store),
         capture.views,
-        rasterizer or make_rasterizer("auto", device),
+        make_rasterizer("auto", device),
         *nothing_live(3, device),
         device=device,
     )
@@ -108,7 +97,7 @@ def run(
     Args:
         afterwards: given the coordinator when the clock has stopped.
     """
-    coordinator = begin(capture, blocks, folder, seconds=args.seconds, seed=args.seed)
+    coordinator = begin(capture, blocks, args, folder)
     clock, views = StageClock(), 0
     scene, source = coordinator.scene, coordinator.source
     scene.rest = clock.timed("commit", scene.rest)  # as far as the training waits for it
