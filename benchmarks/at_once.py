@@ -7,9 +7,10 @@ with 1 the run is that of one process. Visits are trained one after the other, i
 thread, so that neither the machine nor how busy it is has a part in the result. Runs of ns-train's trainer.
 """
 
+import json
 import tempfile
 from dataclasses import dataclass
-from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 
@@ -23,7 +24,7 @@ from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio import pipeline
 from abcd_ns.nerfstudio.workers import make_worker
-from benchmarks.runs import config_of, runs_of
+from benchmarks.runs import apart, config_of, write_runs
 from tests.cluster.in_process import InProcessWorkers
 
 
@@ -45,11 +46,6 @@ class Args:
     """A run of each number of visits for each. Runs that `out` has are not made again."""
     out: Path | None = None
     """Where to write the results, JSON."""
-
-    @property
-    def of_all_runs(self) -> dict[str, int]:
-        """What they share, but for where the scene is; options of `config_of`."""
-        return {"downscale": self.downscale, "blocks": self.blocks, "steps": self.steps}
 
 
 @dataclass
@@ -89,8 +85,8 @@ def run(args: Args, at_once: int, seed: int) -> Row:
 
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        options = {"seed": seed, "workers": 2, **args.of_all_runs}  # any number but 1 dispatches
-        config = config_of(args.data, Path(folder), **options)
+        options = {"seed": seed, "workers": 2}  # any number but 1 dispatches
+        config = config_of(args.data, Path(folder), **shared(args), **options)
         config.machine.device_type = "cpu"
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
@@ -102,11 +98,24 @@ def run(args: Args, at_once: int, seed: int) -> Row:
     return row
 
 
+def shared(args: Args) -> dict[str, int]:
+    """What all runs share, but for where the scene is."""
+    return {"downscale": args.downscale, "blocks": args.blocks, "steps": args.steps}
+
+
 def main(args: Args) -> None:
     """Make the runs that are missing, print the table, write the file after each."""
-    keys = [(at_once, seed) for seed in args.seeds for at_once in args.visits]
-    asked = {"data": args.data.name, **args.of_all_runs}
-    rows = runs_of(args.out, asked, Row, keys, partial(run, args))
+    asked = {"data": args.data.name, **shared(args)}
+    found = json.loads(args.out.read_text()) if args.out is not None and args.out.exists() else {"runs": []}
+    if found["runs"] and not asked.items() <= found.items():
+        raise SystemExit(f"{args.out} answers another question; name another file, or remove it.")
+    rows = {(row["at_once"], row["seed"]): Row(**row) for row in found["runs"]}
+    for seed, at_once in product(args.seeds, args.visits):
+        if (at_once, seed) not in rows:
+            # In a process of its own, so that nothing of one run is left for the next.
+            rows[at_once, seed] = row = apart(run, args, at_once, seed)
+            print(row, flush=True)
+            write_runs(args.out, asked, list(rows.values()))
     table = [["visits at once", *(f"seed {seed}" for seed in args.seeds), "mean"]]
     for at_once in args.visits:
         psnrs = [rows[at_once, seed].psnr for seed in args.seeds]

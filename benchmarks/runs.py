@@ -1,6 +1,5 @@
 """What benchmarks share: runs of ns-train's trainer, in processes of their own, and results, as JSON."""
 
-import copy
 import json
 import multiprocessing
 import os
@@ -16,7 +15,8 @@ from typing import Any
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
-from abcd_ns import methods
+from abcd_ns.lab.job import Job, Settings
+from abcd_ns.lab.runs.configs import trainer_config
 from abcd_ns.machine import describe_machine, describe_versions
 
 
@@ -31,29 +31,6 @@ def write_runs(out: Path | None, asked: Mapping[str, Any], runs: Sequence[Any]) 
     told = {"machine": asdict(describe_machine()), "versions": asdict(describe_versions())}
     found = {**told, **asked, "runs": [asdict(run) for run in runs]}
     out.write_text(json.dumps(found, indent=1) + "\n")
-
-
-def runs_of(
-    out: Path | None, asked: Mapping[str, Any], kind: Callable, keys: Sequence[tuple], run: Callable
-) -> dict[tuple, Any]:
-    """By key a row: those that `out` has of the same question, and the others made, each in a process of its
-    own, so that nothing of one run is left for the next; `out` is written after each.
-
-    Args:
-        kind: class of a row, whose first fields are the key.
-        run: makes the row of a key; anything that can be pickled.
-    """
-    found = json.loads(out.read_text()) if out is not None and out.exists() else {"runs": []}
-    if found["runs"] and not asked.items() <= found.items():
-        raise SystemExit(f"{out} answers another question; name another file, or remove it.")
-    rows = [kind(**row) for row in found["runs"]]
-    made = {tuple(asdict(row).values())[: len(keys[0])]: row for row in rows}
-    for key in keys:
-        if key not in made:
-            made[key] = apart(run, *key)
-            print(made[key], flush=True)
-            write_runs(out, asked, list(made.values()))
-    return made
 
 
 def apart(work: Callable, *args: Any) -> Any:
@@ -73,19 +50,11 @@ def config_of(
     steps: int | None = None,
     seconds: float | None = None,
 ) -> TrainerConfig:
-    """ns-train's, with nothing but training in it."""
-    config = copy.deepcopy(methods.abcd.config)
-    config.pipeline.datamanager.data = data
-    config.pipeline.datamanager.dataparser.downscale_factor = downscale
-    config.pipeline.blocks, config.pipeline.workers = blocks, workers
-    config.pipeline.cluster = None
-    config.pipeline.training.seed = config.machine.seed = seed
-    config.pipeline.max_seconds = seconds
-    config.max_num_iterations = steps or 10**9
-    config.output_dir, config.experiment_name, config.vis = out, "run", "tensorboard"
-    config.logging.local_writer.enable = False
-    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
-    config.steps_per_save = 0
+    """That of a run of `abcd compare`, with workers."""
+    unasked = {"evals": 1, "max_gaussians": 0, "densify": True, "pictures": 0}
+    settings = Settings(str(data), downscale, blocks, seconds, steps, **unasked)
+    config = trainer_config(Job("abcd", seed, settings), out)
+    config.pipeline.workers = workers
     config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
     return config
 

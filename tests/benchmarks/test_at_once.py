@@ -6,13 +6,14 @@ from dataclasses import replace
 import pytest
 
 from abcd_ns.nerfstudio import pipeline
-from benchmarks import runs
+from benchmarks import at_once
 from benchmarks.at_once import Args, main
 from tests.reference.colmap_scene import write_scene
 
 
 def test_runs_are_made_once_and_told_in_a_table(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(runs, "apart", lambda work, *args: work(*args))  # another process would import torch
+    # Another process would import torch.
+    monkeypatch.setattr(at_once, "apart", lambda work, *args: work(*args))
     monkeypatch.setattr(pipeline, "dispatcher_for", pipeline.dispatcher_for)  # to be put back
     out = tmp_path / "out.json"
     args = Args(
