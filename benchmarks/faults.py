@@ -89,7 +89,6 @@ class Bench:
         self.args, self.folder = args, folder
         self.random = random.Random(args.seed)
         self.runs = Runs(*IMPORTED)
-        self._count = 0
         self._train = folder / "undisturbed"
         if self.runs.finish(self._train) != 0:
             raise RuntimeError("the run that nothing disturbs failed")
@@ -100,10 +99,7 @@ class Bench:
 
     def new_folder(self) -> Path:
         """An empty one for a trial."""
-        self._count += 1
-        folder = self.folder / f"trial-{self._count}"
-        folder.mkdir()
-        return folder
+        return Path(tempfile.mkdtemp(dir=self.folder))
 
     def gone_on(self, folder: Path, lost: int) -> Outcome:
         """Finish the run in `folder`, compare, and clear it away."""
@@ -186,7 +182,10 @@ class Bench:
     def _alter(self, name: str, length: int | None, bit: int | None) -> Outcome:
         folder = self.new_folder() / "store"
         shutil.copytree(self._train / "store", folder)
-        alter(folder / name, length, bit)
+        content = bytearray((folder / name).read_bytes())
+        if bit is not None:
+            content[bit // 8] ^= 1 << bit % 8
+        (folder / name).write_bytes(content[:length])
         noticed = False
         try:
             for pin in (None, "saved"):  # every file belongs to one of both
@@ -211,7 +210,6 @@ class TrainingBench:
         self.folder, self.random = folder, random.Random(args.seed)
         self.data = write_scene(folder / "wall")
         self.trainings = Trainings(*IMPORTED)
-        self._count = 0
         if self.trainings.finish(self.data, folder / "undisturbed") != 0:
             raise RuntimeError("the training that nothing disturbs failed")
         self.expected = gaussians(run_folder(folder / "undisturbed"))
@@ -234,12 +232,8 @@ class TrainingBench:
             found += [Trial(f"ns-train: {name}", partial(self._signal, number)) for _ in range(2)]
         return found
 
-    def _new_folder(self) -> Path:
-        self._count += 1
-        return self.folder / f"out-{self._count}"
-
     def _kill(self, how: dict) -> Outcome:
-        out = self._new_folder()
+        out = Path(tempfile.mkdtemp(dir=self.folder))
         if self.trainings.finish(self.data, out, **how) != KILLED:
             return Outcome(False)
         run = run_folder(out)
@@ -247,7 +241,7 @@ class TrainingBench:
         return Outcome(ended == 0 and same(gaussians(run), self.expected))
 
     def _signal(self, number: signal.Signals) -> Outcome:
-        out = self._new_folder()
+        out = Path(tempfile.mkdtemp(dir=self.folder))
         process = self._command(out)
         while process.poll() is None and not list(out.rglob("step-*.ckpt")):
             time.sleep(0.01)
@@ -280,14 +274,6 @@ class TrainingBench:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-
-
-def alter(path: Path, length: int | None, bit: int | None) -> None:
-    """Cut a file to `length` bytes, or flip a bit of it."""
-    content = bytearray(path.read_bytes())
-    if bit is not None:
-        content[bit // 8] ^= 1 << bit % 8
-    path.write_bytes(content[:length])
 
 
 def same(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> bool:
