@@ -13,7 +13,6 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,27 +76,18 @@ def type_in(command: str, out: Path) -> Step:
     return Step(command, seconds, done.returncode, said[-1] if said else "")
 
 
-@contextmanager
-def viewer(command: str, out: Path) -> Iterator[str]:
-    """Start a viewer; its address."""
+def look(command: str, out: Path) -> Step:
+    """Start a viewer, until its page is there."""
+    began = time.monotonic()
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     program, *words = command.split()
     words += ["--viewer.websocket-port", str(port)]
+    address = f"http://127.0.0.1:{port}/"
     with (out / "viewer.txt").open("w") as said:
         process = subprocess.Popen([str(BIN / program), *words], cwd=out, stdout=said, stderr=said)
     try:
-        yield f"http://127.0.0.1:{port}/"
-    finally:
-        process.terminate()
-        process.wait()
-
-
-def look(command: str, out: Path) -> Step:
-    """Until the viewer's page is there."""
-    began = time.monotonic()
-    with viewer(command, out) as address:
         while time.monotonic() - began < PATIENCE:
             try:
                 with urllib.request.urlopen(address, timeout=5) as page:
@@ -105,6 +95,9 @@ def look(command: str, out: Path) -> Step:
                     return Step(command, seconds, 0, f"a page of {size:,} bytes at {address}")
             except OSError:
                 time.sleep(0.2)
+    finally:
+        process.terminate()
+        process.wait()
     return Step(command, time.monotonic() - began, 1, "no page")
 
 
