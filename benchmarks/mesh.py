@@ -28,10 +28,10 @@ LAMP = np.array([-0.4, -0.4, -0.8])
 """Towards it, from what is lit, in the camera's frame."""
 
 
-def pictures(surface: open3d.geometry.TriangleMesh, view: View, by: int) -> list[np.ndarray]:
+def pictures(
+    surface: open3d.geometry.TriangleMesh, scene: open3d.t.geometry.RaycastingScene, view: View, by: int
+) -> list[np.ndarray]:
     """Float [h, w, 3], 0..1: the mesh in its colours and in grey; white where it is not."""
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(surface))
     K = view.K.double().numpy() * [[by], [by], [1.0]]
     matrices = core.Tensor(K), core.Tensor(view.viewmat.double().numpy())
     rays = scene.create_rays_pinhole(*matrices, view.width * by, view.height * by)
@@ -69,14 +69,14 @@ def main(
     surface = open3d.io.read_triangle_mesh(str(mesh))
     vertices = to.inverse.points(torch.from_numpy(np.asarray(surface.vertices)))
     surface.vertices = open3d.utility.Vector3dVector(vertices.numpy())
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(surface))
     camera = views_of(dataset.cameras)[view]
     photo = Image.fromarray(dataset.photos.image(view).numpy()[..., :3])
     photo = photo.resize((camera.width * by, camera.height * by), Image.Resampling.LANCZOS)
-    drawn = [(255 * part).round().astype(np.uint8) for part in pictures(surface, camera, by)]
+    drawn = [(255 * part).round().astype(np.uint8) for part in pictures(surface, scene, camera, by)]
     picture = Image.fromarray(np.concatenate([np.asarray(photo), *drawn], axis=1))
     picture.quantize(colors, dither=Image.Dither.NONE).save(out, optimize=True)
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(surface))
     points = dataset.metadata["points3D_xyz"].numpy()
     closest = scene.compute_closest_points(core.Tensor(points))
     off = np.linalg.norm(closest["points"].numpy() - points, axis=1) * to.scale
