@@ -25,7 +25,7 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.results.style import in_style, save
+from abcd_ns.lab.results.style import in_style, save, write_beside
 from abcd_ns.machine import describe_machine, describe_versions
 
 BIN = Path(sys.executable).parent
@@ -161,15 +161,9 @@ def draw(processes: list[Process], limit: float, out: Path) -> None:
         axes.fill_between(times, [used / GB for _, used in process.rss], color=f"C{number % 3}", alpha=0.75)
         if process.killed_at_step is not None:
             axes.axvline(process.ended / 60, color="black", linewidth=1)
-            axes.annotate(
-                f"kill -9\nstep {process.killed_at_step:,}",
-                (process.ended / 60, 0.97),
-                xycoords=("data", "axes fraction"),
-                xytext=(-4, 0),
-                textcoords="offset points",
-                ha="right",
-                va="top",
-            )
+            look = {"xycoords": ("data", "axes fraction"), "ha": "right", "va": "top", "fontsize": 9}
+            text = f"kill -9\nstep {process.killed_at_step:,}"
+            write_beside(axes, text, (process.ended / 60, 0.97), (-4, 0), **look)
     axes.axhline(limit, color="black", linestyle="--", linewidth=1)
     axes.set(xlabel="minutes", ylabel="RAM of the process (GB)", ylim=(0, 1.25 * limit))
     save(figure, out, "day")
