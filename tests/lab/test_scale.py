@@ -140,6 +140,8 @@ def test_results_are_written_in_words_and_drawn(tmp_path):
         ({"blocks": (0,)}, "from 1 on"),
         ({"gaussians": 0}, "--gaussians"),
         ({"visits": 0}, "--visits"),
+        ({"device_limit_mb": -1}, "--device-limit-mb is -1; it must be at least 0"),
+        ({"monolithic_limit": -1}, "--monolithic-limit is -1; it must be at least 0"),
         ({"blocks": (2**18,), "gaussians": 10**6}, "GiB free"),
     ],
 )

@@ -68,6 +68,7 @@ def scale(
     if not blocks or bad or len(set(blocks)) < len(blocks):
         raise UserError(f"--blocks {' '.join(map(str, blocks))}: give different powers of 2, from 1 on.")
     check_ranges({"gaussians": gaussians, "visits": visits, "ram_budget_mb": ram_budget_mb})
+    check_ranges({"monolithic_limit": monolithic_limit, "device_limit_mb": device_limit_mb}, low=0)
     _check_disk(out, max(blocks) * gaussians)
     settings = LandSettings(gaussians, visits, ram_budget_mb * MIB, device_limit_mb * MIB)
     few = [k for k in sorted(blocks) if k * gaussians <= monolithic_limit]
