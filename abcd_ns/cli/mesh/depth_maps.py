@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.layers.whole_pictures import Rasters
+from abcd_ns.engine.layers.whole_pictures import WholePictures
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.types import View
 
@@ -59,7 +59,7 @@ class DepthMaps:
 
 
 def draw(
-    pictures: Rasters,
+    pictures: WholePictures,
     views: Sequence[View],
     folder: Path,
     advance: Callable[[], None],
