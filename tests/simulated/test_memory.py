@@ -11,9 +11,9 @@ import pytest
 
 from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
+from abcd_ns.engine.train import visit_training
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, levels_of, projected_bytes
-from abcd_ns.engine.train.step import drawing
 from abcd_ns.engine.train.training_loop import train
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, training_config
 from tests.reference.simulated_device import DEVICE
@@ -50,7 +50,7 @@ CONSISTENT = {"density": STILL, "primitive": "2dgs", "normal_consistency": 0.05}
 
 @pytest.mark.parametrize(("batch", "given"), [(1, PLAIN), (2, PLAIN), (1, LIT), (1, CONSISTENT)])
 def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, monkeypatch, batch, given):
-    monkeypatch.setattr(drawing, "BEGINS", 0.0)
+    monkeypatch.setattr(visit_training, "BEGINS", 0.0)
     options = {"gaussians": 40, "batch": batch, **given}
     (small, _), (large, _) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(w), width=w, **options) for w in (48, 96)
@@ -65,7 +65,7 @@ GROWING_SURFELS = {"density": GROWING, "primitive": "2dgs"}
 
 @pytest.mark.parametrize("given", [PLAIN, {"density": GROWING}, GROWING_SURFELS, CONSISTENT])
 def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, monkeypatch, given):
-    monkeypatch.setattr(drawing, "BEGINS", 0.0)
+    monkeypatch.setattr(visit_training, "BEGINS", 0.0)
     options = {"width": 32, "batch": 1, **given}
     (small, few), (large, many) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, **options) for n in (300, 1200)
