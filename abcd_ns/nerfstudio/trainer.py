@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
 from abcd_ns.engine.events import Event, LayersDrawn, Shedding, WorkersSeen
 from abcd_ns.engine.store import StoreError, crash_points
-from abcd_ns.engine.store.atomic import fsync_folder, remove_temporaries, replacing
+from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
 from abcd_ns.nerfstudio.flags import hidden
@@ -282,7 +282,8 @@ def _save_atomically(state: dict[str, Any], path: Path) -> None:
     run = path.parent.parent
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(run)  # of a run that was killed
+        for leftover in run.glob(f".step-*.ckpt*{TEMPORARY_SUFFIX}"):  # of a run that was killed
+            leftover.unlink(missing_ok=True)
         with replacing(path, run) as temporary:
             torch.save(state, temporary)
             crash_points.reached(crash_points.CHECKPOINT_WRITTEN)

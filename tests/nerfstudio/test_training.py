@@ -19,7 +19,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
-from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig
+from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig, _save_atomically
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
 
 STEPS = 36
@@ -90,6 +90,15 @@ def trained(data, tmp_path_factory) -> AbcdTrainer:
 def test_on_the_cpu_layers_and_photos_have_room_under_the_ram_budget_alone(trained):
     assert trained.pipeline.datamanager.device_photo_bytes == 0
     assert trained.pipeline.coordinator.layer_limit == trained.pipeline._ram.layers
+
+
+def test_a_checkpoint_takes_away_its_own_leftovers_and_no_others(tmp_path):
+    own, report = tmp_path / ".step-000000009.ckpt.0a1b2c3d.tmp", tmp_path / ".report.html.0a1b2c3d.tmp"
+    own.touch(), report.touch()
+    path = tmp_path / "nerfstudio_models" / "step-000000010.ckpt"
+    _save_atomically({"step": 10}, path)
+    assert torch.load(path, weights_only=True) == {"step": 10}
+    assert sorted(tmp_path.iterdir()) == [report, path.parent]
 
 
 def test_a_run_leaves_a_checkpoint_of_the_merged_scene(trained):

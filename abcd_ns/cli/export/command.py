@@ -169,6 +169,6 @@ def tell_rounding(suffix: str, largest: float, size: float) -> None:
         size: of the scene.
     """
     off = rounding(suffix, largest)
-    if off > LOST_DIGITS * size:
+    if size > 0 and off > LOST_DIGITS * size:
         remedy = "; .sog and .ply are finer." if suffix == ".spz" else FAR_AWAY
         print(f"{suffix} rounds positions to {off:.1g}, {off / size:.1g} of the scene's size{remedy}")

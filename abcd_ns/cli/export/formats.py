@@ -1,6 +1,6 @@
 """The formats of an exported scene, chosen by the file's suffix."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import torch
@@ -62,10 +62,23 @@ def write_scene(
         suffix: of SUFFIXES.
         count: how many there will be; most formats say so at their beginning.
         up: turns the Gaussians' frame so that y is up.
+
+    Raises:
+        RuntimeError: there were more, or fewer.
     """
+    parts = _counted(parts, count)
     if suffix == ".ply":
         write_ply(path, count, sh_degree, parts)
     elif suffix == ".glb":
         write_glb(path, count, sh_degree, up, parts)
     else:
         write_packed(path, count, sh_degree, suffix[1:], parts)
+
+
+def _counted(parts: Iterable[Gaussians], count: int) -> Iterator[Gaussians]:
+    written = 0
+    for part in parts:
+        yield part
+        written += len(part)
+    if written != count:
+        raise RuntimeError(f"{written} Gaussians were written where {count} were announced")

@@ -210,8 +210,8 @@ class Painter:
         with torch.no_grad():
             raster = self.rasterizer(gaussians, seen.view, crop=seen.crop, z_window=span, **vars(settings))
         layer, nothing = raster.layer, self._nothing(seen.view, seen.crop)
-        others = (unit,) if active is None else (unit, self.tree.node_of(active))
-        front = not by_means or self.order(others, seen.view)[0] == unit
+        front = active is None or not by_means
+        front = front or self.order((unit, self.tree.node_of(active)), seen.view)[0] == unit
         return FrozenLayers(layer, nothing) if front else FrozenLayers(nothing, layer)
 
     def span(self, unit: int, view: View, crop: Crop) -> ZWindow:

@@ -12,7 +12,6 @@ from functools import reduce
 from typing import Any, Literal
 
 import torch
-from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
 from jaxtyping import Bool
@@ -350,6 +349,8 @@ def _operators_for(device: torch.device) -> Iterator[None]:
     it gives back the allocator's memory after each refinement, only to ask for it anew: it had better not."""
     lent: list[tuple[Any, str, Any]] = [(torch.cuda, "empty_cache", lambda: None)]
     if device.type != "cuda":
+        from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci  # private: asked of nobody else
+
         lent.append((gsplat_ops, "compute_relocation", compute_relocation))
         lent.append((gsplat_ops, "quat_scale_to_covar_preci", _quat_scale_to_covar_preci))
     originals = [(owner, name, getattr(owner, name)) for owner, name, _ in lent]
