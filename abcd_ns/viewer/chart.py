@@ -5,9 +5,8 @@ them wider than the panel.
 """
 
 import base64
-from collections.abc import Callable, Sequence
-
-from matplotlib.ticker import MaxNLocator
+import math
+from collections.abc import Sequence
 
 WIDTH, HEIGHT = 260, 130
 LEFT, RIGHT, TOP, BOTTOM = 30, 6, 6, 18
@@ -32,13 +31,13 @@ def curve_image(points: Sequence[tuple[float, float]], name: str) -> str:
 def curve_svg(points: Sequence[tuple[float, float]]) -> str:
     """The curve through (x, y) points, two or more, with round numbers on its axes."""
     xs, ys = zip(*points, strict=True)
-    across, times = _axis(xs, LEFT, WIDTH - RIGHT)
-    up, heights = _axis(ys, HEIGHT - BOTTOM, TOP)
-    rows = "".join(f"M{LEFT} {up(tick):.1f}H{WIDTH - RIGHT}" for tick in heights)
-    columns = "".join(f"M{across(tick):.1f} {TOP}V{HEIGHT - BOTTOM}" for tick in times)
+    across = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT)
+    up = _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP)
+    rows = "".join(f"M{LEFT} {up(tick):.1f}H{WIDTH - RIGHT}" for tick in up.ticks)
+    columns = "".join(f"M{across(tick):.1f} {TOP}V{HEIGHT - BOTTOM}" for tick in across.ticks)
     labels = [
-        *(_label(f"{tick:g}", LEFT - 4, up(tick) + 3, "end") for tick in heights),
-        *(_label(f"{tick:g}", across(tick), HEIGHT - 5, "middle") for tick in times),
+        *(_label(f"{tick:g}", LEFT - 4, up(tick) + 3, "end") for tick in up.ticks),
+        *(_label(f"{tick:g}", across(tick), HEIGHT - 5, "middle") for tick in across.ticks),
     ]
     line = " ".join(f"{across(x):.1f},{up(y):.1f}" for x, y in points)
     return (
@@ -49,13 +48,24 @@ def curve_svg(points: Sequence[tuple[float, float]]) -> str:
     )
 
 
-def _axis(values: Sequence[float], start: float, stop: float) -> tuple[Callable[[float], float], list[float]]:
-    """Where on a range of pixels a value lies, and round ones within the values' range."""
-    low, high = min(values), max(values)
-    high = high if high > low else low + 1.0
-    ticks = MaxNLocator(TICKS, steps=[1, 2, 5, 10]).tick_values(low, high).tolist()
-    scale = (stop - start) / (high - low)
-    return lambda value: start + (value - low) * scale, [tick for tick in ticks if low <= tick <= high]
+class _Axis:
+    """Maps a range of values to pixels."""
+
+    def __init__(self, low: float, high: float, start: float, stop: float) -> None:
+        high = high if high > low else low + 1.0
+        self._low, self._start, self._scale = low, start, (stop - start) / (high - low)
+        step = _round_step((high - low) / TICKS)
+        self.ticks = [step * k for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+        """Round values within the range."""
+
+    def __call__(self, value: float) -> float:
+        return self._start + (value - self._low) * self._scale
+
+
+def _round_step(step: float) -> float:
+    """The smallest of 1, 2, 5 x 10^k that is at least `step`."""
+    power = 10.0 ** math.floor(math.log10(step))
+    return next(power * lead for lead in (1, 2, 5, 10) if power * lead >= step * (1 - 1e-9))
 
 
 def _label(text: str, x: float, y: float, anchor: str) -> str:
