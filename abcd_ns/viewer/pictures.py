@@ -1,5 +1,6 @@
 """The pictures that the viewer asks for: the whole scene by parts, or what belongs to one block."""
 
+import atexit
 import math
 import threading
 from dataclasses import dataclass, replace
@@ -21,6 +22,10 @@ OPAQUE = 1e-4
 """Transmittance below which nothing behind can be seen; where rasterizers stop."""
 FAR = 1e4
 """Depth of pictures that have none; world units."""
+
+
+SECONDS_TO_END = 10.0
+"""That a picture which is being drawn has when the process ends."""
 
 
 class Show(str, Enum):
@@ -45,6 +50,17 @@ class Choice:
 def asked_by_viewer() -> bool:
     """Whether this thread draws for a browser, and not for training, evaluation or export."""
     return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+@atexit.register
+def end_drawing() -> None:
+    """Have no thread draw for a browser when Python ends: it would be stopped in the midst of torch's C++,
+    which aborts the process."""
+    drawing = [thread for thread in threading.enumerate() if isinstance(thread, RenderStateMachine)]
+    for thread in drawing:
+        thread.running, thread.interrupt_render_flag = False, True
+    for thread in drawing:
+        thread.join(SECONDS_TO_END)
 
 
 def chosen_outputs() -> tuple[str, ...]:

@@ -1,5 +1,7 @@
 """The viewer's pictures: the whole scene by units, and what belongs to one block."""
 
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -144,3 +146,31 @@ def test_only_the_viewers_threads_draw_for_the_viewer():
     thread.start()
     thread.join()
     assert answers == [True]
+
+
+DRAWS_TO_THE_END = """
+import threading, torch
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+import abcd_ns.viewer.pictures
+
+class Busy(RenderStateMachine):
+    def __init__(self):
+        threading.Thread.__init__(self, daemon=True)
+        self.running, self.begun = True, threading.Event()
+
+    def run(self):
+        while self.running:
+            torch.zeros(1).broadcast_to(4)
+            self.begun.set()
+
+for busy in [Busy() for _ in range(4)]:
+    busy.start()
+    busy.begun.wait()
+"""
+
+
+def test_a_process_that_still_draws_for_browsers_ends_in_order():
+    run = subprocess.run(
+        [sys.executable, "-c", DRAWS_TO_THE_END], capture_output=True, text=True, check=False
+    )
+    assert (run.returncode, run.stdout) == (0, ""), run.stderr
