@@ -9,7 +9,7 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from abcd_ns.cli.export.command import TRANSFORMS, export
+from abcd_ns.cli.export.command import TRANSFORMS, export, tell_rounding
 from abcd_ns.cli.export.shown import Shown
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.frames import Frame
@@ -148,6 +148,11 @@ def test_far_from_the_origin_lost_digits_are_told(run, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "rounds positions to 0." in said
     assert "--frame nerfstudio" in said
+
+
+def test_a_single_gaussian_has_no_size_to_lose_digits_of(capsys):
+    tell_rounding(".ply", largest=5e6, size=0.0)
+    assert capsys.readouterr().out == ""
 
 
 def test_the_scenes_size_is_that_of_its_blocks_together(run, scene):
