@@ -22,8 +22,6 @@ OPAQUE = 1e-4
 """Transmittance below which nothing behind can be seen; where rasterizers stop."""
 FAR = 1e4
 """Depth of pictures that have none; world units."""
-
-
 SECONDS_TO_END = 10.0
 """That a picture which is being drawn has when the process ends."""
 
