@@ -10,7 +10,7 @@ import msgspec
 from abcd_ns.engine.layers.visit_layers import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
 from abcd_ns.engine.store.special_blocks import WHOLE, from_text
-from abcd_ns.engine.train.health_record import Ledger
+from abcd_ns.engine.train.health_record import BlockHealth, Ledger
 from abcd_ns.engine.train.schedule import VisitPlan
 
 UNLIMITED = 2**31
@@ -156,6 +156,8 @@ class RunState:
         for known in (self.views, self.influence):
             if parent in known:
                 known[new] = copy.copy(known[parent])
+        if (record := self.health.get(parent)) is not None:  # what was mended is counted once
+            self.health[new] = BlockHealth(visits=record.visits, damping=record.damping)
         places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
         for place in reversed(places):
             self.queue.insert(place + 1, VisitPlan(new, self.queue[place].steps))

@@ -9,6 +9,7 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.splitting import FULL, cut_at_rest, split_full
+from abcd_ns.engine.train.health_record import BlockHealth, standing
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.schedule import VisitPlan
@@ -66,6 +67,15 @@ def test_a_part_is_visited_next_to_the_block_it_came_from():
     assert state.influence == {0: {2: 0.5}, 2: {2: 0.5}}
     state.influence[2][2] = 0.1
     assert state.influence[0][2] == 0.5
+
+
+def test_a_part_has_had_the_visits_of_the_block_it_came_from():
+    state = RunState(health={0: BlockHealth(visits=3, undone=1, shed=7, damping=0.5)})
+    state.inherit(2, 0)
+    state.inherit(3, 1)
+    assert state.health.keys() == {0, 2}
+    assert state.health[2] == BlockHealth(visits=3, damping=0.5)  # what was shed is told once
+    assert standing(2, state.health[2], {}) == "trained"
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
