@@ -11,6 +11,7 @@ from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import overlap, worth_training
 from abcd_ns.engine.store.settle import has_scaffold
 from abcd_ns.engine.store.special_blocks import RESERVE, WHOLE
+from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
@@ -147,7 +148,8 @@ class Planner(Visits):
             return None
         if self._scene.tree.num_blocks == 1:
             return self._sole_visit(state, block, showing, sh_degree)
-        used, earlier = self._views_used(state, len(showing)), self._scene.clocks(block).visits
+        record = state.health.get(block, BlockHealth())  # of undone visits, too, unlike clocks
+        used, earlier = self._views_used(state, len(showing)), record.visits
         doubtful = tuple(sorted(views.keys() - set(showing)))
         chosen = visit_views(showing, used, earlier, seed)
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()

@@ -8,7 +8,6 @@ or without all this, on a CPU bit for bit: healthy tensors are read, never writt
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -142,7 +141,8 @@ class Health:
     def end_visit(self, active: ActiveVisit, detach: Callable[[], BlockState]) -> BlockState:
         """What the visit leaves behind: the live block, mended, or the block as it was before.
 
-        The clocks go on in either case, so that what ended badly is not tried again at once.
+        What is put back has its old clocks, so that a first visit is to come yet; but the same is not tried
+        again: rates are lower, and other views have their turn.
 
         Args:
             detach: takes the live block out.
@@ -158,7 +158,7 @@ class Health:
         rise = loss_rise(list(active.objective.values()))
         record.rises += rise is not None and rise[1] > rise[0]
         if rise is not None and is_worse(*rise):
-            return self._undo(active, state, rise, record)
+            return self._undo(active, rise, record)
         record.damping = min(2 * record.damping, 1.0)
         return state
 
@@ -176,15 +176,11 @@ class Health:
         self._read()
         self._mend()
 
-    def _undo(
-        self, active: ActiveVisit, state: BlockState, rise: tuple[float, float, float], record: BlockHealth
-    ) -> BlockState:
+    def _undo(self, active: ActiveVisit, rise: tuple[float, float, float], record: BlockHealth) -> BlockState:
         record.undone += 1
         record.damping = max(record.damping / 2, LEAST_DAMPING)
         self._announce(VisitUndone(active.number, active.geometry.block, rise[0], rise[1]))
-        before = with_mail(self._scene, active.geometry.block)  # who has waited waits for the next visit
-        clocks = replace(state.clocks, adam_views=before.clocks.adam_views)
-        return replace(before, clocks=clocks)
+        return with_mail(self._scene, active.geometry.block)  # who has waited waits for the next visit
 
     # -- numbers -------------------------------------------------------------------------------------
 
