@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
-from abcd_ns.engine.train.health_record import FEW_VIEWS
+from abcd_ns.engine.train.health_record import FEW_VIEWS, BlockHealth
+from abcd_ns.engine.train.planner import LOOK_AGAIN
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 
 SECONDS_BETWEEN_POINTS = 2.0
@@ -64,15 +65,15 @@ class RunHistory:
 
     @staticmethod
     def resumed(state: RunState, seconds: float) -> "RunHistory":
-        """Of a run that goes on: which blocks had a visit follows from the plan of the sweep."""
+        """Of a run that goes on: which blocks had a visit follows from what their health tells, and from
+        the plan of the sweep."""
         waiting = {plan.block for plan in state.queue}
         if state.active is not None:
             waiting.add(state.active.geometry.block)
-        seen = [block for block, views in state.views.items() if views > 0]
-        visits = {block: state.sweep + (block not in waiting) for block in seen}
-        over = sum(block not in waiting for block in seen)
+        records = {b: record for b, record in state.health.items() if record.visits and state.views.get(b)}
+        visits = {block: record.visits for block, record in records.items()}
+        over = sum(b not in waiting and not _passed_over(r, state.sweep) for b, r in records.items())
         sweep = state.sweep if state.views else None
-        visits = {block: count for block, count in visits.items() if count}
         history = RunHistory(visits, sweep=sweep, sweep_began=seconds, sweep_visits=over)
         if (active := state.active) is not None:
             block = None if active.is_whole else active.geometry.block
@@ -150,6 +151,11 @@ class RunHistory:
             )
             for block, count in counts.items()
         ]
+
+
+def _passed_over(record: BlockHealth, sweep: int) -> bool:
+    """Whether a block that is hidden has no visit in this sweep: then it has had fewer than one in each."""
+    return record.hidden and sweep % LOOK_AGAIN > 0 and record.visits <= sweep
 
 
 def sweep_share(history: RunHistory, state: RunState) -> float:

@@ -6,6 +6,8 @@ import pytest
 
 from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded, WorkerSeen
 from abcd_ns.engine.layers.visit_layers import VisitGeometry
+from abcd_ns.engine.store.special_blocks import WHOLE
+from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
@@ -217,15 +219,34 @@ def test_a_sweep_has_no_more_time_left_than_the_run():
 
 def test_a_resumed_run_knows_which_blocks_had_their_visit():
     state = RunState(
-        sweep=0, visit=3, queue=[VisitPlan(2, 10)], views={0: 9, 1: 9, 2: 9, 3: 0}, active=active(1, done=4)
+        visit=3, queue=[VisitPlan(2, 10)], views={0: 9, 1: 9, 2: 9, 3: 0, 4: 9}, active=active(1, done=4)
     )
+    state.health = {WHOLE: BlockHealth(visits=1), 0: BlockHealth(visits=1)}
     history = RunHistory.resumed(state, seconds=7.0)
-    statuses = [history.status(block, state.views[block]) for block in range(4)]
-    assert statuses == [Status.DONE, Status.ACTIVE, Status.UNTRAINED, Status.UNDER_OBSERVED]
+    statuses = [history.status(block, state.views[block]) for block in range(5)]
+    none = Status.UNTRAINED  # the last one, whose share of the sweep was no step, too
+    assert statuses == [Status.DONE, Status.ACTIVE, none, Status.UNDER_OBSERVED, none]
     assert sweep_share(history, state) == pytest.approx((1 + 0.4) / 3)
-    state.sweep = 1
+    state.sweep, state.health[2] = 1, BlockHealth(visits=1)
     assert RunHistory.resumed(state, 7.0).status(2, 9) is Status.DONE
     assert RunHistory.resumed(RunState(), 0.0) == RunHistory()
+
+
+@pytest.mark.parametrize(("sweep", "over"), [(0, 2), (1, 1), (4, 2)])
+def test_a_resumed_run_knows_which_blocks_the_sweep_passes_over(sweep, over):
+    """Block 1 was hidden in its first visit: then it is looked at again in the fifth sweep."""
+    hidden = BlockHealth(visits=1 + sweep // 4, hidden=True)
+    health = {0: BlockHealth(visits=1 + sweep), 1: hidden, 2: BlockHealth(visits=sweep)}
+    state = RunState(sweep=sweep, views={0: 9, 1: 9, 2: 9}, health=health, active=active(2))
+    history = RunHistory.resumed(state, seconds=7.0)
+    assert history.sweep_visits == over
+    assert history.status(1, 9) is Status.DONE
+
+
+def test_a_resumed_run_counts_the_visit_in_which_a_block_was_hidden():
+    health = {0: BlockHealth(visits=2, hidden=True)}
+    state = RunState(sweep=1, views={0: 9, 1: 9}, health=health, active=active(1))
+    assert RunHistory.resumed(state, seconds=7.0).sweep_visits == 1
 
 
 def test_words():
