@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from abcd_ns.lab.results.records import decode
-from abcd_ns.lab.results.results import Arm, Results
+from abcd_ns.lab.results.results import Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
 from abcd_ns.lab.results.tables import GIB, cell, measures_of, notes, print_rows, rows
@@ -73,13 +73,9 @@ def _results(found: Record) -> Results | None:
     return decode(Results, found["results"], "results") if found.get("results") else None
 
 
-def _name(arm: Arm) -> str:
-    return f"{arm.method} {arm.variant}".removesuffix(" default")
-
-
 def _rows_of_comparison(part: str, results: Results) -> list[list[str]]:
     shown = measures_of(COMPARED)
-    body = [[_name(arm), *(cell(arm.runs, measure) for measure in shown)] for arm in results.arms]
+    body = [[arm.name, *(cell(arm.runs, measure) for measure in shown)] for arm in results.arms]
     return [[part, *(measure.title for measure in shown)], *body]
 
 
@@ -89,7 +85,7 @@ def _draw_comparison(part: str, results: Results, out: Path) -> list[Path]:
     if not results.arms:
         return []
     shades, settings = iter(SHADES), results.settings
-    runs = {_name(arm): arm.runs[0] for arm in results.arms}
+    runs = {arm.name: arm.runs[0] for arm in results.arms}
     colors = {
         name: next(shades) if name.startswith("abcd blocks") else COLORS[run.method]
         for name, run in runs.items()

@@ -25,6 +25,11 @@ class Arm:
     """One for each seed that did not fail."""
 
     @property
+    def name(self) -> str:
+        """The method, and what of it is set."""
+        return self.method if self.variant == "default" else f"{self.method} {self.variant}"
+
+    @property
     def psnr(self) -> float:
         """Held out, merged, dB; mean over the seeds."""
         return fmean(run.psnr_merged for run in self.runs)

@@ -100,7 +100,7 @@ def cell(runs: Sequence[Run], measure: Measure) -> str:
 def rows(results: Results) -> Rows:
     """A row for each arm; of a comparison a row for each measure. Columns that know nothing are left out."""
     if results.kind not in COLUMNS:
-        titles = ["", *results.methods]
+        titles = ["", *(arm.name for arm in results.arms)]
         return [titles, *([m.title, *(cell(arm.runs, m) for arm in results.arms)] for m in MEASURES)]
     first, measures = COLUMNS[results.kind]
     measures = [m for m in measures if any(cell(arm.runs, m) != NOTHING for arm in results.arms)]

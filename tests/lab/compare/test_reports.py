@@ -18,10 +18,11 @@ from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy, 
 from abcd_ns.lab.compare.command import first_runs
 from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
 from abcd_ns.lab.job import METHODS
+from abcd_ns.lab.results.results import Arm
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS, spread
 from abcd_ns.lab.results.tables import MEASURES, cell, notes, print_table, rows, write_table
-from tests.lab.compare.records import made_up_results, made_up_run
+from tests.lab.compare.records import made_up, made_up_results, made_up_run
 from tests.lab.svg import texts_of
 
 # The chart
@@ -122,6 +123,13 @@ def test_table_has_a_column_per_method_and_a_row_per_measure(tmp_path):
     widths = {line.count("|") for line in lines if line.startswith("|")}
     assert widths == {4}
     assert len([line for line in lines if line.startswith("|")]) == 2 + len(MEASURES)
+
+
+def test_table_has_a_column_for_each_way_that_a_method_is_set():
+    arms = [("abcd-monolithic", "default"), ("abcd", "default"), ("abcd", "blocks=2")]
+    titles, *body = rows(made_up("comparison", *(Arm(*arm, None, (made_up_run(arm[0]),)) for arm in arms)))
+    assert titles == ["", "abcd-monolithic", "abcd", "abcd blocks=2"]
+    assert {len(row) for row in body} == {len(titles)}
 
 
 def test_several_seeds_give_mean_and_deviation():
