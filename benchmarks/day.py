@@ -27,10 +27,10 @@ from rich.console import Console
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.style import in_style, save, write_beside
 from abcd_ns.machine import describe_machine, describe_versions
+from abcd_ns.units import GIB
 
 BIN = Path(sys.executable).parent
 SECONDS_BETWEEN_LOOKS = 0.2
-GB = 2**30
 
 
 @dataclass
@@ -145,7 +145,7 @@ class Day:
                 time.sleep(SECONDS_BETWEEN_LOOKS)
             record.exit_code = command.wait()
         record.ended = self._now()
-        self.console.print(f"  exit code {record.exit_code}, at most {record.peak / GB:.2f} GB of RAM")
+        self.console.print(f"  exit code {record.exit_code}, at most {record.peak / GIB:.2f} GiB of RAM")
         return record
 
     def _now(self) -> float:
@@ -154,18 +154,18 @@ class Day:
 
 @in_style
 def draw(processes: list[Process], limit: float, out: Path) -> None:
-    """RAM over the day, with the kills; `limit` is in GB."""
+    """RAM over the day, with the kills; `limit` is in GiB."""
     figure, axes = plt.subplots(figsize=(7.0, 3.4), layout="constrained")
     for number, process in enumerate(processes):
         times = [seconds / 60 for seconds, _ in process.rss]
-        axes.fill_between(times, [used / GB for _, used in process.rss], color=f"C{number % 3}", alpha=0.75)
+        axes.fill_between(times, [used / GIB for _, used in process.rss], color=f"C{number % 3}", alpha=0.75)
         if process.killed_at_step is not None:
             axes.axvline(process.ended / 60, color="black", linewidth=1)
             look = {"xycoords": ("data", "axes fraction"), "ha": "right", "va": "top", "fontsize": 9}
             text = f"kill -9\nstep {process.killed_at_step:,}"
             write_beside(axes, text, (process.ended / 60, 0.97), (-4, 0), **look)
     axes.axhline(limit, color="black", linestyle="--", linewidth=1)
-    axes.set(xlabel="minutes", ylabel="RAM of the process (GB)", ylim=(0, 1.25 * limit))
+    axes.set(xlabel="minutes", ylabel="RAM of the process (GiB)", ylim=(0, 1.25 * limit))
     save(figure, out, "day")
 
 
@@ -200,11 +200,11 @@ def main(args: Args) -> int:
     (args.out / "day.json").write_text(json.dumps(found, indent=1) + "\n")
     draw(day.processes, args.ram_limit_gb, args.out)
     shutil.copy(day.run / "abcd" / "log.jsonl", args.out / "log.jsonl")
-    good = last.exit_code == 0 and bool(scores) and peak <= args.ram_limit_gb * GB
+    good = last.exit_code == 0 and bool(scores) and peak <= args.ram_limit_gb * GIB
     psnr = scores.get("psnr", float("nan"))
     print(
         f"{found['steps']} steps, blocks {found['blocks']}, {found['gaussians']} Gaussians, {psnr:.2f} dB, "
-        f"at most {peak / GB:.2f} GB: {'a good day' if good else 'not a good day'}"
+        f"at most {peak / GIB:.2f} GiB: {'a good day' if good else 'not a good day'}"
     )
     return int(not good)
 

@@ -30,6 +30,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio.run import STATE
+from abcd_ns.units import MIB
 from benchmarks.runs import apart, config_of, print_machine, write_runs
 from tests.reference.crash_runs import digest
 
@@ -198,7 +199,7 @@ def main(args: Args) -> None:
         sys.exit("give --seconds or --steps; with --kills it must be --steps")
     budget = f"{args.seconds:g} s" if args.seconds else f"{args.steps:,} steps"
     print_machine(f"{args.data.name}, downscale {args.downscale}, {args.blocks} blocks, {budget}\n")
-    print("| workers | kills | visits | visits/s | steps | seconds | driver waits | MB lent a visit | PSNR |")
+    print("| workers | kills | visits | visits/s | steps | seconds | driver waits | MiB a visit | PSNR |")
     print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     rows = []
     for workers in args.workers:
@@ -206,7 +207,7 @@ def main(args: Args) -> None:
             with tempfile.TemporaryDirectory() as out:
                 row = apart(measure, args, workers, kills, Path(out))
             rows.append(row)
-            lent, rate = row.lent / max(row.visits, 1) / 1e6, row.visits / row.seconds
+            lent, rate = row.lent / max(row.visits, 1) / MIB, row.visits / row.seconds
             print(
                 f"| {row.workers or 'none'} | {len(row.kills)} | {row.visits} | {rate:.2f} | "
                 f"{row.steps:,} | {row.seconds:.1f} | {row.waited:.0%} | {lent:.1f} | {row.psnr:.2f} |",

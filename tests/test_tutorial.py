@@ -6,7 +6,7 @@ from abcd_ns.engine.train.memory import DeviceNeeds
 
 TUTORIAL = Path(__file__).resolve().parent.parent / "docs" / "tutorial.md"
 BUDGETS = (4, 6, 8, 12, 24)
-"""GB."""
+"""GiB."""
 PHOTOS = (1, 2, 8)
 """Megapixels."""
 
@@ -14,7 +14,7 @@ PHOTOS = (1, 2, 8)
 def memory_table() -> str:
     """Millions of Gaussians in a block; a dash where not even a small one fits."""
     lines = [
-        "| photos, views in a step | " + " | ".join(f"{budget} GB" for budget in BUDGETS) + " |",
+        "| photos, views in a step | " + " | ".join(f"{budget} GiB" for budget in BUDGETS) + " |",
         "| --- |" + " ---: |" * len(BUDGETS),
     ]
     for megapixels in PHOTOS:

@@ -26,6 +26,7 @@ from abcd_ns.engine.types import Crop
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.flags import hidden
 from abcd_ns.nerfstudio.views import place_cameras
+from abcd_ns.units import GIB
 
 BATCH = "abcd_batch"
 """The key of a camera's metadata under which what to train on travels from here to the model."""
@@ -81,7 +82,7 @@ class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     cache_images: Literal["cpu", "gpu"] = "cpu"
     """Of no use: see UNUSED. nerfstudio would speak of it where it is "gpu"."""
     photo_cache_gb: float = 0.0
-    """RAM for decoded photos, GB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
+    """RAM for decoded photos, GiB; 0 takes the photos' share of `pipeline.ram_budget_gb`."""
 
     def __post_init__(self) -> None:
         if self.data_format is None:
@@ -118,7 +119,7 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def create_train_dataset(self) -> AbcdDataset:
         """The training photos, under their share of RAM."""
-        budget = int(self.config.photo_cache_gb * 2**30) if self.config.photo_cache_gb else None
+        budget = int(self.config.photo_cache_gb * GIB) if self.config.photo_cache_gb else None
         outputs = self.train_dataparser_outputs
         return AbcdDataset(outputs, budget_bytes=budget, needs_photos=self._needs_photos)
 

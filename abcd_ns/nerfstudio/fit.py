@@ -12,8 +12,8 @@ from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, fewest_blocks, free_on_gpu, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
+from abcd_ns.units import GIB, bytes_in_words
 
-GB = 2**30
 EXPECTED_GROWTH = 5
 """Gaussians at the end for each initial point, where no limit is set; for forecasts only."""
 FREE_SHARE = 0.9
@@ -77,7 +77,7 @@ class Fit:
         grows = "a block that comes near that is cut in two."
         if not self.limit:
             grows = "there is no room for the layers of more, and the scene stops growing at that."
-        budget = f"{self.budget / GB:.1f} GB of the device allow {limit:,} Gaussians in a block"
+        budget = f"{bytes_in_words(self.budget)} of the device allow {limit:,} Gaussians in a block"
         return f"{budget}: {blocks} to begin with; {grows}{self._drawn_in_words()}"
 
     def _drawn_in_words(self) -> str:
@@ -93,7 +93,7 @@ class Fit:
 def device_budget(wanted_gb: float, device: torch.device | str) -> int:
     """Bytes of the device that training may take: what is wanted, or with 0 what there is."""
     if wanted_gb > 0:
-        return int(wanted_gb * GB)
+        return int(wanted_gb * GIB)
     if (device := torch.device(device)).type == "cuda":
         return int(FREE_SHARE * free_on_gpu(device))
     return int(RAM_SHARE * psutil.virtual_memory().total)
@@ -206,14 +206,14 @@ def _refusal(budget: int, demand: Demand) -> str:
         ways.append(f"smaller photos by {DOWNSCALE} {times * demand.factor}")
     ways.append(f"more memory by {BUDGET_FLAG} {least:.2f}, if the device has it")
     return (
-        f"Training on photos of {demand.pixels / 1e6:.2g} megapixels takes {least:.2f} GB of the device, and "
-        f"{budget / GB:.2f} GB may be taken: give {', or '.join(ways)}."
+        f"Training on photos of {demand.pixels / 1e6:.2g} megapixels takes {least:.2f} GiB of the device, "
+        f"and {budget / GIB:.2f} GiB may be taken: give {', or '.join(ways)}."
     )
 
 
 def _least_budget(budget: int, demand: Demand) -> float:
-    """The least that suffices, GB to two digits."""
-    step = GB // 100
+    """The least that suffices, GiB to two digits."""
+    step = GIB // 100
     low = high = budget // step + 1
     while _fit(high * step, demand) is None:
         high *= 2
@@ -232,11 +232,11 @@ class RamShares:
     """A visit's layers; where there is a GPU, those that have no room there."""
 
     @staticmethod
-    def of(gigabytes: float) -> "RamShares":
+    def of(gibibytes: float) -> "RamShares":
         """A quarter of so many for photos, one for blocks, the rest for layers; 0 is the smaller of 8 and 40%
         of the machine's memory."""
-        if gigabytes:
-            budget = int(gigabytes * GB)
+        if gibibytes:
+            budget = int(gibibytes * GIB)
         else:
             budget = min(MOST_RAM, int(KEPT_SHARE * psutil.virtual_memory().total))
         photos = blocks = budget // 4

@@ -56,6 +56,7 @@ from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with, dispatcher_for, number_of_workers
 from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
+from abcd_ns.units import GIB
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
 
@@ -79,8 +80,8 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Number of blocks that space is cut into; 1 is ordinary 3DGS. 0 takes as few as `device_budget_gb`
     allows, one where the scene fits, and cuts blocks that outgrow it in two."""
     device_budget_gb: float = 0.0
-    """Memory of the device that training may take, GB, by which `blocks` 0 is decided; 0 takes 0.9 of what is
-    free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
+    """Memory of the device that training may take, GiB, by which `blocks` 0 is decided; 0 takes 0.9 of what
+    is free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
     eighth for photos."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
@@ -88,7 +89,7 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
     the nearest distance at which a photo shows a point."""
     ram_budget_gb: float = 0.0
-    """RAM for photos, blocks and layers that could be read or drawn again, GB; no result depends on it, but
+    """RAM for photos, blocks and layers that could be read or drawn again, GiB; no result depends on it, but
     that `workers` 0 is one where it is set. 0 takes 8, or 40% of the machine's memory where that is less."""
     workers: int = 0
     """Blocks that are trained at once, each by a process of its own: on a core each, or on a GPU each, which
@@ -112,7 +113,7 @@ class AbcdPipeline(VanillaPipeline):
         mirror(config.training, config.model)
         self._ram = RamShares.of(config.ram_budget_gb)
         if not config.datamanager.photo_cache_gb:
-            config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / 2**30
+            config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / GIB
         # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
         guard.install()
         super().__init__(config, *args, **kwargs)

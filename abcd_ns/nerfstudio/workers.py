@@ -21,7 +21,8 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import GB, Fit
+from abcd_ns.nerfstudio.fit import Fit
+from abcd_ns.units import bytes_in_words
 
 BLOCKS_EACH = 2
 """Blocks for each worker at least, where their number is not given: one in training, one that rests."""
@@ -67,8 +68,8 @@ def blocks_to_begin_with(fit: Fit, workers: int) -> int:
     """
     if workers and not fit.limit:
         raise UserError(
-            f"{fit.budget / GB:.1f} GB of the device have no room for a block among others, which workers "
-            "need: leave --pipeline.workers out, or give smaller photos."
+            f"{bytes_in_words(fit.budget)} of the device have no room for a block among others, which "
+            "workers need: leave --pipeline.workers out, or give smaller photos."
         )
     return max(fit.blocks, BLOCKS_EACH * workers)
 

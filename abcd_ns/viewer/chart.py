@@ -1,6 +1,6 @@
-"""A curve as a small picture in the panel: an SVG of a few kB.
+"""A curve as a small picture in the panel: an SVG of a few KiB.
 
-viser can show plotly's figures, but sends every browser 5 MB of script for it, and its version 0.2 may draw
+viser can show plotly's figures, but sends every browser 5 MiB of script for it, and its version 0.2 may draw
 them wider than the panel.
 """
 

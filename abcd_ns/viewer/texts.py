@@ -7,6 +7,7 @@ from datetime import timedelta
 from pathlib import Path
 
 from abcd_ns.engine.events import WorkerSeen
+from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.guard.rules import THIS_MACHINE
 from abcd_ns.viewer.run_history import BlockRow, Status
 
@@ -93,11 +94,5 @@ def memory_table(rows: Sequence[tuple[str, int, int]]) -> str:
         rows: (what, bytes, limit in bytes).
     """
     lines = ["| memory | used | of |", "| --- | ---: | ---: |"]
-    lines += [f"| {what} | {_size(used)} | {_size(limit)} |" for what, used, limit in rows]
+    lines += [f"| {what} | {bytes_in_words(used)} | {bytes_in_words(limit)} |" for what, used, limit in rows]
     return "\n".join(lines)
-
-
-def _size(count: int) -> str:
-    if count < 2**30:
-        return f"{count / 2**20:.0f} MB"
-    return f"{count / 2**30:.1f} GB"

@@ -12,8 +12,9 @@ from abcd_ns.lab.results.records import decode
 from abcd_ns.lab.results.results import Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.style import COLORS, MARKERS, in_style, label_ends, lay_grid, save
-from abcd_ns.lab.results.tables import GIB, cell, measures_of, notes, print_rows, rows
+from abcd_ns.lab.results.tables import cell, measures_of, notes, print_rows, rows
 from abcd_ns.lab.scale.charts import draw_scale
+from abcd_ns.units import GIB
 
 Record = dict[str, Any]
 SHADES = ("#0072B2", "#56A0D3", "#003A5D")

@@ -24,13 +24,13 @@ from abcd_ns.engine.render import make_rasterizer, self_check
 from abcd_ns.lab.compare.command import Options, impossible, make_plan
 from abcd_ns.lab.job import AS_IT_IS, Change, Job, Variant
 from abcd_ns.lab.results.records import decode, encode, read_json, write_json
-from abcd_ns.lab.results.tables import MIB
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.scale import command as scale
 from abcd_ns.lab.scale.worker import LandSettings
 from abcd_ns.lab.stability.scenarios.real import read_stage
 from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio.run import STATE
+from abcd_ns.units import MIB
 from benchmarks import visit
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,8 +13,9 @@ from abcd_ns.cli.plan.forecast import Forecast, device_shares, disk_shares, view
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import FITTED, GB, Fit
+from abcd_ns.nerfstudio.fit import FITTED, Fit
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with
+from abcd_ns.units import GIB
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 FITS = {"something": 1}
@@ -65,9 +66,9 @@ def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
 
 
 def test_workers_for_whom_there_is_no_room_are_refused():
-    alone = Fit(blocks=1, limit=0, sole=5000, budget=GB, gaussians=1000, batch=4)
+    alone = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000, batch=4)
     assert blocks_to_begin_with(alone, 0) == 1
-    with pytest.raises(UserError, match=r"1\.0 GB of the device have no room for a block among others"):
+    with pytest.raises(UserError, match=r"1\.0 GiB of the device have no room for a block among others"):
         blocks_to_begin_with(alone, 2)
     assert blocks_to_begin_with(dataclasses.replace(alone, limit=5000), 3) == 6
 
@@ -79,7 +80,7 @@ def test_a_device_budget_decides_how_many_blocks():
     )
     assert few.fit.blocks_at_the_end == few.fit.blocks == many.fit.blocks == 1
     assert many.fit.blocks_at_the_end > 2
-    assert sum(many.shares["device"].values()) <= 3 * GB
+    assert sum(many.shares["device"].values()) <= 3 * GIB
 
 
 def test_large_photos_are_planned_for_as_they_are_trained_on():
@@ -89,22 +90,22 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
         dataclasses.replace(small, views=large), Wanted(device_budget_gb=0.15), Console(quiet=True)
     )
     assert 0 < found.fit.crop_pixels < 260_000
-    assert sum(found.shares["device"].values()) <= 0.15 * GB
+    assert sum(found.shares["device"].values()) <= 0.15 * GIB
     assert not found.warnings
 
 
 def test_a_device_keeps_layers_and_photos_besides():
-    limit = DeviceNeeds(100, 4).block_limit(GB)
-    fit = Fit(blocks=2, limit=limit, sole=10**9, budget=GB, gaussians=10**9, batch=4)
+    limit = DeviceNeeds(100, 4).block_limit(GIB)
+    fit = Fit(blocks=2, limit=limit, sole=10**9, budget=GIB, gaussians=10**9, batch=4)
     shares = device_shares(fit, DeviceNeeds(100, 4))
-    assert list(shares.values())[2:] == [GB // 8, GB // 8]
-    assert GB - DeviceNeeds(100, 4).gaussian_bytes < sum(shares.values()) <= GB
+    assert list(shares.values())[2:] == [GIB // 8, GIB // 8]
+    assert GIB - DeviceNeeds(100, 4).gaussian_bytes < sum(shares.values()) <= GIB
     alone = device_shares(dataclasses.replace(fit, blocks=1), DeviceNeeds(100, 1, levels=0))
-    assert list(alone.values())[2:] == [0, GB // 8]
+    assert list(alone.values())[2:] == [0, GIB // 8]
 
 
 def test_disk_holds_two_generations_and_a_checkpoint():
-    fit = Fit(blocks=1, limit=10**9, sole=10**9, budget=GB, gaussians=1000, batch=4)
+    fit = Fit(blocks=1, limit=10**9, sole=10**9, budget=GIB, gaussians=1000, batch=4)
     needs = DeviceNeeds(100, 1)
     assert sum(disk_shares(fit, needs).values()) == 1000 * 236 * (2 * 3 + 1)
     assert next(iter(device_shares(fit, needs).values())) == 1000 * needs.gaussian_bytes

@@ -16,7 +16,6 @@ from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import (
     FITTED,
-    GB,
     LEAST_BLOCK,
     Demand,
     Fit,
@@ -24,6 +23,7 @@ from abcd_ns.nerfstudio.fit import (
     device_budget,
     find_fit,
 )
+from abcd_ns.units import GIB
 from tests.reference.scenes import training_config
 
 TRAINING = TrainingConfig()
@@ -35,7 +35,7 @@ POINTS = 140_000
 
 
 def fit_for(gb: float, pixels: int, points: int = POINTS, most: int | None = None, **training) -> Fit:
-    return find_fit(int(gb * GB), Demand(pixels, points, training_config(**training), most=most))
+    return find_fit(int(gb * GIB), Demand(pixels, points, training_config(**training), most=most))
 
 
 def needs_of(fit: Fit, pixels: int, blocks: int) -> DeviceNeeds:
@@ -50,8 +50,8 @@ def test_every_block_fits_the_budget_and_one_fewer_would_not(gaussians, gb):
     assert (fit.batch, fit.crop_pixels) == (4, 0)
     for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
         needs = needs_of(fit, PIXELS, blocks)
-        left = needs.left(gb * GB)
-        assert left == gb * GB * (7 if blocks == 1 else 6) // 8
+        left = needs.left(gb * GIB)
+        assert left == gb * GIB * (7 if blocks == 1 else 6) // 8
         assert needs.bytes_for(limit) <= left < needs.bytes_for(limit + 1)
     assert (fit.blocks == 1) == (gaussians <= FULL * fit.sole)
     if fit.blocks > 1:
@@ -83,7 +83,7 @@ def test_large_photos_are_trained_on_by_fewer_views_and_then_by_parts(gb, pixels
     assert min(fit.limit, fit.sole) > POINTS
     for blocks, limit in ((1, fit.sole), (max(fit.blocks_at_the_end, 2), fit.limit)):
         needs = needs_of(fit, pixels, blocks)
-        assert needs.bytes_for(limit) <= needs.left(int(gb * GB))
+        assert needs.bytes_for(limit) <= needs.left(int(gb * GIB))
     said = fit.in_words()
     assert "\n" not in said
     assert ("large" in said) == (batch < 4)
@@ -109,7 +109,7 @@ def test_a_deep_tree_leaves_less_room_where_photos_are_large():
     assert many.limit < few.limit
     needs = needs_of(many, GARDEN, many.blocks_at_the_end)
     assert needs.drawing_bytes > needs.step_bytes
-    assert needs.bytes_for(many.limit) <= needs.left(12 * GB)
+    assert needs.bytes_for(many.limit) <= needs.left(12 * GIB)
 
 
 @given(side=st.integers(100, 6000), batch=st.integers(1, 4))
@@ -121,11 +121,11 @@ def test_layers_that_are_folded_take_no_more_than_the_steps_that_follow(side, ba
 
 def test_a_cpu_keeps_layers_and_photos_under_another_budget():
     demand = Demand(PIXELS, 10_000_000, TRAINING)
-    device, cpu = (find_fit(8 * GB, dataclasses.replace(demand, on_cpu=on_cpu)) for on_cpu in (False, True))
+    device, cpu = (find_fit(8 * GIB, dataclasses.replace(demand, on_cpu=on_cpu)) for on_cpu in (False, True))
     needs = dataclasses.replace(needs_of(cpu, PIXELS, cpu.blocks_at_the_end), keeps=False)
-    assert needs.left(8 * GB) == 8 * GB
-    assert (needs.layer_bytes(8 * GB), needs.photo_bytes(8 * GB)) == (0, 0)
-    assert needs.bytes_for(cpu.limit) <= 8 * GB < needs.bytes_for(cpu.limit + 1)
+    assert needs.left(8 * GIB) == 8 * GIB
+    assert (needs.layer_bytes(8 * GIB), needs.photo_bytes(8 * GIB)) == (0, 0)
+    assert needs.bytes_for(cpu.limit) <= 8 * GIB < needs.bytes_for(cpu.limit + 1)
     assert cpu.limit > device.limit
 
 
@@ -152,7 +152,7 @@ def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
     with pytest.raises(UserError):
         fit_for(0.3, 100_000, 2_000_000)
     with pytest.raises(UserError):  # a run that has two blocks already
-        find_fit(int(0.3 * GB), Demand(100_000, 2_000, TRAINING, blocks=2))
+        find_fit(int(0.3 * GIB), Demand(100_000, 2_000, TRAINING, blocks=2))
 
 
 @pytest.mark.parametrize("block", [1, 3_333, 5_000_000])
@@ -202,35 +202,35 @@ def test_a_scene_that_fits_is_one_block():
 def test_a_refusal_names_options_that_help(gb, pixels, points, options):
     demand = Demand(pixels, points, TrainingConfig(**options), factor=2)
     with pytest.raises(UserError) as caught:
-        find_fit(int(gb * GB), demand)
+        find_fit(int(gb * GIB), demand)
     said = str(caught.value)
-    assert f"{gb:.2f} GB may be taken" in said
+    assert f"{gb:.2f} GiB may be taken" in said
     least = float(re.search(r"--pipeline\.device-budget-gb (\S+),", said)[1])
-    assert f"takes {least:.2f} GB" in said
+    assert f"takes {least:.2f} GiB" in said
     assert least > gb
-    assert find_fit(int((least + 0.01) * GB), demand).batch >= 1
+    assert find_fit(int((least + 0.01) * GIB), demand).batch >= 1
     with pytest.raises(UserError):
-        find_fit(int((least - 0.03) * GB), demand)
+        find_fit(int((least - 0.03) * GIB), demand)
     if factor := re.search(r"--pipeline\.datamanager\.dataparser\.downscale-factor (\d+)", said):
         times = int(factor[1]) // 2
-        assert find_fit(int(gb * GB), demand.reduced(times)).batch >= 1
+        assert find_fit(int(gb * GIB), demand.reduced(times)).batch >= 1
     if "--pipeline.training.batch 1" in said:
-        assert find_fit(int(gb * GB), dataclasses.replace(demand, training=TrainingConfig(batch=1)))
+        assert find_fit(int(gb * GIB), dataclasses.replace(demand, training=TrainingConfig(batch=1)))
 
 
 def test_where_photos_are_all_too_large_smaller_ones_are_proposed():
     with pytest.raises(UserError, match=r"by --pipeline\.datamanager\.dataparser\.downscale-factor 2, or"):
-        find_fit(2 * GB, Demand(GARDEN, 400_000, TRAINING))
+        find_fit(2 * GIB, Demand(GARDEN, 400_000, TRAINING))
 
 
 def test_the_budget_is_what_is_wanted_or_a_share_of_what_there_is():
-    assert device_budget(3.0, "cpu") == 3 * GB
+    assert device_budget(3.0, "cpu") == 3 * GIB
     assert device_budget(0.0, "cpu") > 0
 
 
 @given(st.integers(1, 2**50))
 def test_shares_of_ram_add_up(budget):
-    shares = RamShares.of(budget / GB)
+    shares = RamShares.of(budget / GIB)
     assert sum(vars(shares).values()) == budget
     assert min(vars(shares).values()) >= 0
 

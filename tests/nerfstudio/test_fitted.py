@@ -6,12 +6,13 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.step.last_shedding import LastShedding
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
-from abcd_ns.nerfstudio.fit import GB, Fit
+from abcd_ns.nerfstudio.fit import Fit
+from abcd_ns.units import GIB
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
 
 STEPS = 16
-FIT = Fit(blocks=3, limit=5000, sole=5000, budget=GB, gaussians=300, batch=2, crop_pixels=600)
+FIT = Fit(blocks=3, limit=5000, sole=5000, budget=GIB, gaussians=300, batch=2, crop_pixels=600)
 
 
 def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_path, monkeypatch, capsys):

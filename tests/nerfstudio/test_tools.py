@@ -228,7 +228,7 @@ def test_a_network_that_fails_is_one_line(monkeypatch):
 
 # What TensorBoard, wandb and comet are given
 
-NAMES = ("block", "blocks", "sweep", "gaussians", "share of time for layers", "RAM (GB)")
+NAMES = ("block", "blocks", "sweep", "gaussians", "share of time for layers", "RAM (GiB)")
 
 
 @pytest.mark.usefixtures("trained")
@@ -241,7 +241,7 @@ def test_writers_are_told_where_the_training_stands(events):
     assert blocks[-1] in (1, 2, 3)
     assert events.scalars["ABCD/blocks"][-1][1] == 3
     assert events.scalars["ABCD/gaussians"][-1][1] > 100
-    assert 0 < events.scalars["ABCD/RAM (GB)"][-1][1] < 1000
+    assert 0 < events.scalars["ABCD/RAM (GiB)"][-1][1] < 1000
     for name in ("Eval Images Metrics Dict (all images)/psnr", "Eval Images Metrics/psnr", "Eval Loss"):
         assert [step for step, _ in events.scalars[name]] == [10, 20], name
     assert events.scalars["Train Metrics Dict/Gradients/Total"][-1][1] > 0

@@ -259,6 +259,6 @@ def test_words():
     assert sweep_line(2, 3, 8, None) == "Sweep 2: 3 of 8"
     assert sweep_line(2, 3, 8, 61.0) == "Sweep 2: 3 of 8, 0:01:01 left"
     assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers", 2**20, 2**32)]).splitlines()[2:] == [
-        "| RAM | 1.5 GB | 16.0 GB |",
-        "| layers | 1 MB | 4.0 GB |",
+        "| RAM | 1.5 GiB | 16.0 GiB |",
+        "| layers | 1 MiB | 4.0 GiB |",
     ]

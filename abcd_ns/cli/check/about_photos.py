@@ -10,6 +10,7 @@ from abcd_ns.cli.findings import Finding, error, note, warning
 from abcd_ns.cli.terminal import few, many
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.prepare import DOWNSCALE, MAX_AUTO_SIDE
+from abcd_ns.units import bytes_in_words
 
 FEW_PHOTOS = 8
 MANY_PIXELS = 4e6
@@ -66,7 +67,7 @@ def memory(survey: Survey) -> Iterator[Finding]:
     if needed > budget:
         yield note(
             "photos-beyond-ram",
-            f"Decoded photos take {needed / 2**30:.1f} GiB, and {budget / 2**30:.1f} GiB of them are kept in "
+            f"Decoded photos take {bytes_in_words(needed)}, and {bytes_in_words(budget)} of them are kept in "
             "RAM; the others are decoded again whenever they are needed, which takes time.",
             "If there is RAM, give more with --pipeline.datamanager.photo-cache-gb, or reduce the photos.",
         )

@@ -13,6 +13,7 @@ from abcd_ns.data.input_errors import one_line
 from abcd_ns.data.photos import default_budget
 from abcd_ns.data.scene import Lens
 from abcd_ns.engine.train.memory import parameter_bytes
+from abcd_ns.units import bytes_in_words
 
 MIDDLE = (0.05, 0.95)
 """Quantiles between which the points' extent is taken: single wrong ones would decide it otherwise."""
@@ -79,9 +80,9 @@ def print_summary(summary: Summary, console: Console) -> None:
     points = f"{summary.points:,}"
     if summary.point_extent:
         points += f", nine tenths of them within {_box(summary.point_extent)}"
-    photos = _size(summary.photo_bytes)
+    photos = bytes_in_words(summary.photo_bytes)
     if summary.photo_bytes > summary.photo_budget_bytes:
-        photos = f"{_size(summary.photo_budget_bytes)} of {photos}"
+        photos = f"{bytes_in_words(summary.photo_budget_bytes)} of {photos}"
     facts = {
         "model": one_line(summary.model),
         "photos": f"{summary.photos:,}, {few(sizes)}",
@@ -90,7 +91,7 @@ def print_summary(summary: Summary, console: Console) -> None:
         "cameras": f"within {_box(summary.camera_extent)} model units",
         "points": points,
         "near plane": f"{summary.near_plane_model:.3g} model units, {summary.near_plane:.3g} in training",
-        "RAM": f"{photos} of photos, {_size(summary.gaussian_bytes)} of Gaussians to begin with",
+        "RAM": f"{photos} of photos, {bytes_in_words(summary.gaussian_bytes)} of Gaussians to begin with",
     }
     print_facts(facts, console)
 
@@ -110,7 +111,3 @@ def _counted(photos: dict[str, int]) -> list[str]:
 
 def _box(sides: tuple[float, ...]) -> str:
     return " x ".join(f"{side:,.3g}" for side in sides)
-
-
-def _size(count: int) -> str:
-    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"

@@ -12,6 +12,7 @@ from abcd_ns.cli.doctor.hardware import Hardware
 from abcd_ns.cli.doctor.kernels import Kernels
 from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
 from abcd_ns.cli.terminal import many, print_plain
+from abcd_ns.units import bytes_in_words
 
 SCHEMA = 1
 """Of the JSON file; changes with its fields."""
@@ -94,12 +95,12 @@ def _lines(facts: Facts, verbose: bool) -> Iterator[str]:
 def _hardware(hardware: Hardware, verbose: bool) -> dict[str, str]:
     gpu, device = hardware.gpu, "none: training runs on the CPU, which is meant for small pictures"
     if gpu is not None:
-        device = f"{gpu.name}, {_gib(gpu.memory_bytes)}, capability {gpu.capability}"
+        device = f"{gpu.name}, {bytes_in_words(gpu.memory_bytes)}, capability {gpu.capability}"
     rows = {
         "GPU": device,
         "CPU": f"{hardware.cpu}, {hardware.cores} cores",
-        "RAM": f"{_gib(hardware.ram_bytes)}, {_gib(hardware.ram_free_bytes)} free",
-        "disk": f"{_gib(hardware.disk_free_bytes)} free",
+        "RAM": f"{bytes_in_words(hardware.ram_bytes)}, {bytes_in_words(hardware.ram_free_bytes)} free",
+        "disk": f"{bytes_in_words(hardware.disk_free_bytes)} free",
     }
     if verbose:
         rows |= {"OS": hardware.os, "driver": hardware.driver or "none"}
@@ -137,7 +138,3 @@ def _kernels(kernels: Kernels, on_gpu: bool, verbose: bool) -> dict[str, str]:
         rows["compilers"] = ", ".join(compilers)
         rows["LPIPS"] = "no weights" if kernels.lpips_missing else "weights are there"
     return rows
-
-
-def _gib(count: int) -> str:
-    return f"{count / 2**30:.1f} GiB"

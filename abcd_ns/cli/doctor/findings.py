@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from abcd_ns.cli.doctor.facts import Facts
 from abcd_ns.cli.doctor.packages import EXPORT
 from abcd_ns.cli.findings import Finding, error, note, warning
+from abcd_ns.units import GIB, bytes_in_words
 
 TESTED = {"nerfstudio": "1.1.5", "gsplat": "1.4.0"}
 """Versions whose insides are relied on."""
 VISER_MENDED = (1, 0, 25)
 """The first version of viser that serves its own files only."""
-GIB = 2**30
 LITTLE_RAM, LITTLE_DISK = 4 * GIB, 6 * GIB
 """Free bytes below which runs of usual size end early."""
 SYSTEM_LIBRARIES = "sudo apt-get install libgl1 libegl1 libgomp1 libusb-1.0-0 libx11-6"
@@ -105,7 +105,7 @@ def disk(facts: Facts) -> Iterator[Finding]:
     if facts.hardware.disk_free_bytes < LITTLE_DISK:
         yield warning(
             "little-disk",
-            f"Only {facts.hardware.disk_free_bytes / GIB:.1f} GiB of disk are free here. A run's blocks "
+            f"Only {bytes_in_words(facts.hardware.disk_free_bytes)} of disk are free here. A run's blocks "
             "take six times the size of the scene, and each checkpoint once that.",
             "Make room, or give ns-train --output-dir FOLDER on another disk.",
         )
@@ -117,8 +117,8 @@ def ram(facts: Facts) -> Iterator[Finding]:
     if free < LITTLE_RAM:
         yield warning(
             "little-ram",
-            f"Only {free / GIB:.1f} GiB of RAM are free. By default photos, blocks and layers take up "
-            "to 8 GB of it, or 40% of all.",
+            f"Only {bytes_in_words(free)} of RAM are free. By default photos, blocks and layers take up "
+            "to 8 GiB of it, or 40% of all.",
             "Close other programs, or lower --pipeline.ram-budget-gb",
         )
 

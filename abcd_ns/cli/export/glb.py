@@ -23,6 +23,7 @@ from abcd_ns.engine.gaussians.frames import quaternion
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
+from abcd_ns.units import bytes_in_words
 
 EXTENSION = "KHR_gaussian_splatting"
 Z_TO_Y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
@@ -102,7 +103,7 @@ def write_glb(
     total = head + starts[-1]
     if total >= _LARGEST:
         raise UserError(
-            f"{count:,} Gaussians are {total / 2**30:.1f} GiB and a .glb holds 4; use --by-block."
+            f"{count:,} Gaussians are {bytes_in_words(total)} and a .glb holds 4; use --by-block."
         )
     done, low, high = 0, np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
     with path.open("wb") as file:

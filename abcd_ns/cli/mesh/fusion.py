@@ -24,7 +24,7 @@ from abcd_ns.engine.types import View
 BOX = 16
 """Side of a box, voxels."""
 PART_BOXES = 4096
-"""About as many as a part has, those around it left out: 0.3 GB, and 0.3 GB more while vertices are found."""
+"""About as many as a part has, those around it left out: 0.3 GiB, and as much while vertices are found."""
 TRUNCATION = 8.0
 """How far from what a view sees it has a say, voxels; open3d's own. Views that disagree by more than twice
 that leave a hole."""

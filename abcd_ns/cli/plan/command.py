@@ -36,9 +36,10 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.checks import check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.fit import GB, Demand, Fit, device_budget, find_fit
+from abcd_ns.nerfstudio.fit import Demand, Fit, device_budget, find_fit
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with
+from abcd_ns.units import bytes_in_words
 
 Number = Annotated[int, tyro.conf.arg(metavar="N")]
 
@@ -49,7 +50,7 @@ class Wanted:
 
     blocks: Number = 0
     """number of blocks; 0 takes as few as the device's budget allows."""
-    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GB")] = 0.0
+    device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GiB")] = 0.0
     """memory of the device that training may take; 0 takes 0.9 of what is free on a GPU, or a quarter of
     the RAM on a CPU, as in training."""
     max_gaussians: Number = 0
@@ -204,12 +205,13 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views}",
     }
     for place, shares in found.shares.items():
-        rows[place] = f"{_gb(sum(shares.values()))} at most, {found.free[place] / GB:.1f} GB may be taken"
-        rows |= {f"  {what}": _gb(nbytes) for what, nbytes in shares.items() if verbose}
+        needed, free = sum(shares.values()), found.free[place]
+        rows[place] = f"{bytes_in_words(needed)} at most, {bytes_in_words(free)} may be taken"
+        rows |= {f"  {what}": bytes_in_words(nbytes) for what, nbytes in shares.items() if verbose}
     if found.workers > 1:
         rows["workers"] = f"{found.workers}, each with as much of a GPU, or of the RAM, as the device above"
-        rows["sent a visit"] = f"{_gb(sum(found.sent.values()))} at most"
-        rows |= {f"  {what}": _gb(nbytes) for what, nbytes in found.sent.items() if verbose}
+        rows["sent a visit"] = f"{bytes_in_words(sum(found.sent.values()))} at most"
+        rows |= {f"  {what}": bytes_in_words(nbytes) for what, nbytes in found.sent.items() if verbose}
     if verbose:
         for what, values in (("points", found.points_of_block), ("views", found.views_of_block)):
             rows[f"{what} by block"] = f"{min(values):,} to {max(values):,}, median {median(values):,.0f}"
@@ -220,10 +222,6 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
     if not (found.warnings or verbose):
         console.print("\nAll of it fits. What takes the room: abcd plan --verbose", highlight=False)
-
-
-def _gb(nbytes: int) -> str:
-    return f"{nbytes / GB:.2f} GB"
 
 
 def _hours(hours: float) -> str:

@@ -15,7 +15,8 @@ from abcd_ns.engine.train.health_record import FEW_VIEWS
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.fit import GB, Fit, RamShares
+from abcd_ns.nerfstudio.fit import Fit, RamShares
+from abcd_ns.units import bytes_in_words
 
 STATES = 3
 """Parameters and two moments are kept of each Gaussian."""
@@ -71,7 +72,7 @@ class Forecast:
         for place, (where, how, cure) in PLACES.items():
             needed, free = sum(self.shares[place].values()), self.free[place]
             if needed > free:
-                lines.append(f"{needed / GB:.1f} GB {where}, but {free / GB:.1f} GB {how}: {cure}.")
+                lines.append(f"{bytes_in_words(needed)} {where}, but {bytes_in_words(free)} {how}: {cure}.")
         if few := sum(count <= FEW_VIEWS for count in views):
             seen = f"{few} of {len(views)} blocks are seen by fewer than {FEW_VIEWS + 1} views"
             lines.append(f"{seen}: use fewer blocks.")

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
 from abcd_ns.cli.report.story import Story, Visit
 from abcd_ns.lab.results.style import COLORS, in_style, label_ends, lay_grid, short
-from abcd_ns.lab.results.tables import GIB
+from abcd_ns.units import GIB, bytes_in_words
 
 WIDTH, HEIGHT = 4.9, 2.7
 """Inches. Narrow, so that letters can still be read where a page is as wide as a phone."""
@@ -119,7 +119,7 @@ def draw_budgets(story: Story) -> Figure | None:
     colors = {name: BUDGETS[place % len(BUDGETS)] for place, name in enumerate(budgets)}
 
     def write(name: str, share: float) -> str:
-        return f"{name}\n{share:.0f}% of {budgets[name] / GIB:.1f} GiB"
+        return f"{name}\n{share:.0f}% of {bytes_in_words(budgets[name])}"
 
     return _draw_series(story, series, colors, "of its budget (%)", write, high=100)
 

@@ -7,7 +7,8 @@ from abcd_ns.cli.report.run_folder import RunFolder
 from abcd_ns.cli.report.story import Story
 from abcd_ns.cli.terminal import many
 from abcd_ns.engine.train.memory import FLOAT
-from abcd_ns.lab.results.tables import GIB, MIB, NOTHING
+from abcd_ns.lab.results.tables import NOTHING
+from abcd_ns.units import GIB, MIB
 from abcd_ns.viewer.texts import clock
 
 

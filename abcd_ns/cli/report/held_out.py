@@ -18,7 +18,7 @@ from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.progress_bar import ProgressBar
 
 PAGE_PIXELS = 6_000_000
-"""Of all pictures of a page together; larger ones are reduced. As JPEG that is some 3 MB."""
+"""Of all pictures of a page together; larger ones are reduced. As JPEG that is some 3 MiB."""
 LOSSLESS_PIXELS = 40_000
 """Pictures no larger than this are PNG: JPEG would spoil what little there is."""
 JPEG_QUALITY = 88

@@ -25,6 +25,7 @@ from abcd_ns.engine.store.manifest import (
 from abcd_ns.engine.store.manifest import StoreError as StoreError
 from abcd_ns.engine.store.shard import link_or_copy, read_shard, verify_shard, write_shard
 from abcd_ns.engine.store.special_blocks import BlockName, in_order
+from abcd_ns.units import bytes_in_words
 
 
 class ParameterStore:
@@ -312,8 +313,8 @@ class ParameterStore:
         free = shutil.disk_usage(self.folder).free
         if needed > free:
             raise StoreError(
-                f"{self.folder} has {free / 2**20:.1f} MiB free but the next generation needs "
-                f"{needed / 2**20:.1f} MiB. Free space and go on; generation {self.generation} is intact."
+                f"{self.folder} has {bytes_in_words(free)} free but the next generation needs "
+                f"{bytes_in_words(needed)}. Free space and go on; generation {self.generation} is intact."
             )
 
     def _publish(self, manifest: Manifest) -> None:

@@ -18,6 +18,7 @@ from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
+from abcd_ns.units import bytes_in_words
 
 FLOAT = 4
 """Bytes."""
@@ -208,7 +209,7 @@ def check_room(gaussians: int, sh_degree: int, device: torch.device) -> None:
     needed, free = bytes_for(gaussians, sh_degree), free_bytes(device)
     if needed > free:
         raise OutOfRoomError(
-            f"A block of {gaussians:,} Gaussians takes {needed / 2**30:.1f} GiB, but {device} has "
-            f"{free / 2**30:.1f} GiB left; set --pipeline.training.density.max-gaussians, or more "
+            f"A block of {gaussians:,} Gaussians takes {bytes_in_words(needed)}, but {device} has "
+            f"{bytes_in_words(free)} left; set --pipeline.training.density.max-gaussians, or more "
             "--pipeline.blocks."
         )

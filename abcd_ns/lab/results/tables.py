@@ -19,11 +19,11 @@ from abcd_ns.lab.results.frontier import label_of
 from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results, find_default
 from abcd_ns.lab.results.run import Run
 from abcd_ns.machine import Machine
+from abcd_ns.units import GIB, MIB
 
 TABLE_FILE = "table.md"
 NOTHING = "-"
 """Stands where there is no value."""
-MIB, GIB = 2**20, 2**30
 Rows = list[list[str]]
 """Of a table, its titles first."""
 

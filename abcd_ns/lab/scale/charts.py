@@ -17,7 +17,7 @@ from abcd_ns.lab.results.style import (
     tick_at,
     write_beside,
 )
-from abcd_ns.lab.results.tables import MIB
+from abcd_ns.units import MIB
 
 NAMES = {"abcd": "ABCD", "abcd-monolithic": "one block"}
 

@@ -14,11 +14,11 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Change, Plan, Variant
 from abcd_ns.lab.results.results import LeftOut
 from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.results.tables import MIB
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, Number, Numbers, check_ranges
 from abcd_ns.lab.scale.charts import draw_scale
 from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings
+from abcd_ns.units import MIB, bytes_in_words
 
 BYTES_PER_GAUSSIAN = 3 * 59 * 4
 """On disk: parameters and two moments in float32."""
@@ -26,7 +26,7 @@ OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")
 """How torch and CUDA say it, in the last line of a log."""
 MONOLITHIC_LIMIT = 4_000_000
 """Gaussians; larger scenes are not tried as one block unless asked for."""
-Megabytes = Annotated[int, tyro.conf.arg(metavar="MB")]
+Mebibytes = Annotated[int, tyro.conf.arg(metavar="MiB")]
 
 
 def scale(
@@ -34,9 +34,9 @@ def scale(
     blocks: Numbers = (2, 4, 8, 16, 32, 64),
     gaussians: Number = 20_000,
     visits: Number = 3,
-    ram_budget_mb: Megabytes = 16,
+    ram_budget_mb: Mebibytes = 16,
     monolithic_limit: Number = MONOLITHIC_LIMIT,
-    device_limit_mb: Megabytes = 0,
+    device_limit_mb: Mebibytes = 0,
     seed: int = 0,
     overwrite: Flag = False,
 ) -> int:
@@ -106,6 +106,6 @@ def _check_disk(out: Path, gaussians: int) -> None:
     needed, free = 2 * gaussians * BYTES_PER_GAUSSIAN, shutil.disk_usage(place).free
     if needed > free:
         raise UserError(
-            f"{place} has {free / 2**30:.1f} GiB free, but {gaussians:,} Gaussians may take "
-            f"{needed / 2**30:.1f} GiB; give fewer, or --out on another disk."
+            f"{place} has {bytes_in_words(free)} free, but {gaussians:,} Gaussians may take "
+            f"{bytes_in_words(needed)}; give fewer, or --out on another disk."
         )

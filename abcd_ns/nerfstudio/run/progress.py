@@ -27,6 +27,7 @@ from abcd_ns.engine.events import (
 from abcd_ns.engine.train.health_record import MENDED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.units import GIB, bytes_in_words
 from abcd_ns.viewer.run_history import seconds_left
 from abcd_ns.viewer.texts import clock
 
@@ -99,10 +100,10 @@ class ProgressReport:
             "sweep": self._sweep,
             "gaussians": coordinator.count(),
             "share of time for layers": self._share_for_layers(),
-            "RAM (GB)": psutil.Process().memory_info().rss / 2**30,
+            "RAM (GiB)": psutil.Process().memory_info().rss / GIB,
         }
         if torch.cuda.is_available():
-            found["GPU (GB)"] = torch.cuda.memory_allocated() / 2**30
+            found["GPU (GiB)"] = torch.cuda.memory_allocated() / GIB
         return found
 
     def close(self) -> None:
@@ -200,7 +201,7 @@ def _at_work(workers: Sequence[WorkerSeen], blocks: int) -> str:
 
 
 def _memory() -> str:
-    resident = f"{psutil.Process().memory_info().rss / 2**30:.1f} GB RAM"
+    resident = f"{bytes_in_words(psutil.Process().memory_info().rss)} RAM"
     if not torch.cuda.is_available():
         return resident
-    return f"{torch.cuda.max_memory_allocated() / 2**30:.1f} GB GPU, {resident}"
+    return f"{bytes_in_words(torch.cuda.max_memory_allocated())} GPU, {resident}"

@@ -51,7 +51,7 @@ class Light:
     the identity, which their mean over the views always is: otherwise the scene's colours would drift, and
     the transforms with them.
 
-    Grids take 0.3 MB a view, with moments, and stay in RAM, from where those of a step's views are copied.
+    Grids take 0.3 MiB a view, with moments, and stay in RAM, from where those of a step's views are copied.
 
     Args:
         kind: `exposure` leaves a gain for each channel, `affine` everything free, `bilateral` everything in

@@ -1,0 +1,28 @@
+"""Bytes are told in GiB and MiB, and in nothing else."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import abcd_ns
+from abcd_ns.units import GIB, MIB, bytes_in_words
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [
+        (0, "0 MiB"),
+        (3 * MIB // 2, "2 MiB"),
+        (GIB - MIB, "1023 MiB"),
+        (GIB, "1.0 GiB"),
+        (24.26 * GIB, "24.3 GiB"),
+    ],
+)
+def test_bytes_in_words(count, words):
+    assert bytes_in_words(count) == words
+
+
+def test_no_source_tells_of_powers_of_1000():
+    sources = Path(abcd_ns.__file__).parent.rglob("*.py")
+    assert [path.name for path in sources if re.search(r"\b[MG]B\b", path.read_text())] == []
