@@ -3,10 +3,13 @@
 import atexit
 import math
 import threading
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from abcd_ns.engine.layers.compositing import empty_layer, over
@@ -23,7 +26,9 @@ OPAQUE = 1e-4
 FAR = 1e4
 """Depth of pictures that have none; world units."""
 SECONDS_TO_END = 10.0
-"""That a picture which is being drawn has when the process ends."""
+"""That pictures which are being drawn have when the process ends."""
+SECONDS_OF_SILENCE = 1.0
+"""After which it is said what is waited for."""
 
 
 class Show(str, Enum):
@@ -57,8 +62,18 @@ def end_drawing() -> None:
     drawing = [thread for thread in threading.enumerate() if isinstance(thread, RenderStateMachine)]
     for thread in drawing:
         thread.running, thread.interrupt_render_flag = False, True
-    for thread in drawing:
-        thread.join(SECONDS_TO_END)
+    _join(drawing, SECONDS_OF_SILENCE)
+    if any(thread.is_alive() for thread in drawing):
+        left = SECONDS_TO_END - SECONDS_OF_SILENCE
+        CONSOLE.print(f"Waiting for the viewer's last picture, {left:.0f} s at most.", highlight=False)
+        _join(drawing, left)
+
+
+def _join(threads: Sequence[threading.Thread], seconds: float) -> None:
+    """Wait for all of them to end, so long at most."""
+    until = time.monotonic() + seconds
+    for thread in threads:
+        thread.join(max(until - time.monotonic(), 0.0))
 
 
 def chosen_outputs() -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -22,6 +23,7 @@ from abcd_ns.viewer.pictures import (
     Show,
     asked_by_viewer,
     bounded,
+    end_drawing,
 )
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -174,3 +176,24 @@ def test_a_process_that_still_draws_for_browsers_ends_in_order():
         [sys.executable, "-c", DRAWS_TO_THE_END], capture_output=True, text=True, check=False
     )
     assert (run.returncode, run.stdout) == (0, ""), run.stderr
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"), [(0.0, ""), (0.3, "Waiting for the viewer's last picture, 9 s at most.\n")]
+)
+def test_who_waits_for_a_picture_is_told(monkeypatch, capsys, seconds, said):
+    monkeypatch.setattr("abcd_ns.viewer.pictures.SECONDS_OF_SILENCE", 0.1)
+    monkeypatch.setattr("abcd_ns.viewer.pictures.SECONDS_TO_END", 9.1)
+
+    class Draws(RenderStateMachine):
+        def __init__(self) -> None:
+            threading.Thread.__init__(self)
+
+        def run(self) -> None:
+            time.sleep(seconds)
+
+    thread = Draws()
+    thread.start()
+    end_drawing()
+    assert not thread.is_alive()
+    assert capsys.readouterr().out == said
