@@ -114,8 +114,8 @@ def make_plan(options: Options) -> Plan:
     for method in given.methods:
         if method not in METHODS:
             raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
-    if not given.methods:
-        raise UserError("Give at least one of --methods.")
+    if not given.methods or len(set(given.methods)) < len(given.methods):
+        raise UserError("Give at least one of --methods, and each once.")
     if "abcd-paper" in given.methods and given.steps is None:
         raise UserError(
             "abcd-paper gives each cell a fixed number of steps: use --steps instead of --seconds."

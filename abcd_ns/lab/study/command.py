@@ -121,12 +121,14 @@ class GaussiansStudy(Conditions):
         """
         if self.max_gaussians:
             check_numbers("--max-gaussians", self.max_gaussians, 1, several=True)
-        prices, limits = sorted(set(self.prices)), sorted(self.max_gaussians)
-        for price in prices:
+        for price in self.prices:
             if not 0 <= price < math.inf:
                 raise UserError(f"--prices {price:g}: a price is 0 or more, in pixels.")
-        varied = ["--prices", *(f"{price:g}" for price in prices), "--max-gaussians", *limits]
-        variants = [AS_IT_IS, *(_one(PRICE, f"{price:g}") for price in prices)]
+        prices, limits = [f"{price:g}" for price in sorted(self.prices)], sorted(self.max_gaussians)
+        if len(set(prices)) < len(prices):
+            raise UserError(f"--prices {' '.join(prices)}: give different prices.")
+        varied = ["--prices", *prices, "--max-gaussians", *limits]
+        variants = [AS_IT_IS, *(_one(PRICE, price) for price in prices)]
         variants += [_one(LIMIT, limit) for limit in limits]
         variants += [Variant((Change(STRATEGY, "mcmc"), Change(LIMIT, str(limit)))) for limit in limits]
         return self._planned("gaussians", self.method, variants, varied, blocks=self.blocks)

@@ -71,6 +71,7 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"max_gaussians": -1}, "--max-gaussians is -1"),
         ({"methods": ("nerfacto",)}, "no method 'nerfacto'"),
         ({"methods": ()}, "at least one"),
+        ({"methods": ("abcd", "abcd")}, "each once"),
         ({"methods": ("abcd-paper",), "steps": None, "seconds": 9.0}, "abcd-paper .* use --steps"),
         ({"seeds": (1, 1)}, "different numbers"),
         ({"seeds": (-1,)}, "different numbers"),

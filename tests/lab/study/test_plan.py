@@ -122,6 +122,9 @@ def test_a_study_of_gaussians_has_the_method_as_it_is_prices_limits_and_mcmc(sce
     for price in (-1.0, math.nan, math.inf):
         with pytest.raises(UserError, match=f"--prices {price:g}: a price is 0 or more"):
             GaussiansStudy(**given(scene), prices=(1.0, price)).plan()
+    for prices, said in (((4.0, 1.0, 4.0), "1 4 4"), ((1.0, 1.0000001), "1 1")):  # told to six digits
+        with pytest.raises(UserError, match=f"--prices {said}: give different prices"):
+            GaussiansStudy(**given(scene), prices=prices).plan()
 
 
 def test_an_ablation_begins_with_the_method_as_it_is(scene):
