@@ -9,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.events import Mended
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import attach, nothing_live
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import weights
-from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.density.shedding import PASSES, faded, fills, may_grow, price_at, weigh
+from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.train.density.shedding import PASSES, faded, fills, haze, may_grow, risen, weigh
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import (
@@ -80,6 +82,25 @@ def test_the_warm_ups_views_and_a_blocks_own_say_the_same(whole, block, before, 
     assert not bool(fills(growth) <= 19.9)
 
 
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 100), st.floats(0, 1), st.booleans()),  # px, opacity, weighed in all views
+        min_size=1,
+        max_size=20,
+    ),
+    st.floats(0, 0.1),
+)
+def test_haze_is_faint_and_fills_more_than_the_mean_of_those_known(several, faint):
+    weight, opacities, known = (list(values) for values in zip(*several, strict=True))
+    growth = statistics(weight, [1.0 if each else 0.5 for each in known])
+    told = [px for px, each in zip(weight, known, strict=True) if each]
+    mean = sum(told) / max(len(told), 1)
+    found = haze(growth, torch.tensor(opacities), faint).tolist()
+    for px, opacity, each, goes in zip(weight, opacities, known, found, strict=True):
+        if abs(px - mean) > 1e-3 and abs(opacity - faint) > 1e-6:
+            assert goes == (each and px > mean and opacity < faint)
+
+
 def test_what_was_seen_long_ago_counts_for_less():
     found = faded(statistics([8.0, 8.0], [2.0, 0.6]))
     assert found["weight"].tolist() == [4.0, 8.0]
@@ -92,7 +113,7 @@ def test_what_was_seen_long_ago_counts_for_less():
     [(0.0, 0.5, 0.0), (0.25, 0.5, 1.5), (0.5, 0.5, 3.0), (0.69, 0.5, 3.0), (0.7, 0.5, 0.0), (0.0, 0.0, 3.0)],
 )
 def test_the_price_rises_with_growth_and_is_off_when_nothing_could_be_made_good(progress, ends, expected):
-    assert price_at(3.0, progress, ends) == pytest.approx(expected)
+    assert risen(3.0, progress, ends) == pytest.approx(expected)
 
 
 def test_drawings_without_weights_say_nothing():
@@ -126,6 +147,19 @@ def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_sheds(tmp_pat
     left = whole_scene(coordinator)
     assert len(left) == 40
     assert float(torch.sigmoid(left.opacities).min()) >= 1 / 255
+
+
+@pytest.mark.parametrize(
+    ("progress", "left"), [(0.6, [2, 3, 4, 5]), (0.25, [1, 2, 3, 4, 5]), (0.8, [0, 1, 2, 3, 4, 5])]
+)
+def test_a_cloud_before_cameras_is_shed_and_what_is_as_faint_but_small_stays(progress, left):
+    opacity, fills = [0.02, 0.07, 0.02, 0.07, 0.5, 0.9], [90.0, 90.0, 9.0, 9.0, 90.0, 9.0]
+    gaussians = replace(random_gaussians(6), opacities=torch.tensor(opacity).logit()[:, None])
+    params, optimizers = nothing_live(gaussians.sh_degree)
+    attach(BlockState.fresh(gaussians), params, optimizers)
+    growth = {**statistics(fills, [1.0] * 6), "count": torch.ones(6)}
+    DensityControl(DensityConfig(price=1.0)).shed(params, optimizers, growth, progress)
+    assert params["means"].tolist() == gaussians.means[left].tolist()
 
 
 def test_without_a_price_everything_stays(tmp_path, views, photos):

@@ -22,7 +22,17 @@ from abcd_ns.engine.render.primitive import Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
-from abcd_ns.engine.train.density.shedding import LAST, WEIGHED, faded, fills, may_grow, price_at, weigh
+from abcd_ns.engine.train.density.shedding import (
+    FAINT,
+    LAST,
+    WEIGHED,
+    faded,
+    fills,
+    haze,
+    may_grow,
+    risen,
+    weigh,
+)
 
 # Step numbers as gsplat sees them. It refines on multiples of REFINE; it resets opacities on multiples of
 # NEVER and prunes by size in scene units, which takes backgrounds, after it.
@@ -236,16 +246,17 @@ class DensityControl:
         growth: dict[str, Tensor],
         progress: float,
     ) -> dict[str, Tensor]:
-        """Take out what fills too little of the block's views, at a share of the run, and what is too faint
-        for any picture to show, which nothing would train again.
+        """Take out what fills too little of the block's views, at a share of the run; haze; and what is too
+        faint for any picture to show, which nothing would train again.
 
         Returns:
             The block's statistics from now on.
         """
         if not self.weighs or any(name not in growth for name in WEIGHED):
             return growth
-        price = price_at(self.config.price, progress, self.config.refine_stop)
-        drop = (fills(growth) <= price) | (torch.sigmoid(params["opacities"][:, 0]) < MIN_ALPHA)
+        price, faint = (risen(each, progress, self.config.refine_stop) for each in (self.config.price, FAINT))
+        opacities = torch.sigmoid(params["opacities"][:, 0])
+        drop = (fills(growth) <= price) | (opacities < MIN_ALPHA) | haze(growth, opacities, faint)
         growth = faded(growth)
         if bool(drop.any()):
             gsplat_ops.remove(params, optimizers, growth, drop)

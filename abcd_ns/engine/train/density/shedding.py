@@ -30,6 +30,8 @@ LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 GROWS = 4.0
 """Times its price that a Gaussian fills before it is cloned or split: more than both halves must."""
+FAINT = 0.1
+"""Opacity under which who fills more than most is haze."""
 PASSES = 4
 """A block that is the whole scene sheds whenever each of its views was drawn so often."""
 
@@ -99,9 +101,24 @@ def faded(growth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n"]]:
     return {name: value * half if name in WEIGHED else value for name, value in growth.items()}
 
 
-def price_at(price: float, progress: float, growth_ends: float) -> float:
-    """The price at a share of the run: it rises until growth ends, for who is new has not found its place.
-    Late in the run only what fills nothing at all goes, for what is missed could not be made good."""
+def haze(
+    growth: Mapping[str, Tensor], opacities: Float[Tensor, "n"], faint: float = FAINT
+) -> Bool[Tensor, "n"]:
+    """Which Gaussians are faint and fill more of their block's views than the mean: clouds before cameras, by
+    which the light of single photos is imitated, and which other views look through.
+
+    Args:
+        growth: with WEIGHED.
+        opacities: after the sigmoid.
+    """
+    full = fills(growth)
+    return (opacities < faint) & (full > full.nanmean())
+
+
+def risen(bound: float, progress: float, growth_ends: float) -> float:
+    """What a bound, as the price, is at a share of the run: it rises until growth ends, for who is new has
+    not found its place. Late in the run it is 0, and only what fills nothing at all goes, for what is missed
+    could not be made good."""
     if progress >= LAST:
         return 0.0
-    return price * min(progress / growth_ends, 1.0) if growth_ends > 0 else price
+    return bound * min(progress / growth_ends, 1.0) if growth_ends > 0 else bound
