@@ -4,7 +4,7 @@ import random
 
 import torch
 
-from abcd_ns.engine.gaussians.param_swap import COLORS, LEARNING_RATES, memory_of_young, rates_of_young
+from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES, rates_of_young
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
@@ -31,8 +31,7 @@ def train_plain(
         share = settling(taken / steps, taken) * rates_of_young(taken, 1)
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, config.means_lr_decay) if name == "means" else 1.0
-            second = 0.999 if name in COLORS else min(0.999, memory_of_young(taken, 1))
-            adam[name].param_groups[0].update(lr=rate * decay * share, betas=(0.9, second))
+            adam[name].param_groups[0]["lr"] = rate * decay * share
         raster = draw(
             Gaussians(**{name: params[name] for name in PARAM_NAMES}),
             view,

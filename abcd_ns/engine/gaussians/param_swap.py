@@ -28,11 +28,6 @@ RATED_FOR = 10_000
 """Steps after which a block is trained with these rates, which are made for 30,000."""
 YOUNG_RATES = 4.0
 """Times as large they are before, at most; a step of four views is as large as that by itself."""
-REMEMBERED, LEAST_MEMORY = 1 / 20, 100
-"""Second moments of a block without others are means over this share of the views that it was trained on,
-over so many steps at least and over Adam's thousand views at most ..."""
-COLORS = ("features_dc", "features_rest")
-"""... but for those of colours, which always are means over a thousand."""
 
 STEP_PARTS = 128
 """Adam's step count is a multiple of 1 over this, which float32 counts exactly to beyond 100,000."""
@@ -124,14 +119,9 @@ class Pace:
         self._optimizers, self._power, self._fast_start = optimizers, power, fast_start
         self._given = {name: (group["lr"], group["betas"]) for name, group in groups.items()}
 
-    def set(
-        self, batch: int, trained: int, means_decay: float, damping: float = 1.0, *, alone: bool = False
-    ) -> None:
+    def set(self, batch: int, trained: int, means_decay: float, damping: float = 1.0) -> None:
         """For a step of `batch` views on a block that was trained on so many, with the means' rate at a share
         of what was given, and all of them damped.
-
-        With a fast start, a block that is `alone` forgets second moments sooner while it is young, see
-        `memory_of_young`. One among others has few steps in a visit, and gains nothing by it.
 
         Moments forget as many views' worth a step. With rates that grow with the square root, Adam then
         follows the path of single views as far as gradients are noise (Malladi et al. 2022, "On the SDEs and
@@ -139,13 +129,11 @@ class Pace:
         far as they agree, with rates in proportion.
         """
         share = damping * (rates_of_young(trained, batch) if self._fast_start else 1.0)
-        soon = memory_of_young(trained, batch) if self._fast_start and alone else 1.0
-        for name, (rate, (first, second)) in self._given.items():
+        for name, (rate, betas) in self._given.items():
             group = self._optimizers[name].param_groups[0]
             decay = means_decay if name == "means" else 1.0
             group["lr"] = rate * decay * batch**self._power * share
-            second = second**batch
-            group["betas"] = first**batch, second if name in COLORS else min(second, soon)
+            group["betas"] = tuple(beta**batch for beta in betas)
 
 
 def rates_of_young(views: int, batch: int) -> float:
@@ -157,15 +145,6 @@ def rates_of_young(views: int, batch: int) -> float:
     """
     steps = max(views, 1) / batch
     return max(min(math.sqrt(RATED_FOR / steps), YOUNG_RATES) / batch, 1.0)
-
-
-def memory_of_young(views: int, batch: int) -> float:
-    """The decay of second moments in a step, for a block that was trained on so many views yet.
-
-    What gradients were while pictures were blurs says little of what they are: a mean over all of a short
-    training holds steps back to its end.
-    """
-    return 1 - 1 / max(REMEMBERED * views / batch, LEAST_MEMORY)
 
 
 def _release(parameter: Parameter, optimizer: torch.optim.Optimizer) -> None:

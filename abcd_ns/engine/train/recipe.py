@@ -45,9 +45,8 @@ class Recipe:
     split_wide: bool = True
     """Gaussians over a twentieth of a picture wide are split when their block grows, see `WIDE_ANGLE`."""
     fast_start: bool = True
-    """Learning rates are larger while a block was trained on few views, and one without others forgets second
-    moments sooner, see `param_swap.rates_of_young` and `memory_of_young`; and rates fall at the end of the
-    run, see `schedule.settling`."""
+    """Learning rates are larger while a block was trained on few views, see `param_swap.rates_of_young`, and
+    fall at the end of the run, see `schedule.settling`."""
 
 
 @dataclass(frozen=True)

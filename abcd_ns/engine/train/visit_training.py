@@ -113,7 +113,7 @@ class VisitTraining:
         settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views
         damping = run.health.damping * (settling(run.progress, trained) if settles else 1.0)
-        self._pace.set(self.batch, trained, decay, damping, alone=run.active.sole)
+        self._pace.set(self.batch, trained, decay, damping)
         step, first = run.state.step, run.active.done * self.batch
         views = self._views_of(range(first, first + self.batch + COMING))
         run.announce(PhotosWanted(views))

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import (
-    COLORS,
     YOUNG_RATES,
     Pace,
     adam_step,
@@ -69,27 +68,6 @@ def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times):
     Pace(adam, 1.0, fast_start=True).set(batch, views, means_decay=0.5)
     expected = {name: times * rate * (0.5 if name == "means" else 1.0) for name, rate in given.items()}
     assert {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES} == pytest.approx(expected)
-
-
-@given(views=st.integers(0, 10**6), batch=st.integers(1, 8))
-def test_second_moments_of_a_young_block_alone_forget_sooner_but_for_colours(views, batch):
-    _, adam = nothing_live(sh_degree=1)
-    Pace(adam, 1.0, fast_start=True).set(batch, views, means_decay=1.0, alone=True)
-    usual = 0.999**batch
-    for name in PARAM_NAMES:
-        first, second = adam[name].param_groups[0]["betas"]
-        assert first == 0.9**batch
-        if name in COLORS or views >= 20_000:
-            assert second == usual
-        else:
-            assert second == min(usual, max(0.99, 1 - 20 * batch / max(views, 1)))
-
-
-@pytest.mark.parametrize(("fast_start", "alone"), [(False, True), (True, False)])
-def test_others_remember_as_adam_does(fast_start, alone):
-    _, adam = nothing_live(sh_degree=0)
-    Pace(adam, 1.0, fast_start=fast_start).set(2, 100, means_decay=1.0, alone=alone)
-    assert {adam[name].param_groups[0]["betas"] for name in PARAM_NAMES} == {(0.9**2, 0.999**2)}
 
 
 def corrected_moments(adam, parameter) -> tuple[float, float]:
