@@ -30,8 +30,9 @@ LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 GROWS = 4.0
 """Times its price that a Gaussian fills before it is cloned or split: more than both halves must."""
-FAINT = 0.1
-"""Opacity under which who fills more than most is haze."""
+FAINT, FAINTER = 0.1, 0.25
+"""Who fills more than most is haze with an opacity under the first, and under this share of the median: after
+a reset of opacities all are faint."""
 PASSES = 4
 """A block that is the whole scene sheds whenever each of its views was drawn so often."""
 
@@ -112,7 +113,7 @@ def haze(
         opacities: after the sigmoid.
     """
     full = fills(growth)
-    return (opacities < faint) & (full > full.nanmean())
+    return (opacities < (FAINTER * opacities.median()).clamp(max=faint)) & (full > full.nanmean())
 
 
 def risen(bound: float, progress: float, growth_ends: float) -> float:
