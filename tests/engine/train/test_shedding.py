@@ -165,6 +165,7 @@ def test_a_cloud_before_cameras_is_shed_and_what_is_as_faint_but_small_stays(pro
 def test_after_a_reset_of_opacities_nobody_is_haze():
     growth = statistics([90.0, 50.0, 9.0, 1.0], [1.0] * 4)
     assert not bool(haze(growth, torch.full((4,), 0.01)).any())
+    assert haze(statistics([], []), torch.zeros(0)).tolist() == []
     assert haze(growth, torch.tensor([0.05, 0.5, 0.5, 0.5])).tolist() == [True, False, False, False]
 
 

@@ -111,6 +111,7 @@ def haze(
     Args:
         growth: with WEIGHED.
         opacities: after the sigmoid.
+        faint: the opacity below which one is, and below FAINTER of their median.
     """
     full = fills(growth)
     return (opacities < (FAINTER * opacities.median()).clamp(max=faint)) & (full > full.nanmean())
