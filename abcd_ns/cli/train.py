@@ -48,7 +48,7 @@ def command_line(path: Path) -> list[str]:
     Raises:
         UserError: the file is absent, is no TOML, names no method, or holds what no option can be.
     """
-    data = read_toml(path, f"{path} does not exist.")
+    data = read_toml(path, f"{path} does not exist.", trains=True)
     method = data.pop(METHOD, None)
     if not isinstance(method, str):
         raise UserError(f'{path} names no method; begin it with: method = "abcd"')

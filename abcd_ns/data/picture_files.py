@@ -13,6 +13,9 @@ from abcd_ns.data.input_errors import InputError
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"})
 """What counts as a photo when a folder is listed."""
 
+UNREAD = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"})
+"""Pictures that cameras and phones write, and nothing here reads."""
+
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 """What is read, by content and not by name. Pillow knows more, some of which it gives to other programs."""
 _MODES = frozenset({"RGB", "RGBA", "L", "LA", "P", "1"})

@@ -49,7 +49,7 @@ class SceneOptions(DataParserConfig):
     scale_factor: float = 1.0
     """Multiplies the scene's size, after auto_scale_poses."""
     scene_scale: float = 1.0
-    """Half the side of the scene box, in scaled units."""
+    """Half the side of the scene box, in scaled units: for methods that have one, which ABCD does not."""
     orientation_method: Orientation = "up"
     """How the scene is turned; "up" makes the mean of the cameras' up vectors +z."""
     center_method: Center = "poses"
@@ -245,7 +245,7 @@ def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np
     if not good.any():
         notes.append(
             f"{scene.model} has no points: Gaussians start at random places, which costs quality; make some "
-            "with `colmap point_triangulator`."
+            "with `point_triangulator` of the program colmap, or the whole model by `abcd poses`."
         )
         return {}, np.empty((0, 3)), notes
     rgb = np.ascontiguousarray(scene.points_rgb[good])

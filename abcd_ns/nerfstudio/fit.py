@@ -138,18 +138,21 @@ class Demand:
         return DeviceNeeds(self.pixels, batch, *options)
 
 
-def find_fit(budget: int, demand: Demand) -> Fit:
+def find_fit(budget: int, demand: Demand, *, downscale: str = DOWNSCALE, memory: str = BUDGET_FLAG) -> Fit:
     """The fewest blocks whose visits stay within `budget` bytes, on as many views of a step as leave room.
 
     What does not fit is tried with fewer views in a step, unless their number is set, then with parts of a
     view. A scene that fits in one block needs no room for layers.
+
+    Args:
+        downscale, memory: the options by which photos are reduced and more memory is given.
 
     Raises:
         UserError: the budget has no room for any block worth a visit; says what would help.
     """
     fit = _fit(budget, demand)
     if fit is None:
-        raise UserError(_refusal(budget, demand))
+        raise UserError(_refusal(budget, demand, downscale, memory))
     return fit
 
 
@@ -192,7 +195,7 @@ def _fewest(gaussians: int, limit: int, sole: int) -> int:
     return 1 if gaussians <= FULL * sole else max(2, fewest_blocks(gaussians, limit, FULL))
 
 
-def _refusal(budget: int, demand: Demand) -> str:
+def _refusal(budget: int, demand: Demand, downscale: str, memory: str) -> str:
     """Why nothing fits, and which options would help."""
     least = _least_budget(budget, demand)
     ways = []
@@ -203,8 +206,8 @@ def _refusal(budget: int, demand: Demand) -> str:
     while times * demand.factor <= MOST_DOWNSCALE and _fit(budget, demand.reduced(times)) is None:
         times *= 2
     if times * demand.factor <= MOST_DOWNSCALE:
-        ways.append(f"smaller photos by {DOWNSCALE} {times * demand.factor}")
-    ways.append(f"more memory by {BUDGET_FLAG} {least:.2f}, if the device has it")
+        ways.append(f"smaller photos by {downscale} {times * demand.factor}")
+    ways.append(f"more memory by {memory} {least:.2f}, if the device has it")
     return (
         f"Training on photos of {demand.pixels / 1e6:.2g} megapixels takes {least:.2f} GiB of the device, "
         f"and {budget / GIB:.2f} GiB may be taken: give {', or '.join(ways)}."

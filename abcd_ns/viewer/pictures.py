@@ -15,14 +15,13 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from abcd_ns.engine.layers.compositing import empty_layer, over
 from abcd_ns.engine.layers.painter import FrozenLayers, Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Raster, Shot, ZWindow
+from abcd_ns.engine.render.cpu.torch_kernels import MIN_TRANSMITTANCE
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.influence import coarser
 from abcd_ns.engine.types import Gaussians, Layer, View
 
 MOST_PIXELS = 2048 * 2048
 """Of a picture for the viewer, whatever size a client asks for; nerfstudio's slider ends there."""
-OPAQUE = 1e-4
-"""Transmittance below which nothing behind can be seen; where rasterizers stop."""
 FAR = 1e4
 """Depth of pictures that have none; world units."""
 SECONDS_TO_END = 10.0
@@ -125,7 +124,7 @@ class BlockPictures:
         painter, view = self.painter, self.view
         whole, seen_by = self._nothing(), painter.frusta([(view, view.full)])
         for unit in painter.order(painter.units(), view):
-            if float(whole.transmittance.max()) < OPAQUE:
+            if float(whole.transmittance.max()) < MIN_TRANSMITTANCE:
                 break
             loaded, window = painter.load(unit, seen_by=seen_by), None
             if painter.ownership == "fragments" and unit != 0:

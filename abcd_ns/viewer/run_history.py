@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
-from abcd_ns.engine.train.health_record import FEW_VIEWS, BlockHealth
+from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS, BlockHealth
 from abcd_ns.engine.train.planner import LOOK_AGAIN
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 
@@ -139,7 +139,7 @@ class RunHistory:
         """Of one block, on which so many views are worth training, if that is known."""
         if any(visit.block == block for visit in self.under_way.values()):
             return Status.ACTIVE
-        if views is not None and views <= FEW_VIEWS:
+        if views is not None and views <= TOO_FEW_VIEWS:
             return Status.UNDER_OBSERVED
         return Status.DONE if self.visits.get(block) else Status.UNTRAINED
 

@@ -115,9 +115,9 @@ def read_own(run, tmp_path) -> np.ndarray:
 
 def test_the_blocks_files_together_are_the_scene(run, tmp_path):
     whole = by_position(read_own(run, tmp_path))
-    export(run, out=tmp_path / "parts", by_block=True, frame="nerfstudio")
+    export(run / "config.yml", out=tmp_path / "parts", by_block=True, frame="nerfstudio")
     parts = sorted((tmp_path / "parts").iterdir())
-    assert [path.name for path in parts] == [f"block-{n:04d}.ply" for n in range(BLOCKS)]
+    assert [path.name for path in parts] == [f"block-{n:04d}.ply" for n in range(1, BLOCKS + 1)]
     assert np.array_equal(by_position(np.concatenate([read(path) for path in parts])), whole)
 
 
@@ -175,7 +175,7 @@ def test_wrong_requests_are_refused_and_leave_nothing(run, tmp_path):
             export(run, out=tmp_path / "new.ply", **options)
     with pytest.raises(UserError, match="exists already"):
         export(run, out=run)
-    with pytest.raises(UserError, match="no run of ABCD"):
+    with pytest.raises(UserError, match=f"no run with abcd/store: did you mean {run}"):
         export(tmp_path, out=tmp_path / "new.ply", frame="nerfstudio")
     (run / TRANSFORMS).write_text("{}")
     with pytest.raises(UserError, match="cannot be read"):

@@ -216,7 +216,7 @@ def test_the_suffix_chooses_and_what_it_takes_is_said(run, tmp_path, capsys):  #
     assert "299 Gaussians" in said
     assert export(run, out=tmp_path / "parts.glb", by_block=True) == 0
     files = sorted((tmp_path / "parts.glb").iterdir())
-    assert [file.name for file in files] == [f"block-{n:04d}.glb" for n in range(5)]
+    assert [file.name for file in files] == [f"block-{n:04d}.glb" for n in range(1, 6)]
     assert sum(len(read_glb(file)[1]["POSITION"]) for file in files) == 299
 
 

@@ -215,7 +215,7 @@ def test_wrong_requests_are_one_line_and_leave_nothing(run, tmp_path, capsys, mo
             mesh(run, **{"data": photos, "out": out, **options})
     words = ["mesh", str(tmp_path), "--data", str(photos), "--out", str(out)]
     assert cli.main(words) == 2
-    assert "is no run with a log" in capsys.readouterr().err
+    assert "is no run with abcd/settings.json" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(UserError, match="open3d, which fuses the depths, is not there"):
         mesh(run, data=photos, out=out)

@@ -83,6 +83,15 @@ def test_a_device_budget_decides_how_many_blocks():
     assert sum(many.shares["device"].values()) <= 3 * GIB
 
 
+def test_what_does_not_fit_is_helped_by_options_of_this_command():
+    small = capture()
+    large = [dataclasses.replace(view, width=2600, height=1000) for view in small.views]
+    words = r"smaller photos by --downscale \d+, or more memory by --device-budget-gb"
+    with pytest.raises(UserError, match=words) as refused:
+        forecast(dataclasses.replace(small, views=large), Wanted(device_budget_gb=0.05), Console(quiet=True))
+    assert "--pipeline" not in str(refused.value)
+
+
 def test_large_photos_are_planned_for_as_they_are_trained_on():
     small = capture()
     large = [dataclasses.replace(view, width=2600, height=100) for view in small.views[:3]]

@@ -119,6 +119,31 @@ def test_what_is_wrong_is_said_before_anything_begins(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
+def test_photos_of_two_sizes_have_two_lenses(tmp_path, monkeypatch, capsys):
+    write_blank(tmp_path, 3)
+    tasks: list[mapping.Task] = []
+    monkeypatch.setattr(command, "find_poses", lambda task, _: tasks.append(task))
+    for size in ((64, 48), (48, 64)):
+        Image.new("RGB", size).save(tmp_path / "images" / "9.png")
+        with pytest.raises(UserError, match="No two photos"):
+            poses(tmp_path)
+    assert [task.one_lens for task in tasks] == [True, False]
+    assert "Photos of 2 sizes" in capsys.readouterr().out
+
+
+def test_what_phones_write_and_nothing_reads_is_told(tmp_path, monkeypatch, capsys):
+    write_blank(tmp_path, 2)
+    for name in ("a.HEIC", "b.HEIC", "c.CR2", "notes.txt"):
+        (tmp_path / "images" / name).touch()
+    with pytest.raises(UserError, match=r"has 2 photos.* Not read: 1 \.CR2, 2 \.HEIC; .*jpg \*\.HEIC"):
+        poses(tmp_path)
+    Image.new("RGB", (64, 48)).save(tmp_path / "images" / "2.png")
+    monkeypatch.setattr(command, "find_poses", lambda *_: None)
+    with pytest.raises(UserError, match="No two photos"):
+        poses(tmp_path)
+    assert "Not read: 1 .CR2, 2 .HEIC" in capsys.readouterr().out
+
+
 def test_a_process_that_dies_is_an_error_and_not_a_wait(tmp_path):
     task = mapping.Task(tmp_path / "nowhere", ("a.png",), tmp_path, "OPENCV", True, "any")
     with pytest.raises(UserError):

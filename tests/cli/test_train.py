@@ -12,7 +12,7 @@ from abcd_ns.cli import train
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import own_configs
 
-CONFIGS = [path for path in own_configs() if "\nmethod = " in path.read_text()]
+CONFIGS = own_configs(trains=True)
 
 
 @pytest.fixture
@@ -21,6 +21,13 @@ def told(monkeypatch):
     found = []
     monkeypatch.setattr(os, "execv", lambda _, words: found.append(words[1:]))
     return found
+
+
+def test_a_name_that_is_none_gets_those_that_train(capsys):
+    for name in ("nothing", "compare-castle"):
+        assert cli.main(["train", name]) == 2
+        said = capsys.readouterr().err
+        assert said.endswith("Those that come with abcd: cpu, garden, small-gpu.\n")
 
 
 def test_tables_become_dotted_names_and_later_words_count(tmp_path, told):
@@ -57,7 +64,7 @@ def test_those_that_come_with_abcd_go_by_name_from_anywhere(tmp_path, monkeypatc
     assert named[0] == named[1] == named[2]
     (tmp_path / "cpu.toml").write_text('method = "abcd-exact"\n')
     assert train.command_line(Path("cpu.toml")) == ["abcd-exact"]  # one's own goes first
-    with pytest.raises(UserError, match=r"absent.*: compare-castle, .*cpu, garden"):
+    with pytest.raises(UserError, match=r"absent.*: cpu, garden, small-gpu"):
         train.command_line(Path("absent.toml"))
 
 

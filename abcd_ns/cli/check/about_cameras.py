@@ -44,7 +44,8 @@ def far_cameras(survey: Survey) -> Iterator[Finding]:
             f"{away[rows].max() / usual:.0f} times as far from the middle: "
             f"{few([survey.names[row] for row in rows])}. The scene is scaled until all cameras fit, so the "
             "rest of it becomes tiny.",
-            "If they are registered wrongly, remove them from the model (`colmap image_deleter`).",
+            "If they are registered wrongly, remove them from the model (`image_deleter` of the program "
+            "colmap).",
         )
 
 
@@ -58,7 +59,8 @@ def unlike_fields(survey: Survey) -> Iterator[Finding]:
             "unlike-focal-lengths",
             f"By the model, {wide} is {ratio:.1f} times as wide as {narrow}. If both are of one lens, the "
             "model is wrong.",
-            "Make the model again with one camera for all photos (`--ImageReader.single_camera 1`).",
+            "Make the model again with one camera for all photos (`abcd poses` without --several-lenses; of "
+            "the program colmap `--ImageReader.single_camera 1`).",
         )
 
 

@@ -108,7 +108,8 @@ def exposure(survey: Survey) -> Iterator[Finding]:
             "exposure",
             f"Photos differ in brightness by a factor of {high / low:.1f}. If that is the camera's exposure "
             "and not what they show, Gaussians before single cameras will imitate it as fog.",
-            "Photograph with fixed exposure and white balance, or even the photos out first.",
+            "Photograph with fixed exposure and white balance, even the photos out, or train with "
+            "--pipeline.training.light affine.",
         )
 
 

@@ -42,7 +42,7 @@ def far_points(survey: Survey) -> Iterator[Finding]:
             f"{many(int(far.sum()), 'point lies', 'points lie')} far from the others, up to "
             f"{away.max() / usual:,.0f} times as far from the middle as nine tenths of them. Each becomes a "
             "huge Gaussian.",
-            "If they are no distant background, remove them (`colmap point_filtering`).",
+            "If they are no distant background, remove them (`point_filtering` of the program colmap).",
         )
 
 

@@ -129,10 +129,10 @@ def _kernels(kernels: Kernels, on_gpu: bool, verbose: bool) -> dict[str, str]:
     checks += [f"{name} FAILED" for name in kernels.failed]
     built = f"{kernels.built} of {kernels.wanted} built"
     if kernels.built < kernels.wanted and not on_gpu:
-        built += "; the first training builds the others, in two or three minutes"
+        built += "; the first training or `abcd plan` builds the others, in two or three minutes"
     rows = {"CPU kernels": f"{built}, in {kernels.folder}" if verbose else built}
     if on_gpu:
-        rows["gsplat's"] = kernels.gsplat or "not built: the first training compiles them"
+        rows["gsplat's"] = kernels.gsplat or "not built: the first training or `abcd plan` compiles them"
     rows["self-check"] = ", ".join(checks)
     if verbose:
         rows["compilers"] = ", ".join(compilers)

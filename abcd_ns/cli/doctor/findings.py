@@ -87,8 +87,8 @@ def viewer(facts: Facts) -> Iterator[Finding]:
             "viewer-hole",
             f"viser {version} sends every file that you can read to whoever reaches the viewer's port, and "
             "nerfstudio listens on all networks unless told. `ns-train abcd` listens on this machine alone.",
-            "For other methods, and with ns-viewer: --viewer.websocket-host 127.0.0.1; from another machine "
-            "use ssh -L 7007:127.0.0.1:7007 HOST",
+            "For other methods, and with ns-viewer on their runs: --viewer.websocket-host 127.0.0.1; from "
+            "another machine use ssh -L 7007:127.0.0.1:7007 HOST",
         )
 
 
@@ -157,8 +157,8 @@ def cpu_kernels(facts: Facts) -> Iterator[Finding]:
     if kernels.compiler:
         yield note(
             "kernels-not-built",
-            f"{kernels.built} of {kernels.wanted} CPU kernels are built; the first training on this machine "
-            "builds them, in two or three minutes.",
+            f"{kernels.built} of {kernels.wanted} CPU kernels are built; the first training or `abcd plan` "
+            "on this machine builds them, in two or three minutes.",
         )
     else:
         yield warning(
@@ -194,8 +194,8 @@ def gsplat_extension(facts: Facts) -> Iterator[Finding]:
     else:
         yield note(
             "gsplat-not-built",
-            "gsplat's CUDA kernels are not built; the first training compiles them, once: some 20 minutes of "
-            "CPU time, spread over up to 10 processes.",
+            "gsplat's CUDA kernels are not built; the first training or `abcd plan` compiles them, once: "
+            "some 20 minutes of CPU time, spread over up to 10 processes.",
             "If that takes too much RAM, set MAX_JOBS=2 for it.",
         )
 

@@ -17,7 +17,6 @@ from abcd_ns.machine import output_of
 
 EXTENSION = "gsplat_cuda"
 """gsplat's name for what it compiles at first use."""
-COMPILERS = ("g++", "clang++")
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def look_at_kernels(on_gpu: bool) -> Kernels:
         on_gpu: whether there is a CUDA device to check gsplat's kernels on.
     """
     from abcd_ns.engine.build_kernels import all_kernels
-    from abcd_ns.engine.kernels import kernels_folder
+    from abcd_ns.engine.kernels import find_compiler, kernels_folder
     from abcd_ns.engine.render.cpu.backend import CHUNK, TILE_SIDE
     from abcd_ns.nerfstudio.metrics import lpips_missing
 
@@ -62,7 +61,7 @@ def look_at_kernels(on_gpu: bool) -> Kernels:
         built=sum(kernel.path.is_file() for kernel in kernels),
         wanted=len(kernels),
         folder=str(kernels_folder()),
-        compiler=next(filter(shutil.which, (os.environ.get("CXX", ""), *COMPILERS)), None),
+        compiler=find_compiler(),
         gsplat=None if extension is None else str(extension),
         nvcc=_nvcc(),
         ninja=shutil.which("ninja") is not None,

@@ -16,6 +16,7 @@ from abcd_ns.cli.export.formats import PACKED, rounding, suffix_of, write_scene
 from abcd_ns.cli.export.glb import Z_TO_Y
 from abcd_ns.cli.export.packed import BYTES_AT_ONCE
 from abcd_ns.cli.export.shown import Box, Shown
+from abcd_ns.cli.run_path import find_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
@@ -51,7 +52,7 @@ def export(
     Also of a run that was stopped or killed. Gaussians too transparent for any rasterizer are left out.
 
     Args:
-        run: A run's folder, outputs/SCENE/METHOD/TIME.
+        run: A run's folder, outputs/SCENE/METHOD/TIME, or its config.yml.
         out: A new file that ends in .ply, .compressed.ply, .spz, .sog or .glb. With --by-block a new folder,
             of which each file is a block: .ply, or as the folder's own name ends.
         by_block: One file for each block.
@@ -63,6 +64,7 @@ def export(
         UserError: there is no run, it has nothing to show yet, or `out` exists or cannot be written.
     """
     check_request(out, box)
+    run = find_run(run, STORE)
     suffix = suffix_of(out, ".ply" if by_block else None)
     to = to_data(run) if frame == "data" else None
     with stored(run, out) as store:
@@ -115,11 +117,8 @@ def stored(run: Path, out: Path) -> Iterator[ParameterStore]:
     Raises:
         UserError: there are none, they cannot be read, or `out` cannot be written.
     """
-    folder = run / STATE / STORE
-    if not folder.is_dir():
-        raise UserError(f"There is no run of ABCD in {run}: it has no {folder}.")
     try:
-        with ParameterStore.open(folder, read_only=True) as store:
+        with ParameterStore.open(run / STATE / STORE, read_only=True) as store:
             yield store
     except StoreError as error:
         raise UserError(f"{error} If the run is training, wait until it has ended.") from None
@@ -142,7 +141,7 @@ def _write_parts(scene: Shown, counts: dict[int, int], out: Path, suffix: str) -
     written = []
     try:
         for block in _steps(counts, "writing"):
-            written += _write(scene, {block: counts[block]}, out / f"block-{block:04d}{suffix}", suffix)
+            written += _write(scene, {block: counts[block]}, out / f"block-{block + 1:04d}{suffix}", suffix)
     except BaseException:  # a full disk, or Ctrl-C: a part of the scene is of no use
         shutil.rmtree(out)
         raise

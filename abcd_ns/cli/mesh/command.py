@@ -14,7 +14,8 @@ from abcd_ns.cli.export.command import check_request, stored, tell_rounding, to_
 from abcd_ns.cli.export.shown import Box, check_trained
 from abcd_ns.cli.mesh.depth_maps import draw
 from abcd_ns.cli.mesh.surface import Piece, weld, with_faces, without_specks, write_ply
-from abcd_ns.cli.report.run_folder import find_run, pipeline_config, read_settings
+from abcd_ns.cli.report.run_folder import pipeline_config, read_settings
+from abcd_ns.cli.run_path import find_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.layers.painter import Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.surface import median_depth
@@ -30,7 +31,9 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import FREE_SHARE, RamShares
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
+from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.resuming import MadeFor
+from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.progress_bar import ProgressBar
 
@@ -77,7 +80,7 @@ def mesh(
             surface, or `out` exists or cannot be written.
     """
     _check(out, voxel, box)
-    run = find_run(run)
+    run = find_run(find_run(run, SETTINGS_FILE), STORE)
     to = to_data(run) if frame == "data" else STAY
     wanted = Wanted(out, voxel and voxel / to.scale, box, to, depth == "median")
     with stored(run, out) as store:

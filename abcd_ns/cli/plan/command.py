@@ -25,7 +25,6 @@ from abcd_ns.cli.plan.forecast import (
     views_of_blocks,
 )
 from abcd_ns.cli.terminal import many, print_facts
-from abcd_ns.data.photos import default_budget
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.space.partition import build_kd
@@ -33,15 +32,13 @@ from abcd_ns.engine.train.memory import levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.checks import check_ranges
+from abcd_ns.lab.runs.checks import Number, check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.fit import Demand, Fit, device_budget, find_fit
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with
 from abcd_ns.units import bytes_in_words
-
-Number = Annotated[int, tyro.conf.arg(metavar="N")]
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,9 @@ def plan(
     downscale: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     verbose: bool = False,
 ) -> int:
-    """Say what a run on these photos will need, and what would not fit; trains nothing, writes nothing.
+    """Say what a run on these photos will need, and what would not fit; trains nothing.
+
+    To time a step it compiles what the first training would compile, where that was not done yet.
 
     abcd plan --data garden
 
@@ -169,7 +168,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         points_of_block=tuple(counts.tolist()),
         shares={
             "device": device_shares(fit, needs),
-            "RAM": ram_shares(fit, needs, photo_bytes, default_budget(), wanted.workers),
+            "RAM": ram_shares(fit, needs, photo_bytes, wanted.workers),
             "disk": disk_shares(fit, needs),
         },
         free={
@@ -190,7 +189,7 @@ def _fit(budget: int, demand: Demand, wanted: Wanted) -> Fit:
         limits = demand.training.limits
         batch = views_per_step(demand.training.batch, wanted.blocks, limits.batch_limit)
         return Fit(wanted.blocks, 0, 0, budget, demand.gaussians, batch, limits.crop_pixels)
-    fit = find_fit(budget, demand)
+    fit = find_fit(budget, demand, downscale="--downscale", memory="--device-budget-gb")
     return replace(fit, blocks=blocks_to_begin_with(fit, wanted.workers if wanted.workers > 1 else 0))
 
 

@@ -11,7 +11,7 @@ from abcd_ns.engine.render import Shot, make_rasterizer
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.health_record import FEW_VIEWS
+from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
@@ -29,8 +29,8 @@ PLACES = {
     "disk": ("of disk", "are free in this folder", "use `ns-train --output-dir` on another disk"),
 }
 """Where room is taken, and in which words it is said where there is not enough, with what to do about it."""
-LAYER_SHARE = 0.15
-"""Time for layers by the time of steps: they took 11 to 15% of runs on a CPU (docs/results, 2026-11-23)."""
+LAYERS_BY_STEPS = 0.15
+"""Time for layers by the time of steps: they take 11 to 18% of runs on a CPU (docs/results)."""
 
 
 Shares = dict[str, int]
@@ -61,7 +61,7 @@ class Forecast:
     @property
     def hours(self) -> tuple[float, float]:
         """Of the whole run: with as many Gaussians as points, and with as many as are expected."""
-        layers = 1 + LAYER_SHARE * (self.fit.blocks_at_the_end > 1)
+        layers = 1 + LAYERS_BY_STEPS * (self.fit.blocks_at_the_end > 1)
         low = self.steps * self.seconds_per_step * layers / 3600
         return low, low * max(self.fit.gaussians / max(self.points, 1), 1.0)
 
@@ -73,8 +73,8 @@ class Forecast:
             needed, free = sum(self.shares[place].values()), self.free[place]
             if needed > free:
                 lines.append(f"{bytes_in_words(needed)} {where}, but {bytes_in_words(free)} {how}: {cure}.")
-        if few := sum(count <= FEW_VIEWS for count in views):
-            seen = f"{few} of {len(views)} blocks are seen by fewer than {FEW_VIEWS + 1} views"
+        if few := sum(count <= TOO_FEW_VIEWS for count in views):
+            seen = f"{few} of {len(views)} blocks are seen by fewer than {TOO_FEW_VIEWS + 1} views"
             lines.append(f"{seen}: use fewer blocks.")
         return lines
 
@@ -117,14 +117,15 @@ def sent_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
     }
 
 
-def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, photo_budget: int, workers: int) -> Shares:
+def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> Shares:
     """What the rest takes in RAM, beside Python and torch."""
     scene = fit.gaussians * needs.parameter_bytes
     out = 2 * SLACK * workers * STATES * _largest(fit) * needs.parameter_bytes
+    shares = RamShares.of(0)
     lent = {"blocks that are out, there and back, and those around them": out + scene}
     return (lent if workers > 1 else {}) | {
-        "decoded photos": min(photo_bytes, photo_budget),
-        "frozen blocks": min(scene, RamShares.of(0).blocks),
+        "decoded photos": min(photo_bytes, shares.photos),
+        "frozen blocks": min(scene, shares.blocks),
         "the whole scene, while a checkpoint is written": scene,
     }
 

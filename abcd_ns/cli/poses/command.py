@@ -3,6 +3,7 @@
 import os
 import shlex
 import shutil
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -14,11 +15,11 @@ from rich.console import Console
 from abcd_ns.cli.poses.mapping import FEATURES, MATCHES, POSES, Model, Order, Task, find_poses
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import Problems
-from abcd_ns.data.picture_files import SUFFIXES, check_complete, read_header
+from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_header
 from abcd_ns.errors import UserError
 
 WORK = "poses.part"
-"""The folder in which models are made; a command that is stopped leaves it, the next one removes it."""
+"""The folder in which models are made; a command that is killed leaves it, the next one removes it."""
 FEWEST = 3
 """Photos."""
 MANY = 400
@@ -43,14 +44,16 @@ def poses(
 
     The photos are in DATA/images. Writes a COLMAP model to DATA/sparse/0, by pycolmap; then
     `ns-train abcd --data DATA` trains. Photos should overlap by two thirds, be sharp, and show nothing that
-    moves. On a CPU 50 photos take minutes.
+    moves. On a CPU 50 photos take minutes; twice as many take four times as long, each being compared with
+    each.
 
     Args:
         data: Folder of the scene.
         order: "any" compares each photo with each; "video" with those that follow by name, for many photos.
         lens: COLMAP's camera model. OPENCV suits phones and cameras, OPENCV_FISHEYE fisheyes, PINHOLE photos
             without distortion.
-        several_lenses: The photos are of several lenses, or zoomed.
+        several_lenses: The photos are of several lenses, or zoomed; taken for granted where their sizes
+            differ.
         seed: Of pycolmap's random choices.
 
     Returns:
@@ -59,22 +62,31 @@ def poses(
     Raises:
         UserError: there are no photos, a model is there already, or the photos do not fit together.
     """
-    photos, names = _photos(data)
+    photos, names, sizes = _photos(data)
     if (data / "sparse").exists():
         raise UserError(f"{data / 'sparse'} exists already; move it away to find poses anew.")
     _check_lens(lens)
     console = Console()
+    for line in _unread(photos):
+        print_plain(line, console)
+    one_lens = not several_lenses and len(sizes) == 1
+    if not several_lenses and not one_lens:
+        console.print(f"Photos of {len(sizes)} sizes: those of one size have a lens of their own.")
     if order == "any" and len(names) > MANY:
         console.print(f"{len(names)} photos: comparing each with each takes long; is it --order video?")
-    work = data / WORK
+    task = Task(photos, names, data / WORK, lens, one_lens, order, seed)
+    return _report(data, names, _model(data, task, console), console)
+
+
+def _model(data: Path, task: Task, console: Console) -> Model:
+    """The model that is found, put in its place."""
     try:
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir()
-        task = Task(photos, names, work, lens, not several_lenses, order, seed)
+        shutil.rmtree(task.work, ignore_errors=True)
+        task.work.mkdir()
         model = _with_bars(task, console)
         if model is None:
             raise UserError(
-                f"No two photos in {photos} fit together. They need to overlap, and to be taken from "
+                f"No two photos in {task.photos} fit together. They need to overlap, and to be taken from "
                 "different places."
             )
         (data / "sparse").mkdir()
@@ -82,24 +94,37 @@ def poses(
     except OSError as error:
         raise UserError(f"{data} cannot be written to: {error.strerror}.") from None
     finally:
-        shutil.rmtree(work, ignore_errors=True)
-    return _report(data, names, model, console)
+        shutil.rmtree(task.work, ignore_errors=True)
+    return model
 
 
-def _photos(data: Path) -> tuple[Path, tuple[str, ...]]:
-    """The folder of photos, and their names in it, sorted."""
+def _photos(data: Path) -> tuple[Path, tuple[str, ...], set[tuple[int, int]]]:
+    """The folder of photos, their names in it, sorted, and what sizes they have."""
     folder = data / "images"
     if not folder.is_dir():
         raise UserError(f"{folder} does not exist; put the photos there.")
     found = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     if len(found) < FEWEST:
-        raise UserError(f"{folder} has {len(found)} photos; at least {FEWEST} are needed, better 30.")
-    problems = Problems()
+        words = f"{folder} has {len(found)} photos; at least {FEWEST} are needed, better 30."
+        raise UserError(" ".join([words, *_unread(folder)]))
+    problems, sizes = Problems(), set()
     for path in found:
         with problems.collect():
-            check_complete(path, read_header(path))
+            header = read_header(path)
+            check_complete(path, header)
+            sizes.add(header.size)
     problems.raise_if_any()
-    return folder, tuple(str(path.relative_to(folder)) for path in found)
+    return folder, tuple(str(path.relative_to(folder)) for path in found), sizes
+
+
+def _unread(folder: Path) -> list[str]:
+    """A sentence about pictures in the folder that are passed over, if there are any."""
+    kinds = Counter(p.suffix for p in folder.rglob("*") if p.suffix.lower() in UNREAD and p.is_file())
+    if not kinds:
+        return []
+    (most, _), *_ = kinds.most_common()
+    counted = ", ".join(f"{count:,} {kind}" for kind, count in sorted(kinds.items()))
+    return [f"Not read: {counted}; make JPEGs of them, by `mogrify -format jpg *{most}` for instance."]
 
 
 def _check_lens(lens: str) -> None:

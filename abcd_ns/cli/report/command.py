@@ -11,12 +11,14 @@ from abcd_ns import __version__
 from abcd_ns.cli.report.held_out import look_at_held_out
 from abcd_ns.cli.report.page import GENERATOR, render_page
 from abcd_ns.cli.report.plan import Plan, make_plan
-from abcd_ns.cli.report.run_folder import RunFolder, find_run, load_pipeline, open_run
+from abcd_ns.cli.report.run_folder import RunFolder, load_pipeline, open_run
+from abcd_ns.cli.run_path import find_run
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.checks import check_ranges
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 
 PAGE_FILE = "report.html"
 NO_PHOTOS = "Held-out views and their photos are shown if their folder is named: --data {}"
@@ -46,10 +48,10 @@ def report(
         pictures: Held-out views to show, from the best to the worst.
 
     Raises:
-        UserError: `run` is no run with a log, something in it is damaged, or `out` is another file.
+        UserError: `run` is no run, something in it is damaged, or `out` is another file.
     """
     check_ranges({"pictures": pictures})
-    folder = find_run(run)
+    folder = find_run(run, SETTINGS_FILE)
     out = folder / PAGE_FILE if out is None else out
     _check_page(out)
     console, found = Console(), open_run(folder)

@@ -69,18 +69,6 @@ class RunFolder:
     """By block, of how many numbers its Gaussians at rest are, as known then."""
 
 
-def find_run(path: Path) -> Path:
-    """The folder of a run that is named by it or by its config.yml.
-
-    Raises:
-        UserError: it is none; the message says what to give.
-    """
-    path = path.parent if path.name == "config.yml" else path
-    if not (path / STATE / SETTINGS_FILE).exists():
-        raise UserError(one_line(f"{path} is no run with a log: {_hint(path)}"))
-    return path
-
-
 def open_run(path: Path) -> RunFolder:
     """Read a run's settings, log, newest checkpoint and state.
 
@@ -175,15 +163,6 @@ def _registered(method: str, reader: str) -> AbcdTrainerConfig:
         raise UserError(f"The run's data was read by {reader!r}, which nerfstudio does not know here.")
     found.pipeline.datamanager.dataparser = copy.deepcopy(READERS[reader])
     return found
-
-
-def _hint(path: Path) -> str:
-    if not path.is_dir():
-        return "there is no such folder."
-    below = sorted(path.glob(f"**/{STATE}/{SETTINGS_FILE}"), key=lambda found: found.stat().st_mtime)
-    if below:
-        return f"did you mean {below[-1].parent.parent}?"
-    return "give a folder outputs/SCENE/METHOD/TIME that this version of `ns-train abcd` wrote."
 
 
 def _newest(folder: Path) -> Checkpoint | None:

@@ -23,7 +23,7 @@ from abcd_ns.engine.kernels.kernel import (
     COMPILER_OPTIONS,
     SMALLEST,
     Kernel,
-    can_build,
+    find_compiler,
     forget_loaded,
     kernels_folder,
 )
@@ -41,7 +41,7 @@ def build_kernels(kernels: Sequence[Kernel], side: int, chunk: int, primitive: s
     Args:
         kernels: what is wanted; the process builds all kernels for the other arguments, see BUILDER.
     """
-    if all(kernel.is_built for kernel in kernels) or not can_build():
+    if all(kernel.is_built for kernel in kernels) or find_compiler() is None:
         return
     command = [sys.executable, "-m", BUILDER, str(side), str(chunk), primitive]
     run = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -86,9 +86,9 @@ def kernels_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "abcd_ns" / "kernels"
 
 
-def can_build() -> bool:
-    """Whether a C++ compiler is found."""
-    return any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "g++", "clang++"))
+def find_compiler() -> str | None:
+    """The C++ compiler that is found, by its name."""
+    return next(filter(shutil.which, (os.environ.get("CXX") or "g++", "g++", "clang++")), None)
 
 
 def forget_loaded() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from abcd_ns.engine.store.special_blocks import BlockName
 
-FEW_VIEWS = 2
+TOO_FEW_VIEWS = 2
 """A block that no more views see has surfaces that nothing but the first Gaussians hold in place."""
 
 
@@ -27,10 +27,8 @@ class BlockHealth:
     """Gaussians that were shrunk."""
     shed: int = 0
     """Gaussians that filled too little of their views and were taken out."""
-    rises: int = 0
-    """Visits that left the loss of their views higher than they found it."""
     undone: int = 0
-    """Those of them that were undone."""
+    """Visits that were undone, as they left the loss of their views too high."""
     damping: float = 1.0
     """Learning rates of the next visit, as a share of what they would be."""
     hidden: bool = False
@@ -55,7 +53,7 @@ def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -
         return "hidden behind others, passed over"
     if record.undone >= record.visits:
         return "every visit undone"
-    if views.get(block, FEW_VIEWS + 1) <= FEW_VIEWS:
+    if views.get(block, TOO_FEW_VIEWS + 1) <= TOO_FEW_VIEWS:
         return "seen by 1 view only" if views[block] == 1 else f"seen by {views[block]} views only"
     return "trained"
 

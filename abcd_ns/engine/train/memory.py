@@ -169,7 +169,7 @@ def parameter_bytes(sh_degree: int) -> int:
     return FLOAT * (NUMBERS_WITHOUT_COLOR + 3 * (sh_degree + 1) ** 2)
 
 
-def bytes_for(gaussians: int, sh_degree: int) -> int:
+def live_bytes(gaussians: int, sh_degree: int) -> int:
     """What a live block of so many Gaussians takes, pictures not counted."""
     return gaussians * parameter_bytes(sh_degree) * LIVE_COPIES
 
@@ -206,7 +206,7 @@ def check_room(gaussians: int, sh_degree: int, device: torch.device) -> None:
     Raises:
         OutOfRoomError: the memory that is free does not suffice; says what would.
     """
-    needed, free = bytes_for(gaussians, sh_degree), free_bytes(device)
+    needed, free = live_bytes(gaussians, sh_degree), free_bytes(device)
     if needed > free:
         raise OutOfRoomError(
             f"A block of {gaussians:,} Gaussians takes {bytes_in_words(needed)}, but {device} has "

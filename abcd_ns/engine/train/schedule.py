@@ -28,7 +28,7 @@ LEAST_SIDE = 100
 
 FEW_VIEWS = 32
 """Of a visit: with more, a visit uses each less often, and is as long."""
-LAYER_SHARE = 0.1
+LAYER_TIME = 0.1
 """Of a visit's time, for its layers, where visits are as long as they should be."""
 SHORTER = 4
 """Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
@@ -79,7 +79,7 @@ def passes_of_sweep(sweep: int, first: int, last: int, used: int) -> int:
 
 
 def passes_for_layers(trained: int, frozen: int) -> int:
-    """Uses of each view in a visit such that its layers take LAYER_SHARE of the visit's time.
+    """Uses of each view in a visit such that its layers take LAYER_TIME of the visit's time.
 
     A step draws a block forward and backward. A layer draws what is around the block forward, and its window
     needs the weights of the block. What these cost was measured (docs/performance.md); it is counted in
@@ -91,7 +91,7 @@ def passes_for_layers(trained: int, frozen: int) -> int:
     if trained == 0:
         return 0
     layers = FROZEN_COST * frozen / trained + WINDOW_COST
-    return math.ceil(layers * (1 - LAYER_SHARE) / LAYER_SHARE)
+    return math.ceil(layers * (1 - LAYER_TIME) / LAYER_TIME)
 
 
 def passes_at_once(passes: int, at_once: int, blocks: int) -> float:

@@ -86,31 +86,34 @@ def read_json(path: Path) -> Any:
         raise RecordError(f"{path} is not JSON ({error}); delete it and run again.") from None
 
 
-def read_toml(path: Path, absent: str) -> dict[str, Any]:
+def read_toml(path: Path, absent: str, *, trains: bool = False) -> dict[str, Any]:
     """A user's options in TOML.
 
     Args:
         path: of the file. Where there is none, `small-gpu` and `configs/small-gpu.toml` are one of ours.
         absent: what to say where there is no such file either.
+        trains: it is for `abcd train`, not for a comparison.
 
     Raises:
         RecordError: the file is absent, or is no TOML.
     """
     if not path.is_file() and path.parent in (Path(), Path("configs")):
-        path = next((own for own in own_configs() if own.stem == path.name.removesuffix(".toml")), path)
+        path = next((own for own in own_configs(trains) if own.stem == path.name.removesuffix(".toml")), path)
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise RecordError(
-            f"{absent} Those that come with abcd: {', '.join(p.stem for p in own_configs())}."
+            f"{absent} Those that come with abcd: {', '.join(p.stem for p in own_configs(trains))}."
         ) from None
     except (ValueError, OSError) as error:
         raise RecordError(f"{path} cannot be read as TOML: {error}.") from None
 
 
-def own_configs() -> list[Path]:
-    """The option files that come with abcd."""
-    return sorted(CONFIGS.glob("*.toml"))
+def own_configs(trains: bool) -> list[Path]:
+    """The option files that come with abcd: for `abcd train` those that name a method, for a comparison the
+    others."""
+    named = {path: "method" in tomllib.loads(path.read_text("utf-8")) for path in CONFIGS.glob("*.toml")}
+    return sorted(path for path, names_one in named.items() if names_one == trains)
 
 
 def read_record(path: Path, cls: type[R], schema: int) -> R:

@@ -196,7 +196,7 @@ def test_a_run_that_is_still_going_on_has_a_page(copied):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda folder: (folder / "abcd" / SETTINGS_FILE).unlink(), "is no run with a log"),
+        (lambda folder: (folder / "abcd" / SETTINGS_FILE).unlink(), "is no run with abcd/settings.json"),
         (lambda folder: (folder / "abcd" / LOG_FILE).unlink(), r"log\.jsonl does not exist"),
         (lambda folder: (folder / "abcd" / SETTINGS_FILE).write_text("{"), r"settings\.json is not JSON"),
         (lambda folder: settings_changed(folder, begun="today"), r"settings\.json: .*begun"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from abcd_ns.engine.build_kernels import all_kernels
-from abcd_ns.engine.kernels import Kernel, build, can_build
+from abcd_ns.engine.kernels import Kernel, build, find_compiler
 from abcd_ns.engine.kernels.kernel import FOLDER_VARIABLE, forget_loaded
 from abcd_ns.engine.kernels.photometric import PHOTOMETRIC_KERNELS, SSIM_WINDOW
 from abcd_ns.engine.render import TorchRasterizer
@@ -18,7 +18,7 @@ from abcd_ns.engine.types import Crop
 from tests.reference.rasterizer_scenes import gradients, random_gaussians, relative_error, small_view
 
 needs_compiler = pytest.mark.skipif(
-    not can_build(), reason="building kernels needs a C++ compiler, and none is on the PATH"
+    find_compiler() is None, reason="building kernels needs a C++ compiler, and none is on the PATH"
 )
 
 
@@ -111,7 +111,7 @@ def test_failing_to_build_warns_and_stays_eager(monkeypatch):
         return subprocess.CompletedProcess([], 1, "", "Traceback\nRuntimeError: no such compiler")
 
     monkeypatch.setattr(build.subprocess, "run", fail)
-    monkeypatch.setattr(build, "can_build", lambda: True)
+    monkeypatch.setattr(build, "find_compiler", lambda: "g++")
     view, gaussians = small_view(dtype=torch.float32), random_gaussians(10, dtype=torch.float32)
     rasterizer = TorchRasterizer()
     with pytest.warns(UserWarning, match="stays slow: RuntimeError: no such compiler"):
@@ -135,7 +135,7 @@ def test_without_built_kernels_nothing_is_built_unasked(own_folder, policy):
 
 
 def test_never_means_never(monkeypatch):
-    monkeypatch.setattr(build, "can_build", lambda: pytest.fail("asked for a compiler"))
+    monkeypatch.setattr(build, "find_compiler", lambda: pytest.fail("asked for a compiler"))
     kernels = ChunkKernels("never", 4, 16)
     kernels.warm_up()
     assert not kernels.built

@@ -15,7 +15,7 @@ from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.health.health_rules import is_worse, loss_rise, stand_ins, unsound
 from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
-from abcd_ns.engine.train.memory import OutOfRoomError, bytes_for, check_room
+from abcd_ns.engine.train.memory import OutOfRoomError, check_room, live_bytes
 from abcd_ns.engine.train.run_state import ActiveVisit, RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -336,7 +336,7 @@ def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(
     with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
         check_room(10**12, 3, torch.device("cpu"))
     check_room(1000, 3, torch.device("cpu"))
-    monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: bytes_for(30, 1))
+    monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: live_bytes(30, 1))
     coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=10)
     with pytest.raises(OutOfRoomError, match="A block of 60 Gaussians"):
         train_step(coordinator, photos)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.train.schedule import (
     FROZEN_COST,
-    LAYER_SHARE,
+    LAYER_TIME,
     SHORTER,
     WINDOW_COST,
     exponential_decay,
@@ -80,7 +80,7 @@ def test_a_first_visit_is_about_as_long_with_many_views_as_with_few():
 def test_passes_leave_a_tenth_of_the_time_for_layers(frozen):
     passes, trained = passes_for_layers(1_000, frozen), 1_000
     layers = FROZEN_COST * frozen + WINDOW_COST * trained
-    assert layers / (layers + passes * trained) <= LAYER_SHARE < layers / (layers + (passes - 1) * trained)
+    assert layers / (layers + passes * trained) <= LAYER_TIME < layers / (layers + (passes - 1) * trained)
     assert passes_for_layers(0, 0) == 0
 
 

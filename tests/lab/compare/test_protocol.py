@@ -12,11 +12,7 @@ from abcd_ns.lab.job import METHODS, Settings
 from abcd_ns.lab.results.records import own_configs
 from abcd_ns.lab.runs.configs import trainer_config
 
-CONFIGS = [
-    path
-    for path in own_configs()
-    if "method = " not in path.read_text()  # those are for `abcd train`
-]
+CONFIGS = own_configs(trains=False)
 
 
 def options(scene: Path, **given) -> Options:

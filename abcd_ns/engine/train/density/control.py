@@ -88,7 +88,7 @@ class DensityConfig:
     price: float = 8.0
     """Pixels that a Gaussian must fill (sum of alpha T) in all views of its block together, once growth ends;
     those that fill less go, and those that fill less than four times as many do not grow (`default`
-    strategy). 0 keeps everything."""
+    strategy). 0 keeps everything, haze too, and whatever a complete run could spare (`mcmc` as well)."""
     max_gaussians: int = 0
     """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
     to begin with, a random choice of them begins."""

@@ -156,7 +156,6 @@ class Health:
         if not self.undoes or active.is_whole:
             return state
         rise = loss_rise(list(active.objective.values()))
-        record.rises += rise is not None and rise[1] > rise[0]
         if rise is not None and is_worse(*rise):
             return self._undo(active, rise, record)
         record.damping = min(2 * record.damping, 1.0)

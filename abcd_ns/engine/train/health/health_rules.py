@@ -10,10 +10,8 @@ from torch import Tensor
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View, centers_of
 
-SHOWS = 1 / 255
-"""Rasterizers skip a Gaussian wherever its alpha is below this: with less opacity it is never drawn."""
 STAND_IN_OPACITY = -9.0
-"""Logit of the opacity of a Gaussian that takes the place of one that was lost; far below SHOWS."""
+"""Logit of the opacity of a Gaussian that takes the place of one that was lost; far below MIN_ALPHA."""
 LARGEST_LOG_SCALE = 40.0
 """A standard deviation of e^40; its square still is a number in float32."""
 GIANT_ANGLE = 0.3

@@ -7,10 +7,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
-from abcd_ns.engine.train.health.health_rules import SHOWS
 from abcd_ns.engine.types import View
 from abcd_ns.lab.stability.lab import METHODS, PAIR, Lab, Stage, Trained, block_at, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
@@ -119,7 +119,7 @@ def floaters(lab: Lab) -> Finding:
         alpha = float(alpha_in_air(lab, trained, tree, held_out))
         gaussians = trained.gaussians
         inside = (gaussians.means[:, 1] > AIR[0]) & (gaussians.means[:, 1] < AIR[1])
-        left = int((inside & (torch.sigmoid(gaussians.opacities[:, 0]) > SHOWS)).sum())
+        left = int((inside & (torch.sigmoid(gaussians.opacities[:, 0]) > MIN_ALPHA)).sum())
         numbers |= {f"alpha {method}": alpha, f"left {method}": left, f"psnr {method}": trained.psnr}
         said[method] = (
             f"{alpha:.2%} alpha in the air, {left} of {FLOATERS} Gaussians left, {trained.psnr:.2f} dB"

@@ -12,10 +12,11 @@ from abcd_ns.engine.events import Mended
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.render.loss import psnr
+from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.space.influence import weights
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE, SHOWS
+from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.lab.stability.lab import BLOCKS, PAIR, STILL, Lab, Stage, Trained, block_at, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
@@ -122,7 +123,7 @@ def transparent(lab: Lab) -> Finding:
         }
         trained = lab.train(stage, method, start=faint, **options)
         export = trained.gaussians
-        invisible = int((torch.sigmoid(export.opacities) < SHOWS).sum())
+        invisible = int((torch.sigmoid(export.opacities) < MIN_ALPHA).sum())
         unseen = int((unseen_weights(lab, export, stage.views) == 0).sum()) - invisible
         scene = trained.coordinator.scene
         grown = sum(map(scene.count, range(BLOCKS, scene.tree.num_blocks)))
