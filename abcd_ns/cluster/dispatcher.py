@@ -209,6 +209,8 @@ class Dispatcher(Coordinator):
     def _submit(self) -> None:
         for lent in self._lent:
             if not lent.submitted and self.workers.idle:
+                now = replace(lent.lease.task, seconds=self.stopwatch.seconds)  # it may have waited for long
+                lent.lease = replace(lent.lease, task=now)
                 self.workers.submit(lent.lease)
                 lent.submitted = True
                 active, task = lent.active, lent.lease.task

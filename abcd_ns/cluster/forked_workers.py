@@ -23,13 +23,13 @@ import torch
 from abcd_ns.cluster.lease import Finished, Lease, Lost, Parcel, Report, StepsSeen, WorkersError
 from abcd_ns.cluster.members import Member, Members, RecentMean
 from abcd_ns.cluster.visit_worker import VisitWorker
-from abcd_ns.engine.events import StepTaken
+from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, is_out_of_memory
 
 SILENCE = 600.0
-"""Seconds without a word after which a worker counts as lost: drawing a visit's layers may take minutes."""
+"""Seconds without a word after which a worker counts as lost: a view of large blocks may take many."""
 TELL_EVERY = 0.5
 """Seconds between two words of a worker's progress."""
 PR_SET_PDEATHSIG = 1
@@ -113,6 +113,8 @@ class ForkedWorkers(Members[Place]):
         except (OSError, EOFError):
             return [self._lose(member, "it was killed")]
         match said:
+            case None:  # it lives
+                return []
             case (int(done), float(psnr)):
                 member.done = done
                 return [StepsSeen(member.lease.number, done, psnr)]
@@ -141,20 +143,22 @@ class ForkedWorkers(Members[Place]):
 
 
 class _Telling:
-    """Tells the driver how far a visit is, now and then."""
+    """Tells the driver how far a visit is, now and then; before its first step, that it goes on."""
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._told = pipe, time.monotonic()
         self._psnr = RecentMean()
 
-    def __call__(self, step: StepTaken) -> None:
-        self._psnr.add(step.psnr)
+    def __call__(self, event: Event) -> None:
+        steps = isinstance(event, StepTaken)
+        if steps:
+            self._psnr.add(event.psnr)
         if time.monotonic() - self._told >= TELL_EVERY:
             self._told = time.monotonic()
-            self._pipe.send((step.visit_step, self._psnr.value))
+            self._pipe.send((event.visit_step, self._psnr.value) if steps else None)
 
 
-def _live(pipe: Connection, visit: Callable[[Callable[[StepTaken], None]], Any]) -> NoReturn:
+def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> NoReturn:
     """All of a worker's life. Whatever goes wrong in it ends it, and who waits for it is told."""
     status = 1
     try:

@@ -34,7 +34,7 @@ from abcd_ns.cluster.lease import (
 )
 from abcd_ns.cluster.members import Member, Members, RecentMean
 from abcd_ns.cluster.visit_worker import VisitWorker
-from abcd_ns.engine.events import StepTaken
+from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.types import Gaussians
@@ -96,9 +96,10 @@ class Actor:
         self._done, self._psnr = 0, RecentMean()
         return Parcel.of(self._worker.visit(task, state(), drawn, self._hear))
 
-    def _hear(self, step: StepTaken) -> None:
-        self._done = step.visit_step
-        self._psnr.add(step.psnr)
+    def _hear(self, event: Event) -> None:
+        if isinstance(event, StepTaken):
+            self._done = event.visit_step
+            self._psnr.add(event.psnr)
 
     def progress(self) -> tuple[int, float]:
         """Steps of the visit so far, and the mean PSNR of the last ones, dB."""

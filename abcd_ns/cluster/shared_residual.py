@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from abcd_ns.engine.events import LayersDrawn
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, rounded
 from abcd_ns.engine.render import Raster
 from abcd_ns.engine.space.influence import Influence, weights_by_pixel
@@ -90,8 +91,9 @@ class SharedResidual:
         self._degree, self._store = training.degree, LayerStore(run.device, room.device, room.ram)
         if beside:
             gaussians = own().to(run.device)
-            for view in beside:
+            for done, view in enumerate(beside, start=1):
                 self._store.put(view, Kept(self._draw(gaussians, view)))
+                run.announce(LayersDrawn(run.active.number, done, len(beside)))
 
     def target(self, sample: Sample, photo: Float[Tensor, "_h _w 3"]) -> Float[Tensor, "_h _w 3"]:
         """What a sample is trained on in its photo's place."""

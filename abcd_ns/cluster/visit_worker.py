@@ -10,7 +10,7 @@ from torch.nn import Parameter
 
 from abcd_ns.cluster.lease import VisitOutcome, VisitTask
 from abcd_ns.cluster.shared_residual import ROOM, SharedResidual
-from abcd_ns.engine.events import Event, StepTaken
+from abcd_ns.engine.events import Event
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.loss import psnrs
@@ -90,23 +90,19 @@ class VisitWorker:
         task: VisitTask,
         state: BlockState,
         drawn: Mapping[int, Callable[[], Gaussians]],
-        listen: Callable[[StepTaken], None] | None = None,
+        listen: Callable[[Event], None] = lambda _: None,
     ) -> VisitOutcome:
         """Train a block between the others.
 
         Args:
             state: what it begins with.
             drawn: by block, what reads it as others draw it; only those are read that some picture shows.
-            listen: is told of each step.
+            listen: is told of what happens.
         """
         scene = LentScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
         run = self._run_of(task, scene)
 
-        def hear(event: Event) -> None:
-            if isinstance(event, StepTaken) and listen is not None:
-                listen(event)
-
-        run.announce.subscribe(hear)
+        run.announce.subscribe(listen)
         run.announce.subscribe(self._read_ahead)
         run.stopwatch.start()
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
@@ -143,6 +139,8 @@ class VisitWorker:
             params,
             optimizers,
             device=self._device,
+            # Two workers may show one photo: whose transform should stay?
+            light=None if setup.config.light == "none" else HeldLight(task.light, self._device),
         )
         run.state = RunState(
             step=task.step,
@@ -152,8 +150,6 @@ class VisitWorker:
             health={block: copy.copy(task.health)},
             active=copy.deepcopy(task.active),
         )
-        if run.light is not None:  # two workers may show one photo: whose transform should stay?
-            run.light = HeldLight(task.light, run.device)
         run.poses.restore(task.poses)
         run.take_poses()
         run.stopwatch = Stopwatch(task.seconds)

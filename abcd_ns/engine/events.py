@@ -19,7 +19,8 @@ class VisitBegan:
 
 @dataclass(frozen=True)
 class LayersDrawn:
-    """F and B of one more view of the visit are ready."""
+    """F and B of one more view of the visit are ready; or, where blocks are trained at once, the picture
+    that it begins with."""
 
     visit: int
     done: int

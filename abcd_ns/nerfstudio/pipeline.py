@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import thin_out
 from abcd_ns.engine.render import loss
-from abcd_ns.engine.space.partition import build_grid, build_kd
+from abcd_ns.engine.space.partition import build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
@@ -357,7 +357,7 @@ class AbcdPipeline(VanillaPipeline):
 
 def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:
     """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all."""
-    low, high = (gaussians.means.quantile(q, dim=0) for q in (0.05, 0.95))
+    low, high = robust_range(gaussians.means.double().cpu())
     extent = (high - low).clamp_min(1e-9).tolist()
     counts = [1, 1, 1]
     while counts[0] * counts[1] * counts[2] < blocks:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -76,7 +77,12 @@ class AbcdTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
         self.check()
-        super().save_config()
+        with exit_on_user_error():
+            try:
+                super().save_config()
+            except OSError as error:
+                words = f"{error.filename} cannot be made: {error.strerror}. Choose another --output-dir."
+                raise UserError(words) from None
 
     def check(self) -> None:
         """Choose the device and look at the options and the data, before anything is written.
@@ -117,6 +123,8 @@ class AbcdTrainer(Trainer):
     pipeline: AbcdPipeline
     resumed_from: Start | None = None
     """What this run goes on from."""
+    _trains: int | None = None
+    """The thread that does."""
 
     def __init__(self, config: AbcdTrainerConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
@@ -132,6 +140,18 @@ class AbcdTrainer(Trainer):
             self.config, self.base_dir / STATE, self.total_steps, self._options, self.resumed_from
         )
 
+    @property
+    def training_state(self) -> str:
+        """Of the viewer's buttons. nerfstudio's loop asks before each step and, while it is paused, again and
+        again: no time of the run counts then."""
+        if self._training_state == "paused" and threading.get_ident() == self._trains:
+            self.pipeline.coordinator.pause()
+        return self._training_state
+
+    @training_state.setter
+    def training_state(self, state: str) -> None:
+        self._training_state = state
+
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
         with exit_on_user_error():
@@ -144,6 +164,7 @@ class AbcdTrainer(Trainer):
 
     def train(self) -> None:
         """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
+        self._trains = threading.get_ident()
         try:
             with self._signals:
                 self._complete()
@@ -173,7 +194,7 @@ class AbcdTrainer(Trainer):
 
     def _complete(self) -> None:
         """A run that has had its steps or seconds takes no more; what comes after may be missing."""
-        if self.pipeline.coordinator.finished:
+        if self.pipeline.coordinator.progress >= 1.0:
             self._signals.hold()
             self.pipeline.coordinator.complete()
             self._signals.release()

@@ -31,6 +31,7 @@ from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval
+from abcd_ns.engine.space.partition import robust_range
 from abcd_ns.engine.space.tree import BlockTree, Box
 from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
@@ -72,8 +73,8 @@ def enlarged(cell: Box, means: Float[Tensor, "n 3"], overlap: float) -> Box:
     """
     extent = cell.upper - cell.lower
     if len(means):
-        middle = means.double().cpu().quantile(torch.tensor([0.05, 0.95]).double(), dim=0)
-        extent = torch.where(extent.isinf(), middle[1] - middle[0], extent)
+        low, high = robust_range(means.double().cpu())
+        extent = torch.where(extent.isinf(), high - low, extent)
     margin = overlap * torch.where(extent.isinf(), 0.0, extent)
     return Box(cell.lower - margin, cell.upper + margin)
 

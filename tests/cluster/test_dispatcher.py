@@ -122,6 +122,23 @@ def test_who_waited_for_an_undone_visit_is_not_seen_before_the_next(make, photos
     assert 0 < len(run.scene.gaussians(block)) < run.scene.count(block)
 
 
+def test_a_visit_that_is_lent_again_knows_what_time_it_is(make, photos, monkeypatch):
+    run = make(workers=1, density=STILL)
+    submit, wait, lent = run.workers.submit, run.workers.wait, []
+
+    def lose_the_first(seconds):
+        if len(lent) > 1:
+            return wait(seconds)
+        run.stopwatch._before += 100.0
+        return [Lost(run.workers._leases.popleft().number, "it was killed")]
+
+    monkeypatch.setattr(run.workers, "submit", lambda lease: (lent.append(lease.task), submit(lease)))
+    monkeypatch.setattr(run.workers, "wait", lose_the_first)
+    train(run, photos, steps=8)
+    assert lent[0].active.number == lent[1].active.number
+    assert lent[1].seconds > lent[0].seconds + 100.0
+
+
 def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(make, photos):
     run = make(workers=3, density=STILL)
     out, most, ended = set(), 0, []

@@ -112,6 +112,33 @@ def test_so_is_one_that_nothing_is_heard_of(make, photos, steady, tmp_path, monk
     assert equal(steady[0], whole_scene(run))
 
 
+class Slow(TorchRasterizer):
+    """Takes its time to draw layers."""
+
+    def cuts(self, *args, **options):
+        for cut in super().cuts(*args, **options):
+            time.sleep(0.4)
+            yield cut
+
+
+def test_one_that_draws_layers_for_long_is_not(tmp_path, views, photos, monkeypatch):
+    monkeypatch.setattr(forked_workers, "SILENCE", 1.5)
+
+    def target(sample):
+        return photos(sample.view.index, sample.crop), None
+
+    def workers_of(run):
+        return ForkedWorkers(2, VisitWorker(setup_of(run), Slow(), target))
+
+    run = make_run(tmp_path / "slow", views, workers_of, lag=4, density=GROWING)
+    lost = listen(run, WorkerLost)
+    while run.state.visit < 3:
+        train_step(run, photos)
+    run.workers.close()
+    assert 0.4 * len(views) > 1.5
+    assert not lost
+
+
 @pytest.mark.parametrize(
     ("error", "words"),
     [

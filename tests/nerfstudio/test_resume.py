@@ -14,6 +14,7 @@ from abcd_ns.engine.events import LayersDrawn, StepTaken
 from abcd_ns.engine.store import ParameterStore, crash_points
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run.resuming import MadeFor
 from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
@@ -158,6 +159,22 @@ def test_a_signal_commits_and_says_how_to_go_on(
     resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
     assert resumed.resumed_from.step == taken
     assert_same(resumed.base_dir, undisturbed)
+
+
+def test_going_on_for_no_more_steps_completes_the_run(data, stopped, tmp_path):
+    ParameterStore.open(stopped / "abcd" / "store").close()
+    before = RunState.from_json(ParameterStore.open(stopped / "abcd" / "store", read_only=True).state)
+    assert before.active is not None
+    resumed = run(configure(data, tmp_path / "resumed", load_dir=stopped, steps=before.step))
+    state = resumed.pipeline.coordinator.state
+    assert (state.active, state.step, state.shed_at) == (None, before.step, before.step)
+
+
+def test_a_checkpoint_of_another_name_can_be_viewed_only(data, stopped, tmp_path, capsys):
+    (checkpoint,) = (stopped / "nerfstudio_models").iterdir()
+    copied = Path(shutil.copy(checkpoint, checkpoint.with_name("my best.ckpt")))
+    said = refusal(configure(data, tmp_path / "b", load_checkpoint=copied), capsys)
+    assert "my best.ckpt can be viewed but not trained further" in said
 
 
 # Disks

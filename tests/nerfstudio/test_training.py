@@ -2,6 +2,8 @@
 
 import copy
 import json
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -260,6 +262,8 @@ def test_the_saved_config_is_the_config(trained):
         (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
         (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),
         (lambda c: setattr(c.pipeline.training, "influence_share", 0.0), "training.influence-share"),
+        (lambda c: setattr(c.pipeline.training, "sh_degree", 4), "training.sh-degree must be from 0 to 3"),
+        (lambda c: setattr(c.pipeline.training, "sh_degree", -1), "training.sh-degree must be from 0 to 3"),
         (lambda c: setattr(c.pipeline.training, "window_weight", 1.0), "training.window-weight"),
         (lambda c: setattr(c.pipeline.training, "recipe", Recipe(overlap=0.2)), "recipe.overlap is 0.2"),
         (lambda c: setattr(c.pipeline.training, "warmup", float("nan")), "--pipeline.training.warmup"),
@@ -275,3 +279,30 @@ def test_what_cannot_work_is_refused_before_anything_is_written(data, tmp_path, 
     assert stopped.value.code == 2
     assert expected in capsys.readouterr().out
     assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(data, tmp_path, capsys):
+    taken = tmp_path / "taken"
+    taken.touch()
+    config = configure(data, taken)
+    config.set_timestamp()
+    with pytest.raises(SystemExit) as stopped:
+        config.save_config()
+    assert stopped.value.code == 2
+    assert f"{taken}" in (said := capsys.readouterr().out)
+    assert "Choose another --output-dir." in said
+
+
+def test_no_time_counts_while_the_viewer_has_the_run_paused(data, tmp_path):
+    trainers, waited = [], 1.5
+
+    def pause(trainer):
+        if not trainers:
+            trainers.append(trainer)
+            trainer.training_state = "paused"
+            threading.Timer(waited, setattr, (trainer, "training_state", "training")).start()
+
+    began = time.monotonic()
+    trainer = run(configure(data, tmp_path, steps=6), after_step=pause)
+    assert trainer.pipeline.coordinator.state.step == 6
+    assert trainer.pipeline.coordinator.stopwatch.seconds < time.monotonic() - began - waited

@@ -69,7 +69,7 @@ def build_grid(points: Float[Tensor, "n 3"], counts: tuple[int, int, int]) -> Bl
     if min(counts) < 1 or math.prod(counts) > MAX_CELLS:
         raise ValueError(f"a grid has at least one cell on each axis and {MAX_CELLS} in all, not {counts}")
     _check_finite(points)
-    start, stop = _robust_range(in_float64(points).cpu())
+    start, stop = robust_range(in_float64(points).cpu())
     # Without any extent every cell size is as good as another; 1 keeps the planes apart.
     sizes = [(extent or 1.0) / n for extent, n in zip((stop - start).tolist(), counts, strict=True)]
     grid = zip(start.tolist(), sizes, counts, strict=True)
@@ -104,7 +104,7 @@ def _grid_node(planes: list[list[float]]) -> tuple | None:
     return axis, planes[axis][middle], _grid_node(below), _grid_node(above)
 
 
-def _robust_range(points: Float64[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+def robust_range(points: Float64[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
     """The 5th and 95th percentile on each axis; zeros without points."""
     points = points if len(points) else points.new_zeros((1, 3))
     tail = int(0.05 * (len(points) - 1))
@@ -113,7 +113,7 @@ def _robust_range(points: Float64[Tensor, "n 3"]) -> tuple[Float64[Tensor, "3"],
 
 def _axes_by_extent(points: Float64[Tensor, "n 3"]) -> list[int]:
     """Axes from the widest to the narrowest; by the full range where the bulk of the points coincides."""
-    start, stop = _robust_range(points)
+    start, stop = robust_range(points)
     robust = (stop - start).tolist()
     full = (points.amax(dim=0) - points.amin(dim=0)).tolist() if len(points) else robust
     return sorted(range(3), key=lambda axis: (-robust[axis], -full[axis]))

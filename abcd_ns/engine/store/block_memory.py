@@ -12,9 +12,13 @@ class BlockMemory:
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
-        self.nbytes = 0
         self._drawn: OrderedDict[BlockName, Packed] = OrderedDict()
         self._training: OrderedDict[BlockName, Packed] = OrderedDict()
+
+    @property
+    def nbytes(self) -> int:
+        """Of all that is here; added up anew, since whoever reads a block may be broken off anywhere."""
+        return sum(block.nbytes for kept in (self._drawn, self._training) for block in kept.values())
 
     def drawn(self, name: BlockName) -> Packed | None:
         """What others draw of a block at rest, or will, if it is here."""
@@ -33,13 +37,11 @@ class BlockMemory:
         self._drawn[name] = block.part(set(DRAWN))
         if training := block.tensors.keys() - set(DRAWN):
             self._training[name] = block.part(training)
-        self.nbytes += block.nbytes
 
     def forget(self, name: BlockName) -> None:
         """Let a block go."""
         for kept in (self._drawn, self._training):
-            found = kept.pop(name, None)
-            self.nbytes -= 0 if found is None else found.nbytes
+            kept.pop(name, None)
 
     def shrink(self, spare: int = 0) -> None:
         """Let go of what goes beyond the limit; the Gaussians used last stay in any case.
@@ -47,9 +49,10 @@ class BlockMemory:
         Args:
             spare: bytes that are taken otherwise and count against the limit.
         """
-        while self.nbytes + spare > self.limit and (self._training or len(self._drawn) > 1):
+        beyond = self.nbytes + spare - self.limit
+        while beyond > 0 and (self._training or len(self._drawn) > 1):
             _, gone = (self._training or self._drawn).popitem(last=False)
-            self.nbytes -= gone.nbytes
+            beyond -= gone.nbytes
 
 
 def _used(kept: OrderedDict, name: BlockName):

@@ -140,7 +140,7 @@ class StoredScene(VisitScene):
                 written by the next `rest` or `flush`.
         """
         packed = {n: block if isinstance(block, Packed) else block.packed() for n, block in blocks.items()}
-        with self._writer.lock:
+        with self._writer.mutex:
             header = None if tree is self.tree else {**self.store.header, "tree": tree.to_json()}
             self.tree = tree
             for name, block in packed.items():
@@ -173,7 +173,7 @@ class StoredScene(VisitScene):
                 self._versions[block] = next(self._numbers)
 
     def _saved(self, snapshot: Snapshot) -> None:
-        with self._writer.lock:
+        with self._writer.mutex:
             for name, block in snapshot.blocks.items():
                 if self._unsaved.get(name) is block:
                     del self._unsaved[name]
@@ -183,7 +183,7 @@ class StoredScene(VisitScene):
 
     def make_room(self) -> None:
         """Before a copy of the live block is made: wait for the last, if that is large and unwritten."""
-        with self._writer.lock:
+        with self._writer.mutex:
             unsaved = self.unsaved_bytes
         if unsaved > self.ram_bytes:
             self.flush()
@@ -257,7 +257,7 @@ class StoredScene(VisitScene):
 
     def _packed(self, name: BlockName, *, whole: bool) -> Packed:
         """What is at rest under a name, or what others draw of it; in RAM from now on."""
-        with self._writer.lock:
+        with self._writer.mutex:
             if name in self._unsaved:
                 return self._unsaved[name]
             found = self._memory.whole(name) if whole else self._memory.drawn(name)
@@ -275,7 +275,7 @@ class StoredScene(VisitScene):
 
     def read_ahead(self, block: int) -> None:
         """Have `state` of a block at hand soon; returns at once."""
-        with self._writer.lock:
+        with self._writer.mutex:
             if block not in self._unsaved and self._memory.whole(block) is None:
                 self._writer.do(partial(self._packed, block, whole=True))
 
@@ -325,7 +325,7 @@ class StoredScene(VisitScene):
     @property
     def cached_bytes(self) -> int:
         """RAM that blocks at rest take."""
-        with self._writer.lock:
+        with self._writer.mutex:
             return self._memory.nbytes + self.unsaved_bytes
 
     def version(self, block: int) -> int:

@@ -53,8 +53,12 @@ class WriteBehind:
 
     def __init__(self, store: ParameterStore, written: Callable[[Snapshot], None]) -> None:
         self._store, self._written = store, written
-        self.lock = threading.Condition()
-        """Guards all of this; whoever shares data with jobs uses it, too. It must not be held in a fork."""
+        self.mutex = threading.RLock()
+        """Guards all of this; whoever shares data with jobs uses it, too. It must not be held in a fork. The
+        viewer's pictures are broken off by an exception in whatever line of Python they are: this lock is let
+        go of in none."""
+        self.lock = threading.Condition(self.mutex)
+        """The same, to wait with; for those who are not broken off."""
         self._waiting: Snapshot | None = None
         self._due, self._began = math.inf, time.monotonic()
         self._chore: Callable[[], object] | None = None
@@ -122,6 +126,7 @@ class WriteBehind:
             try:
                 job()
             finally:
+                del job  # what it has written need not stay until there is another
                 with self.lock:
                     self._busy = False
                     self.lock.notify_all()

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from abcd_ns.engine.gaussians.spherical_harmonics import MAX_SH_DEGREE
 from abcd_ns.engine.render.primitive import PrimitiveName
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.capture.light import Kind as LightKind
@@ -102,6 +103,7 @@ class TrainingConfig:
         for name, fits, words in (
             ("warmup", 0 <= self.warmup < 1, "from 0 to below 1"),
             ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
+            ("sh-degree", 0 <= self.sh_degree <= MAX_SH_DEGREE, f"from 0 to {MAX_SH_DEGREE}"),
             ("influence-share", self.influence_share > 0, "above 0"),
             ("normal-consistency", self.normal_consistency >= 0, "0 or more"),
             ("window-weight", 0 <= self.window_weight < 1, "from 0 to below 1"),

@@ -138,7 +138,10 @@ class Coordinator(Trainer):
 
     def complete(self) -> None:
         """Take out what the complete run's pictures hardly miss, where options ask for it and there are
-        photos to tell. Whoever goes on from a kill in its midst does it anew, with what is left by then."""
+        photos to tell. Whoever goes on from a kill in its midst does it anew, with what is left by then. A
+        visit that is under way, as where a run goes on for no more steps, ends."""
+        if self.state.active is not None:
+            self.end_visit()
         if self.state.shed_at == self.state.step or self._last is None or not self._last.is_wanted:
             return
         self._last.take()
@@ -172,7 +175,7 @@ class Coordinator(Trainer):
         if (active := self.state.active) is not None:
             self.health.look_over()
             self.scene.make_room()
-            updates = {LIVE: self.visit.live.detached()}
+            updates = {LIVE: self.visit.live.detached().unpinned()}
             active.saved = True
             if self.visit.influence is not None:
                 self.state.influence, _ = self.visit.influence.found()

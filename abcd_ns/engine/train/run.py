@@ -11,7 +11,7 @@ from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.special_blocks import BlockName
-from abcd_ns.engine.train.capture.light import Light
+from abcd_ns.engine.train.capture.light import HeldLight, Light
 from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityControl, for_primitive
@@ -28,6 +28,7 @@ class TrainingRun:
         views: the training views; `View.index` names them.
         params, optimizers: as `param_swap` wants them. Their present content is dropped, but for the
             learning rates; that of the means is the one to decay from.
+        light: each photo's; None for what the options ask for, not found yet.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class TrainingRun:
         optimizers: Optimizers,
         *,
         device: torch.device | str = "cpu",
+        light: Light | HeldLight | None = None,
     ) -> None:
         self.config, self.budget, self.scene = config, budget, scene
         self.params, self.optimizers = params, optimizers
@@ -52,7 +54,9 @@ class TrainingRun:
         self.announce = Announcer()
         self.stopwatch = Stopwatch()
         self.state = RunState()
-        self.light = None if config.light == "none" else Light(config.light, list(self.views), self.device)
+        self.light = light
+        if light is None and config.light != "none":
+            self.light = Light(config.light, list(self.views), self.device)
         self.poses = Poses(views)
         may_act = config.heal and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)

@@ -10,6 +10,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.render import PrimitiveName
 from abcd_ns.engine.store import ParameterStore, StoreError
+from abcd_ns.engine.store.manifest import pin_names
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -182,6 +183,8 @@ def _at_checkpoint(path: Path) -> Start:
     store = path.absolute().parent.parent / STATE / STORE
     if not store.is_dir():
         raise UserError(f"{path} can be viewed but not trained further: the folder {store} is missing.")
+    if path.stem not in pin_names(store):
+        raise UserError(f"{path} can be viewed but not trained further: {store} has no such moment.")
     return _at(store, path.stem)
 
 

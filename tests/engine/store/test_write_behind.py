@@ -1,8 +1,10 @@
 """Writing beside the training: what waits, what is durable when, errors, forks, and what stays in RAM."""
 
 import os
+import sys
 import threading
 import time
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -344,3 +346,48 @@ def test_those_in_the_inbox_are_drawn_survive_a_stop_and_join(tmp_path, views, p
         train_step(again, photos)
     assert again.scene.mail(block) is None
     assert again.scene.clocks(block).visits == expected.clocks.visits + 1
+
+
+def test_what_was_written_does_not_stay_while_the_next_waits(scene):
+    disk = Disk(scene.store)
+    disk.free.clear()
+    scene._memory.limit = 1
+    block = moved(scene.state(0), 1).packed()
+    means = weakref.ref(block.tensors["means"])
+    scene.rest(scene.tree, {0: block}, {"step": 1}, within=1e-6)
+    del block
+    assert disk.asked.wait(PATIENCE)
+    scene.rest(scene.tree, {1: moved(scene.state(1), 1)}, {"step": 2}, within=PATIENCE)
+    disk.free.set()
+    deadline = time.monotonic() + PATIENCE / 2
+    while means() is not None and time.monotonic() < deadline:
+        scene.state(2)  # somebody else has the only place in RAM
+        time.sleep(0.01)
+    assert means() is None
+    assert disk.commits == [({0}, {"step": 1})]
+
+
+def test_a_picture_that_is_broken_off_leaves_no_lock_behind(scene):
+    class BrokenOffError(Exception):
+        pass
+
+    def trace(frame, event, _):
+        if frame.f_code.co_name == "__exit__" and "threading" in frame.f_code.co_filename and event == "line":
+            raise BrokenOffError
+        return trace
+
+    def draw():
+        sys.settrace(trace)
+        try:
+            scene.drawn(0, "cpu")
+        except BrokenOffError:
+            pass
+        finally:
+            sys.settrace(None)
+
+    viewer = threading.Thread(target=draw)
+    viewer.start()
+    viewer.join()
+    got = scene._writer.mutex.acquire(timeout=1.0)
+    assert got
+    scene._writer.mutex.release()
