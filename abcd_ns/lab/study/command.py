@@ -162,15 +162,14 @@ class OptionsStudy(Conditions):
             raise UserError("Give at least one change of an option with --vary NAME=VALUE.")
         pipeline, notes = registered(self.method).pipeline, []
         variants = [parse_variant(text, pipeline) for text in self.vary]
-        folders = [variant.folder for variant in variants]
+        asked = [{change.path: read_value(change, pipeline) for change in v.changes} for v in variants]
         shared = {LIMIT: self.max_gaussians}
         shared |= {} if self.method == "abcd-monolithic" else {BLOCKS: self.blocks}
-        for variant in variants:
-            if folders.count(variant.folder) > 1:
+        for variant, values in zip(variants, asked, strict=True):
+            if asked.count(values) > 1:
                 raise UserError(f"--vary {variant.name!r} is given twice.")
-            paths = [change.path for change in variant.changes]
-            usual = [shared[path] if path in shared else attrgetter(path)(pipeline) for path in paths]
-            if usual == [read_value(change, pipeline) for change in variant.changes]:
+            usual = {path: shared[path] if path in shared else attrgetter(path)(pipeline) for path in values}
+            if usual == values:
                 shows = "its difference shows how well a run repeats itself."
                 notes.append(f"{variant.name} is the default: {shows}")
         given = {"blocks": self.blocks, "max_gaussians": self.max_gaussians, "notes": notes}

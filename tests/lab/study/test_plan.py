@@ -168,6 +168,7 @@ def test_numbers_of_blocks_must_be_several_and_different(scene, blocks):
     [
         ((), "at least one change"),
         (("blocks=2", "blocks=2"), "'blocks=2' is given twice"),
+        (("training.warmup=0", "training.warmup=0.0"), "'training.warmup=0' is given twice"),
         (("blocks=0",), "blocks must be 1 or more"),
         (("training.batch=1", "training.btach=2"), "no option 'training.btach'"),
         (("model.num_downscales=1",), "has no effect here"),
