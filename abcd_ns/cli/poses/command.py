@@ -71,7 +71,7 @@ def poses(
         print_plain(line, console)
     one_lens = not several_lenses and len(sizes) == 1
     if not several_lenses and not one_lens:
-        console.print(f"Photos of {len(sizes)} sizes: those of one size have a lens of their own.")
+        console.print(f"Photos of {len(sizes)} sizes: taken for those of several lenses.")
     if order == "any" and len(names) > MANY:
         console.print(f"{len(names)} photos: comparing each with each takes long; is it --order video?")
     task = Task(photos, names, data / WORK, lens, one_lens, order, seed)
