@@ -12,7 +12,7 @@ from abcd_ns.engine.gaussians.param_swap import Pace, live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitLayers
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import RESERVE
-from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST, Use, gradients_of
+from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, Use, gradients_of
 from abcd_ns.engine.train.density.shedding import PASSES, weighed
 from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
@@ -183,7 +183,7 @@ class VisitTraining:
         run = self.run
         if run.light is None:
             return
-        damping = exponential_decay(run.progress, LAST)
+        damping = exponential_decay(run.progress, LAST_RATE)
         share = 1.0 if run.active.is_alone else AMONG_OTHERS
         run.light.step(gradients_of(rendered.lights), share * damping)
 

@@ -32,7 +32,7 @@ from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run import STORE
 
-WHOLE = "abcd-monolithic"
+AS_ONE = "abcd-monolithic"
 WHOLE_STEPS = 12
 """Enough for Adam's moments and the drawing of the largest view to be there."""
 
@@ -120,7 +120,7 @@ def run(job: LandJob, folder: Path) -> Run:
 
 def make_scene(job: LandJob, land: Land, folder: Path) -> StoredScene:
     """The land at rest: tile by tile, or all tiles as one block, which takes the RAM that it takes."""
-    whole = job.method == WHOLE
+    whole = job.method == AS_ONE
     tree = build_kd(torch.zeros(0, 3), 1) if whole else land.tree()
     store = ParameterStore.create(folder, {"tree": tree.to_json()})
     if whole:

@@ -25,7 +25,7 @@ RATE, SETTLES = 0.05, 10.0
 """Adam's at a view's first use, and the uses after which it is halved: it falls as in an average."""
 GRID_RATE = 0.005
 """Of a grid, at first: it has cells enough to take over what is the scene's."""
-LAST = 0.03
+LAST_RATE = 0.03
 """Share of it that is left at the end of the run."""
 BETAS = (0.9, 0.999)
 AMONG_OTHERS = 0.5

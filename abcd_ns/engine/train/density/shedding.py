@@ -24,7 +24,7 @@ WEIGHED = ("weight", "passes")
 trained on; a drawing of one of n views is 1/n of a pass. So sums stay right when others are used: all of a
 scene's in the warm-up, and then those that show its block. A reduced picture's pixel counts as one, though
 the price is in the photo's: so little grows before pictures are large enough to tell."""
-WHOLE = 0.999
+FULL_PASS = 0.999
 """Of a pass, in sums that are rounded."""
 LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
@@ -86,7 +86,7 @@ def fills(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
         growth: with WEIGHED.
     """
     weight, passes = (growth[name] for name in WEIGHED)
-    return torch.where(passes >= WHOLE, weight / passes, torch.nan)
+    return torch.where(passes >= FULL_PASS, weight / passes, torch.nan)
 
 
 def may_grow(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
@@ -98,7 +98,7 @@ def may_grow(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
 
 def faded(growth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n"]]:
     """The statistics when all have been judged: what is seen from now on soon counts for more."""
-    half = torch.where(growth["passes"] >= WHOLE, 0.5, 1.0)
+    half = torch.where(growth["passes"] >= FULL_PASS, 0.5, 1.0)
     return {name: value * half if name in WEIGHED else value for name, value in growth.items()}
 
 
