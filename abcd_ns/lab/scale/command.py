@@ -17,7 +17,7 @@ from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.runs import experiment
 from abcd_ns.lab.runs.checks import Flag, Number, Numbers, check_ranges
 from abcd_ns.lab.scale.charts import draw_scale
-from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings
+from abcd_ns.lab.scale.worker import AS_ONE, LandJob, LandSettings
 from abcd_ns.units import MIB, bytes_in_words
 
 BYTES_PER_GAUSSIAN = 3 * 59 * 4
@@ -80,7 +80,7 @@ def make_plan(
     out: Path, settings: LandSettings, by_blocks: Sequence[int], whole: Sequence[int], seed: int
 ) -> Plan:
     """Measurements of lands of so many tiles, by blocks, and then as one block."""
-    sizes = [("abcd", by_blocks), (WHOLE, whole)]
+    sizes = [("abcd", by_blocks), (AS_ONE, whole)]
     jobs = tuple(
         LandJob(method, seed, settings, Variant((Change("tiles", str(count)),)))
         for method, counts in sizes
@@ -96,8 +96,8 @@ def make_plan(
 
 def too_large(job: LandJob, outcome: Run | Failure | None) -> LeftOut | None:
     """Larger scenes are not tried as one block where a smaller one was too large for the GPU."""
-    if job.method == WHOLE and isinstance(outcome, Failure) and OUT_OF_MEMORY.search(outcome.reason):
-        return LeftOut(WHOLE, f"as one block, {job.tiles} tiles ran out of GPU memory")
+    if job.method == AS_ONE and isinstance(outcome, Failure) and OUT_OF_MEMORY.search(outcome.reason):
+        return LeftOut(AS_ONE, f"as one block, {job.tiles} tiles ran out of GPU memory")
     return None
 
 
