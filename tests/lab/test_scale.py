@@ -15,7 +15,7 @@ from abcd_ns.lab.results.run import Failure, Footing, Run
 from abcd_ns.lab.results.tables import notes, rows, write_table
 from abcd_ns.lab.scale.charts import draw_scale
 from abcd_ns.lab.scale.command import make_plan, scale
-from abcd_ns.lab.scale.worker import WHOLE, LandJob, LandSettings, run
+from abcd_ns.lab.scale.worker import AS_ONE, LandJob, LandSettings, run
 from abcd_ns.lab.world.land import Land, color_of
 from tests.lab.compare.records import made_up, made_up_run, read_results
 from tests.lab.in_process import jobs_in_this_process
@@ -81,23 +81,23 @@ def test_cameras_see_their_own_tile():
         assert 0 < pixel[1] < view.height
 
 
-@pytest.mark.parametrize("method", ["abcd", WHOLE])
+@pytest.mark.parametrize("method", ["abcd", AS_ONE])
 def test_a_measurement_trains_and_says_what_it_took(tmp_path, method):
     jobs = make_plan(tmp_path, LandSettings(300, 1, MIB), [2], [2], 0).jobs
     job = next(job for job in jobs if job.method == method)
     assert decode(LandJob, encode(job), "here") == job
     found = run(job, tmp_path)
-    assert (found.gaussians, found.blocks) == (600, 1 if method == WHOLE else 2)
+    assert (found.gaussians, found.blocks) == (600, 1 if method == AS_ONE else 2)
     assert found.peak_rss_bytes >= found.memory.base_rss_bytes > 0
     assert found.store_bytes >= 600 * 3 * 14 * 4  # with moments; harmonics as far as there are any
     assert found.steps > 0
     assert found.psnr > 10
-    assert (found.memory.visit_seconds is None) == (method == WHOLE)
+    assert (found.memory.visit_seconds is None) == (method == AS_ONE)
     assert decode(Run, encode(found), "here") == found
 
 
 def made_up_land(tiles: int, peak: int, method: str = "abcd", device: int | None = None) -> Arm:
-    visit = None if method == WHOLE else 2.0
+    visit = None if method == AS_ONE else 2.0
     footing = Footing(400 * MIB, 1.0, 1.0, visit, visit)
     fields = {"gaussians": tiles * 1000, "peak_rss_bytes": peak * MIB, "peak_device_bytes": device}
     found = made_up_run(method, **fields)
@@ -110,7 +110,7 @@ def results_of(*arms: Arm) -> Results:
 
 
 def test_growth_is_from_the_smallest_to_the_largest():
-    arms = [made_up_land(2, 500), made_up_land(4, 900), made_up_land(8, 520), made_up_land(8, 9000, WHOLE)]
+    arms = [made_up_land(2, 500), made_up_land(4, 900), made_up_land(8, 520), made_up_land(8, 9000, AS_ONE)]
     results = results_of(*arms)
     assert find_growth(results, "peak_rss_bytes") == pytest.approx(0.04)
     assert find_growth(results, "peak_device_bytes") is None
@@ -121,7 +121,7 @@ def test_growth_is_from_the_smallest_to_the_largest():
 
 
 def test_results_are_written_in_words_and_drawn(tmp_path):
-    sizes = ((2, 500, "abcd"), (8, 520, "abcd"), (2, 450, WHOLE), (8, 900, WHOLE))
+    sizes = ((2, 500, "abcd"), (8, 520, "abcd"), (2, 450, AS_ONE), (8, 900, AS_ONE))
     results = results_of(*(made_up_land(*size) for size in sizes))
     write_table(results, tmp_path / "table.md")
     text = (tmp_path / "table.md").read_text()
@@ -166,14 +166,14 @@ def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are
     def made_up_end(job: LandJob, *_) -> Run | Failure:
         tried.append((job.tiles, job.method))
         assert job.settings.device_limit_bytes == 512 * MIB
-        if job.method == WHOLE and job.tiles > 2:
+        if job.method == AS_ONE and job.tiles > 2:
             reason = "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
             return Failure(job.method, job.seed, reason, "log.txt")
         return made_up_land(job.tiles, 500, job.method, device=100).runs[0]
 
     monkeypatch.setattr("abcd_ns.lab.runs.experiment.finish_job", made_up_end)
     assert scale(tmp_path, blocks=(2, 4, 8), gaussians=10, device_limit_mb=512) == 0
-    assert tried == [(2, "abcd"), (4, "abcd"), (8, "abcd"), (2, WHOLE), (4, WHOLE)]
+    assert tried == [(2, "abcd"), (4, "abcd"), (8, "abcd"), (2, AS_ONE), (4, AS_ONE)]
     found = read_results(tmp_path / "results.json")
     assert (found.failures, len(found.arms)) == ((), 4)
     assert "as one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
@@ -185,7 +185,7 @@ def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
     first = read_json(out / "results.json")
-    assert [(arm["method"], arm["value"]) for arm in first["arms"]] == [("abcd", 2), ("abcd", 4), (WHOLE, 2)]
+    assert [(arm["method"], arm["value"]) for arm in first["arms"]] == [("abcd", 2), ("abcd", 4), (AS_ONE, 2)]
     assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
     assert read_json(out / "results.json")["arms"] == first["arms"]
     assert not list(out.glob("runs/*/*/store"))
