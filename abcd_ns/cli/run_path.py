@@ -7,7 +7,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import STATE
 
 
-def find_run(path: Path, holds: str) -> Path:
+def find_run(path: Path, *holds: str) -> Path:
     """The folder of a run that is named by it or by its config.yml.
 
     Args:
@@ -17,15 +17,16 @@ def find_run(path: Path, holds: str) -> Path:
         UserError: there is none; the message says what to give.
     """
     path = path.parent if path.name == "config.yml" else path
-    if not (path / STATE / holds).exists():
-        raise UserError(one_line(f"{path} is no run with {STATE}/{holds}: {_hint(path, holds)}"))
+    for name in holds:
+        if not (path / STATE / name).exists():
+            raise UserError(one_line(f"{path} is no run with {STATE}/{name}: {_hint(path, name)}"))
     return path
 
 
-def _hint(path: Path, holds: str) -> str:
+def _hint(path: Path, name: str) -> str:
     if not path.is_dir():
         return "there is no such folder."
-    below = sorted(path.glob(f"**/{STATE}/{holds}"), key=lambda found: found.stat().st_mtime)
+    below = sorted(path.glob(f"**/{STATE}/{name}"), key=lambda found: found.stat().st_mtime)
     if below:
         return f"did you mean {below[-1].parent.parent}?"
     return "give a folder outputs/SCENE/METHOD/TIME that this version of `ns-train abcd` wrote."

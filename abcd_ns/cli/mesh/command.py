@@ -80,7 +80,7 @@ def mesh(
             surface, or `out` exists or cannot be written.
     """
     _check(out, voxel, box)
-    run = find_run(find_run(run, SETTINGS_FILE), STORE)
+    run = find_run(run, SETTINGS_FILE, STORE)
     to = to_data(run) if frame == "data" else STAY
     wanted = Wanted(out, voxel and voxel / to.scale, box, to, depth == "median")
     with stored(run, out) as store:
