@@ -27,7 +27,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
-from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
+from abcd_ns.engine.layers.survey import VisitGeometry, survey
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_interval

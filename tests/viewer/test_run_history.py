@@ -5,7 +5,7 @@ import math
 import pytest
 
 from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded, WorkerSeen
-from abcd_ns.engine.layers.visit_layers import VisitGeometry
+from abcd_ns.engine.layers.survey import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState

@@ -1,12 +1,11 @@
-"""One visit: what a block looks like to its views, and the frozen layers around it."""
+"""The frozen layers around a block, for the views of one visit."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from torch import Tensor
 
-from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.layers.layer_store import Kept, LayerStore, packed, rounded, unpacked
 from abcd_ns.engine.layers.painter import (
     BYTES_PER_PIXEL,
@@ -17,42 +16,11 @@ from abcd_ns.engine.layers.painter import (
     PaintSettings,
     Seen,
 )
-from abcd_ns.engine.render import Rasterizer, ZWindow
+from abcd_ns.engine.layers.survey import VisitGeometry
+from abcd_ns.engine.render import ZWindow
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.together import runs
-from abcd_ns.engine.space.visibility import footprint
-from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
-
-CROP_MARGIN = SSIM_WINDOW - 1
-"""Pixels added to a footprint, so that every SSIM window that sees the block lies in the crop."""
-CROP_ALIGN = 16
-"""Crops begin and end on multiples of so many pixels, or at the image's edge."""
-
-
-@dataclass(frozen=True)
-class VisitGeometry:
-    """What is decided once, when a visit begins, and must be the same after a resume."""
-
-    block: BlockName
-    crops: dict[int, Crop]
-    """By view index, the pixels to train on; views that do not see the block are missing."""
-
-    @property
-    def views(self) -> tuple[int, ...]:
-        """Indices of the views that see the block."""
-        return tuple(sorted(self.crops))
-
-
-def survey(gaussians: Gaussians, block: int, views: Iterable[View], rasterizer: Rasterizer) -> VisitGeometry:
-    """Which views see the block's Gaussians, and where in the image."""
-    views = tuple(views)
-    extents = rasterizer.extents(gaussians, views).tolist() if views else []
-    crops = {
-        view.index: footprint(extent, view, margin=CROP_MARGIN, align=CROP_ALIGN)
-        for view, extent in zip(views, extents, strict=True)
-    }
-    return VisitGeometry(block, {view: crop for view, crop in crops.items() if crop is not None})
 
 
 class VisitLayers:

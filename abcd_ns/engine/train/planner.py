@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Params, live_gaussians
-from abcd_ns.engine.layers.visit_layers import VisitGeometry, survey
+from abcd_ns.engine.layers.survey import VisitGeometry, survey
 from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import overlap, worth_training
 from abcd_ns.engine.store.settle import has_scaffold
@@ -154,7 +154,8 @@ class Planner(Visits):
         chosen = visit_views(showing, used, earlier, seed)
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
         # Of thousands of views, only those that it uses are asked where they see the block.
-        found = self._survey(block, {view: views[view] for view in (*chosen, *doubted)})
+        asked = {view: views[view] for view in (*chosen, *doubted)}
+        found = self._survey(block, asked, self._config.influence_share)
         chosen, doubted = (tuple(v for v in some if v in found.crops) for some in (chosen, doubted))
         if not chosen:
             return None
@@ -257,8 +258,8 @@ class Planner(Visits):
         (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
         return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
 
-    def _survey(self, block: int, views: Mapping[int, View]) -> VisitGeometry:
+    def _survey(self, block: int, views: Mapping[int, View], share: float = 1.0) -> VisitGeometry:
         if not views:
             return VisitGeometry(block, {})
         gaussians = self._scene.gaussians_at_rest(block).to(self._run.device)
-        return survey(gaussians, block, views.values(), self._run.rasterizer)
+        return survey(gaussians, block, views.values(), self._run.rasterizer, share)

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from abcd_ns.engine.layers.visit_layers import VisitGeometry
+from abcd_ns.engine.layers.survey import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
 from abcd_ns.engine.store.special_blocks import WHOLE, from_text
 from abcd_ns.engine.train.health_record import BlockHealth, Ledger

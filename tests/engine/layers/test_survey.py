@@ -1,0 +1,89 @@
+"""Where a block is in its views' images: all of it, or what holds most of its weight."""
+
+from dataclasses import replace
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.layers.survey import CROP_MARGIN, extent_of_most, survey
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.types import Gaussians
+from tests.engine.space.test_tree import SEEDS
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+DRAW = TorchRasterizer()
+
+
+@given(SEEDS, st.integers(1, 12), st.integers(1, 9), st.floats(0.0, 1.0))
+def test_beyond_each_side_lies_a_quarter_of_what_may_be_missed_and_one_step_more_is_too_much(
+    seed, width, height, share
+):
+    generator = torch.Generator().manual_seed(seed)
+    weight = torch.rand(height, width, generator=generator, dtype=torch.float64) ** 4
+    spared = (1 - share) / 4 * float(weight.sum())
+    left, top, right, bottom = map(int, extent_of_most(weight, share).tolist())
+    beyond = (weight[:, :left], weight[:top], weight[:, right:], weight[bottom:])
+    more = (weight[:, : left + 1], weight[: top + 1], weight[:, right - 1 :], weight[bottom - 1 :])
+    for missed, next_ones in zip(beyond, more, strict=True):
+        assert float(missed.sum()) <= spared + 1e-12
+        assert float(next_ones.sum()) > spared - 1e-12
+    if share > 0.5:
+        assert float(weight[top:bottom, left:right].sum()) >= share * float(weight.sum()) - 1e-12
+
+
+def test_where_nothing_weighs_anything_there_is_no_extent():
+    left, _, right, _ = extent_of_most(torch.zeros(4, 5), 0.99).tolist()
+    assert left > right
+
+
+def cluster_and_veil(opacity: float) -> Gaussians:
+    """Some Gaussians in the middle, and a wide one."""
+    cluster, veil = random_gaussians(60, seed=1, size=0.05), random_gaussians(1, size=1.0)
+    cluster.means[:] *= 0.2
+    veil.opacities[:] = torch.logit(torch.tensor(opacity))
+    return Gaussians.cat([cluster, veil])
+
+
+def test_a_faint_and_wide_one_does_not_make_the_crop_the_image():
+    views = ring_of_views(3, width=320, height=240)
+    block = cluster_and_veil(opacity=0.005)
+    whole, most = (survey(block, 0, views, DRAW, share).crops for share in (1.0, 0.9))
+    for view in views:
+        shown = 1 - DRAW(block, view, sh_degree=0).transmittance
+        held = float(shown[most[view.index].slices].sum())
+        assert whole[view.index] == view.full
+        assert most[view.index].pixels < 0.5 * view.full.pixels
+        assert held >= 0.9 * float(shown.sum())
+
+
+def test_a_crop_that_holds_most_lies_in_the_one_that_holds_all():
+    views = ring_of_views(4, width=200, height=150)
+    block = random_gaussians(40, seed=3, size=0.1)
+    block.means[:] *= 0.4
+    whole, most = (survey(block, 0, views, DRAW, share).crops for share in (1.0, 0.995))
+    assert most.keys() == whole.keys()
+    for view, crop in most.items():
+        within, around = crop.slices, whole[view].slices
+        for inner, outer in zip(within, around, strict=True):
+            assert outer.start <= inner.start
+            assert inner.stop <= outer.stop
+
+
+def test_what_no_small_picture_shows_keeps_all_that_it_may_touch():
+    """A view that sees a block is not lost, however faint the block is there."""
+    views = ring_of_views(2, width=160, height=120)
+    block = random_gaussians(5, size=0.2)
+    faint = replace(block, opacities=torch.full_like(block.opacities, -30.0))
+    assert survey(faint, 0, views, DRAW, 0.995) == survey(faint, 0, views, DRAW)
+
+
+def test_crops_have_room_for_the_windows_of_ssim():
+    (view,) = ring_of_views(1, width=320, height=240)
+    block = random_gaussians(60, seed=1, size=0.02)
+    block.means[:] *= 0.1
+    shown = (1 - DRAW(block, view, sh_degree=0).transmittance) > 1e-3
+    rows, columns = torch.where(shown)
+    crop = survey(block, 0, [view], DRAW, 0.999).crops[view.index]
+    assert crop.x <= int(columns.float().quantile(0.01)) - CROP_MARGIN
+    assert crop.y <= int(rows.float().quantile(0.01)) - CROP_MARGIN
