@@ -34,6 +34,8 @@ class Primitive:
     """The first of two such rows that say where on screen the middle is; its gradient asks for growth."""
     has_absgrad: bool
     """Whether that gradient's absolute values by pixel are summed, too."""
+    axes: int
+    """Along which it extends: those of its scales that are drawn."""
     blur_pixels: float
     """How far from its middle a point may be drawn, px."""
 
@@ -57,6 +59,7 @@ SPLATS = Primitive(
     graded=splat_kernels.GRADED,
     center=splat_kernels.X,
     has_absgrad=True,
+    axes=3,
     blur_pixels=DRAWN_SIGMAS * math.sqrt(splat_kernels.EPS_2D),
 )
 SURFELS = Primitive(
@@ -68,6 +71,7 @@ SURFELS = Primitive(
     graded=surfel_kernels.GRADED,
     center=surfel_kernels.U,
     has_absgrad=False,
+    axes=2,
     blur_pixels=DRAWN_SIGMAS * math.sqrt(0.5),
 )
 PRIMITIVES: dict[PrimitiveName, Primitive] = {each.name: each for each in (SPLATS, SURFELS)}

@@ -39,7 +39,8 @@ class TrainingConfig:
     warm-up, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
-    the pictures; others hardly show it. Known from the warm-up; 1 takes all views that see the block."""
+    the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this
+    share of what it weighs there alone. 1 takes all views and pixels that it may touch."""
     coarse: float = 0.2
     """Share of the run that is trained on reduced pictures: its first half at a quarter of their width, then
     at a half, where no side is below 100 pixels then. 0 for none."""

@@ -14,7 +14,7 @@ from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.train.capture.light import HeldLight, Light
 from abcd_ns.engine.train.capture.poses import Poses
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.control import DensityControl, for_primitive
+from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.run_state import ActiveVisit, Budget, RunState, Stopwatch
 from abcd_ns.engine.train.schedule import reduction_at, sh_degree_at
@@ -60,7 +60,7 @@ class TrainingRun:
         self.poses = Poses(views)
         may_act = config.heal and config.recipe.layers
         self.health = Health(scene, params, optimizers, self.announce, may_act=may_act)
-        self.density = DensityControl(for_primitive(config.density, rasterizer.primitive))
+        self.density = DensityControl(config.density, rasterizer.primitive)
 
     def views_at(self, reduction: int) -> dict[int, View]:
         """The training views by index, their pictures reduced."""

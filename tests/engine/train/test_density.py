@@ -1,4 +1,4 @@
-"""Growing and pruning: gsplat's strategies on a block's own clock."""
+"""Growing and pruning, on a block's own clock."""
 
 import math
 
@@ -40,7 +40,7 @@ def clock(**changes) -> DensityClock:
     )
 
 
-def test_the_default_strategy_clones_where_gradients_are_high():
+def test_the_default_strategy_makes_two_where_gradients_are_high():
     params, optimizers = live(random_gaussians(8, size=0.001))
     control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
     growth = control.after_step(params, optimizers, {}, (fake_info(8, gradient=1.0),), clock())
@@ -60,8 +60,7 @@ def test_the_wide_are_split_whatever_their_gradients_and_the_scenes_units_say(si
     control.after_step(params, optimizers, {}, infos, clock(room=room), wide)
     assert len(params["means"]) == 8 + split
     assert torch.equal(params["scales"][: 8 - split], before[split:])  # the others, as they were
-    halves = params["scales"][8 - split :].view(2, split, 3)
-    assert torch.allclose(halves, (before[:split] - math.log(1.6)).expand(2, split, 3))
+    assert torch.all(params["scales"][8 - split :].view(2, split, 3) <= before[:split])
 
 
 def test_wide_is_what_covers_a_twentieth_of_the_nearest_cameras_picture():

@@ -1,8 +1,8 @@
-"""Growing and pruning the active block, by gsplat's own strategies on the block's own clock.
+"""Growing and pruning the active block, on the block's own clock.
 
-gsplat's strategies keep a schedule in absolute steps of one global run. Here the schedule is in shares of
-the run and in the block's own steps, so it is kept in this file and the strategies are told, through the
-step number they are given, either to gather statistics or to refine now.
+The default strategy is 3DGS's, judged by AbsGS's gradients, but for how one Gaussian becomes two (see
+`growing`); MCMC is gsplat's own. gsplat's strategies keep a schedule in absolute steps of one global run.
+Here the schedule is in shares of the run and in the block's own steps, so it is kept in this file.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,15 +12,16 @@ from functools import reduce
 from typing import Any, Literal
 
 import torch
-from gsplat.strategy import DefaultStrategy, MCMCStrategy
+from gsplat.strategy import MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
 from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
-from abcd_ns.engine.render.primitive import Primitive
+from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.clock import DensityClock
+from abcd_ns.engine.train.density.growing import chosen, halve
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
 from abcd_ns.engine.train.density.shedding import (
     FAINT,
@@ -34,9 +35,8 @@ from abcd_ns.engine.train.density.shedding import (
     weigh,
 )
 
-# Step numbers as gsplat sees them. It refines on multiples of REFINE; it resets opacities on multiples of
-# NEVER and prunes by size in scene units, which takes backgrounds, after it.
-GATHER, REFINE, NEVER = 1, 6, 7
+GATHER, REFINE = 1, 6
+"""Step numbers as gsplat's MCMC sees them; it refines on multiples of the second."""
 
 GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
@@ -45,8 +45,6 @@ REFINE_UNTIL, RESET_UNTIL = 0.5, 0.4
 WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
 """A warm-up is refined whenever this share has been drawn of the views that the run would draw at its pace,
 or so many views if these are more: also a short one is to fill its room."""
-SPLIT_SCALE = 0.01
-"""Standard deviation, in scene units, under which a Gaussian is cloned rather than split."""
 PLAIN_GRADIENT = 0.25
 """Thresholds of gradients, as a share of those of absolute ones: 0.0002 (3DGS, 2DGS) of 0.0008 (AbsGS)."""
 MCMC_MIN_OPACITY = 0.005
@@ -112,8 +110,8 @@ def for_primitive(config: DensityConfig, primitive: Primitive) -> DensityConfig:
 class DensityControl:
     """Applies the configured strategy to the live block."""
 
-    def __init__(self, config: DensityConfig) -> None:
-        self.config = config
+    def __init__(self, config: DensityConfig, primitive: Primitive = SPLATS) -> None:
+        self.config, self._axes = for_primitive(config, primitive), primitive.axes
         self._binomials = binomials()
 
     @property
@@ -272,29 +270,20 @@ class DensityControl:
         wide: Bool[Tensor, "n"] | None,
     ) -> dict[str, Tensor]:
         config = self.config
-        strategy = DefaultStrategy(
-            prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=SPLIT_SCALE,
-            refine_start_iter=0,
-            refine_every=REFINE,
-            reset_every=NEVER,
-            absgrad=config.use_absgrad,
-        )
-        state: dict[str, Any] = {"scene_scale": 1.0, **growth}
         if self.refines(clock, infos):
-            grows, room = may_grow(growth, config.price), clock.room
-            growth = {**growth, "grad2d": torch.where(grows, growth["grad2d"], 0.0)}
+            gradients = growth["grad2d"] / growth["count"].clamp_min(1)
+            wanted = torch.where(gradients > config.densify_grad_thresh, gradients, 0.0)
             if wide is not None:
-                growth, room = _split(params, optimizers, growth, wide & grows, room)
-            state |= growth
-            strategy.grow_grad2d = _threshold_within(growth, config.densify_grad_thresh, room)
-            # Nothing is visible in this info, so the statistics are not gathered twice.
-            unseen = {**infos[0], "radii": torch.zeros_like(infos[0]["radii"])}
-            strategy.step_post_backward(params, optimizers, state, REFINE, unseen)
+                wanted = torch.where(wide, torch.inf, wanted)
+            which = chosen(torch.where(may_grow(growth, config.price), wanted, 0.0), clock.room)
+            growth = halve(params, optimizers, growth, which, self._axes)
+            growth |= {name: torch.zeros_like(growth[name]) for name in GRADIENTS}
+            faint = torch.sigmoid(params["opacities"][:, 0]) < config.cull_alpha_thresh
+            if bool(faint.any()):
+                gsplat_ops.remove(params, optimizers, growth, faint)
         if self.resets(clock):
-            gsplat_ops.reset_opa(params, optimizers, state, value=2 * config.cull_alpha_thresh)
-        return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+            gsplat_ops.reset_opa(params, optimizers, {}, value=2 * config.cull_alpha_thresh)
+        return growth
 
     def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:
         room = len(params["means"]) if clock.room is None else clock.room
@@ -323,35 +312,6 @@ def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str,
     """Statistics of more drawings added to a block's."""
     sums = {name: growth[name] + value if name in growth else value for name, value in more.items()}
     return {**growth, **sums}
-
-
-def _split(
-    params: Params,
-    optimizers: Optimizers,
-    growth: dict[str, Tensor],
-    which: Bool[Tensor, "n"],
-    room: int | None,
-) -> tuple[dict[str, Tensor], int | None]:
-    """Make two smaller ones of each, as far as there is room; and what is left of it.
-
-    gsplat would clone those that are small in scene units, as what is near to a camera is: as wide as before.
-    """
-    if room is not None:
-        which = which & (which.cumsum(0) <= room)
-    before = len(which)
-    growth = {**growth, "grad2d": torch.where(which, 0.0, growth["grad2d"])}  # once is enough
-    if bool(which.any()):
-        gsplat_ops.split(params, optimizers, growth, which)
-    return growth, room if room is None else room - (len(params["means"]) - before)
-
-
-def _threshold_within(growth: dict[str, Tensor], threshold: float, room: int | None) -> float:
-    """The gradient over which to grow, such that no more than `room` Gaussians are added."""
-    gradients = growth["grad2d"] / growth["count"].clamp_min(1)
-    if room is None or int((gradients > threshold).sum()) <= room:
-        return threshold
-    # gsplat grows where gradient > threshold, so the (room + 1)-th largest is the first that must not.
-    return float(gradients.sort(descending=True).values[max(room, 0)])
 
 
 @contextmanager

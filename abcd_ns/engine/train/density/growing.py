@@ -1,0 +1,74 @@
+"""Growing: where views ask for more, one Gaussian becomes two, side by side along its longest axis.
+
+3DGS (Kerbl et al., 2023) puts a copy onto a small one, whose picture is then as of two, and draws at random
+where the halves of a large one go: either upsets the picture, for tens of steps. Two that have together the
+mass, the middle and the variance of the one change it as little as two can. That the longest axis is the one
+to cut is the finding of Deng et al. (2025, arXiv:2508.12313), whose halves lie further apart.
+"""
+
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F
+from gsplat.strategy import ops as gsplat_ops
+from gsplat.utils import normalized_quat_to_rotmat
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
+
+APART, NARROWED = 0.8, 0.6
+"""Of the standard deviation of the one along its axis: how far from its middle the two lie, and their own.
+The squares add up to 1, so that the variance of both together is that of the one."""
+
+
+def chosen(wanted: Float[Tensor, "n"], room: int | None) -> Bool[Tensor, "n"]:
+    """Which are to become two: all that want to, or as many of those that want to most as there is room for.
+
+    Args:
+        wanted: how much each wants to; 0 for not at all.
+    """
+    which = wanted > 0
+    if room is None or int(which.sum()) <= room:
+        return which
+    most = torch.zeros_like(which)
+    most[wanted.topk(max(room, 0)).indices] = True
+    return most & which
+
+
+@torch.no_grad()
+def halve(
+    params: Params,
+    optimizers: Optimizers,
+    growth: Mapping[str, Tensor],
+    which: Bool[Tensor, "n"],
+    axes: int,
+) -> dict[str, Tensor]:
+    """Make two of each. The others come first, in their order, then one half of each, then the other; their
+    moments begin anew.
+
+    Args:
+        growth: statistics by name, [n] each.
+        axes: along which Gaussians extend, the first of three: a surfel's third scale is nothing.
+
+    Returns:
+        The statistics; both halves inherit them.
+    """
+    found = dict(growth)
+    if not bool(which.any()):
+        return found
+    means, opacities = params["means"][which], torch.sigmoid(params["opacities"][which])
+    scales = torch.exp(params["scales"][which])
+    longest = scales[:, :axes].argmax(dim=1, keepdim=True)
+    along = torch.zeros_like(scales).scatter_(1, longest, scales.gather(1, longest))
+    turned = normalized_quat_to_rotmat(F.normalize(params["quats"][which], dim=1))
+    offset = APART * torch.einsum("nij,nj->ni", turned, along)
+    narrow = scales.scatter(1, longest, NARROWED * scales.gather(1, longest))
+    # Its own halves, drawn at random, are overwritten: the rows of parameters, moments and statistics stay.
+    gsplat_ops.split(params, optimizers, found, which)
+    both = slice(-2 * len(means), None)
+    params["means"][both] = torch.cat((means + offset, means - offset))
+    params["scales"][both] = narrow.log().repeat(2, 1)
+    # As much mass in all: 2 a' NARROWED = a.
+    params["opacities"][both] = torch.logit(opacities / (2 * NARROWED)).repeat(2, 1)
+    return found

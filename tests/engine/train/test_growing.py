@@ -1,0 +1,116 @@
+"""One Gaussian becomes two that look as it did, as nearly as two can."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from gsplat.utils import normalized_quat_to_rotmat
+from hypothesis import given
+from hypothesis import strategies as st
+
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.train.density.growing import chosen, halve
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians
+from tests.engine.space.test_tree import SEEDS
+from tests.reference.scenes import random_gaussians, ring_of_views
+
+
+def halved(gaussians: Gaussians, which, axes: int = 3, growth=None):
+    """The Gaussians afterwards, and their statistics."""
+    params, optimizers = nothing_live(gaussians.sh_degree)
+    attach(BlockState.fresh(gaussians), params, optimizers)
+    found = halve(params, optimizers, growth or {}, torch.as_tensor(which), axes)
+    for name in PARAM_NAMES:
+        (held,) = optimizers[name].param_groups[0]["params"]
+        assert held is params[name]
+        assert len(optimizers[name].state[held]["exp_avg"]) == len(held)
+    return live_gaussians(params).detach(), found
+
+
+def covariance(gaussians: Gaussians):
+    turned = normalized_quat_to_rotmat(torch.nn.functional.normalize(gaussians.quats, dim=1))
+    axes = turned * gaussians.scales.exp()[:, None]
+    return axes @ axes.transpose(1, 2)
+
+
+def mass(gaussians: Gaussians):
+    return torch.sigmoid(gaussians.opacities[:, 0]) * gaussians.scales.exp().prod(dim=1)
+
+
+@given(SEEDS, st.integers(1, 9))
+def test_two_have_the_mass_the_middle_and_the_variance_of_the_one(seed, count):
+    before = random_gaussians(count, seed=seed)
+    after, _ = halved(before, [True] * count)
+    first, second = after[:count], after[count:]
+    assert torch.allclose(mass(first) + mass(second), mass(before), rtol=1e-4)
+    assert torch.allclose((first.means + second.means) / 2, before.means, atol=1e-6)
+    apart = (first.means - second.means) / 2
+    both = covariance(first) + apart[:, :, None] * apart[:, None]
+    assert torch.allclose(both, covariance(before), rtol=1e-3, atol=1e-6)
+    for name in ("quats", "features_dc", "features_rest"):
+        assert torch.equal(getattr(first, name), getattr(before, name))
+
+
+@given(SEEDS)
+def test_they_lie_along_the_longest_axis_that_is_drawn(seed):
+    before = random_gaussians(6, seed=seed)
+    before.scales[:, 2] = 3.0  # a surfel's third is nothing
+    after, _ = halved(before, [True] * 6, axes=2)
+    axis = before.scales[:, :2].argmax(dim=1)
+    turned = normalized_quat_to_rotmat(torch.nn.functional.normalize(before.quats, dim=1))
+    apart = torch.nn.functional.normalize(after.means[:6] - before.means, dim=1)
+    along = turned[torch.arange(6), :, axis]
+    assert torch.allclose((apart * along).sum(dim=1), torch.ones(6), atol=1e-4)
+    assert torch.equal(after.scales[:, 2], before.scales[:, 2].repeat(2))
+
+
+def test_the_others_and_their_statistics_stay_and_the_halves_inherit():
+    before = random_gaussians(5, seed=2)
+    growth = {"weight": torch.arange(5.0)}
+    after, found = halved(before, [False, True, False, True, False], growth=growth)
+    for name in PARAM_NAMES:
+        assert torch.equal(getattr(after, name)[:3], getattr(before, name)[[0, 2, 4]])
+    assert found["weight"].tolist() == [0, 2, 4, 1, 3, 1, 3]
+    assert growth["weight"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_nobody_is_halved_where_none_is_to_be():
+    before = random_gaussians(5)
+    after, found = halved(before, [False] * 5, growth={"weight": torch.ones(5)})
+    assert all(torch.equal(getattr(after, name), getattr(before, name)) for name in PARAM_NAMES)
+    assert found["weight"].tolist() == [1.0] * 5
+
+
+def test_a_picture_changes_less_than_by_copies_or_by_halves_drawn_at_random():
+    """What 3DGS does to small ones, and to large ones."""
+    draw, views = TorchRasterizer(), ring_of_views(3, width=80, height=60)
+    before = random_gaussians(12, seed=3, size=0.12)
+    after, _ = halved(before, [True] * 12)
+    copies = Gaussians.cat([before, before])
+    drawn = torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(0)) * before.scales.exp()
+    turned = normalized_quat_to_rotmat(torch.nn.functional.normalize(before.quats, dim=1))
+    moved = (before.means + torch.einsum("nij,bnj->bni", turned, drawn)).flatten(0, 1)
+    at_random = replace(copies, means=moved, scales=copies.scales - math.log(1.6))
+
+    def error(changed: Gaussians) -> float:
+        pairs = ((draw(g, view, sh_degree=0).color for g in (before, changed)) for view in views)
+        return sum(float((a - b).square().mean()) for a, b in pairs)
+
+    assert error(after) < 0.3 * error(copies)
+    assert error(after) < 0.3 * error(at_random)
+
+
+@pytest.mark.parametrize(
+    ("room", "expected"),
+    [(None, [1, 2, 3, 4]), (9, [1, 2, 3, 4]), (2, [2, 4]), (1, [4]), (0, []), (-3, [])],
+)
+def test_those_grow_that_want_to_most(room, expected):
+    wanted = torch.tensor([0.0, 1.0, 3.0, 2.0, torch.inf, 0.0])
+    assert chosen(wanted, room).nonzero().flatten().tolist() == expected
+
+
+def test_where_there_is_more_room_than_gaussians_only_those_grow_that_want_to():
+    assert chosen(torch.tensor([0.0, 1.0]), 5).tolist() == [False, True]
