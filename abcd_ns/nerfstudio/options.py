@@ -52,7 +52,7 @@ SAME = {
     },
 }
 """By class and field, the flag of splatfacto's under --pipeline.model that means the same; taken too."""
-_FIXED = "it is fixed at splatfacto's value"
+_HALVES = "each that grows becomes two along its longest axis, large or small"
 _REDUCED = "set --pipeline.training.coarse, a share of the run, instead"
 _GIANTS = "--pipeline.training.heal shrinks giants"
 _GRIDS = "grids are 16 x 16 x 8, splatfacto's default, and adapt as --pipeline.training.light says"
@@ -62,7 +62,7 @@ UNUSED_OF_MODEL = {
     "stop_split_at": "set --pipeline.training.density.refine-stop, a share of the run, instead",
     "reset_alpha_every": "set --pipeline.training.density.reset-every, in views drawn, instead",
     **{name: f"set --pipeline.training.density.{flag} instead" for name, flag in SAME[DensityConfig].items()},
-    **dict.fromkeys(("densify_size_thresh", "n_split_samples"), _FIXED),
+    **dict.fromkeys(("densify_size_thresh", "n_split_samples"), _HALVES),
     "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",
     **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),
     **dict.fromkeys(("cull_screen_size", "stop_screen_size_at"), _GIANTS),

@@ -64,11 +64,11 @@ class DensityConfig:
     """When and how the number of Gaussians changes. Thresholds are splatfacto's but that of opacities."""
 
     strategy: Literal["default", "mcmc", "off"] = "default"
-    """`default`: clone, split and prune by gradient, as 3DGS. `mcmc`: relocate, and add up to a limit."""
+    """`default`: make two of one by gradient, and prune. `mcmc`: relocate, and add up to a limit."""
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
-    """Share of the run after which none is cloned or split; a block grows in its first visit all the same,
+    """Share of the run after which none becomes two; a block grows in its first visit all the same,
     unless that is in the last third. Who fills less than the `price` goes later, too."""
     refine_every: int = 100
     """Views drawn to train a block between its refinements; never fewer than show the block, but half of a
@@ -79,7 +79,7 @@ class DensityConfig:
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
     densify_grad_thresh: float = 0.0008
-    """Mean norm of the screen-space gradient over which a Gaussian is cloned or split."""
+    """Mean norm of the screen-space gradient over which a Gaussian becomes two."""
     use_absgrad: bool = True
     """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum. Surfels have no such
     sums: they are judged by a quarter of the threshold."""

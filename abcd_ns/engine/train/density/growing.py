@@ -2,8 +2,8 @@
 
 3DGS (Kerbl et al., 2023) puts a copy onto a small one, whose picture is then as of two, and draws at random
 where the halves of a large one go: either upsets the picture, for tens of steps. Two that have together the
-mass, the middle and the variance of the one change it as little as two can. That the longest axis is the one
-to cut is the finding of Deng et al. (2025, arXiv:2508.12313), whose halves lie further apart.
+mass, the middle and the variance of the one change it as little as two can. To cut the longest axis is Deng
+et al.'s (2025, arXiv:2508.12313).
 """
 
 from collections.abc import Mapping

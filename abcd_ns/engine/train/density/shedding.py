@@ -29,7 +29,7 @@ FULL_PASS = 0.999
 LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 GROWS = 4.0
-"""Times its price that a Gaussian fills before it is cloned or split: more than both halves must."""
+"""Times its price that a Gaussian fills before it becomes two: more than both halves must."""
 FAINT, FAINTER = 0.1, 0.25
 """Who fills more than most is haze with an opacity under the first, and under this share of the median: after
 a reset of opacities all are faint."""
