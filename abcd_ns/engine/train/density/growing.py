@@ -54,19 +54,19 @@ def halve(
     Returns:
         The statistics; both halves inherit them.
     """
-    found = dict(growth)
-    if not bool(which.any()):
+    found, rows = dict(growth), torch.where(which)[0]  # a device is waited for once
+    if not len(rows):
         return found
-    means, opacities = params["means"][which], torch.sigmoid(params["opacities"][which])
-    scales = torch.exp(params["scales"][which])
+    means, opacities = params["means"][rows], torch.sigmoid(params["opacities"][rows])
+    scales = torch.exp(params["scales"][rows])
     longest = scales[:, :axes].argmax(dim=1, keepdim=True)
     along = torch.zeros_like(scales).scatter_(1, longest, scales.gather(1, longest))
-    turned = normalized_quat_to_rotmat(F.normalize(params["quats"][which], dim=1))
+    turned = normalized_quat_to_rotmat(F.normalize(params["quats"][rows], dim=1))
     offset = APART * torch.einsum("nij,nj->ni", turned, along)
     narrow = scales.scatter(1, longest, NARROWED * scales.gather(1, longest))
     # Its own halves, drawn at random, are overwritten: the rows of parameters, moments and statistics stay.
     gsplat_ops.split(params, optimizers, found, which)
-    both = slice(-2 * len(means), None)
+    both = slice(-2 * len(rows), None)
     params["means"][both] = torch.cat((means + offset, means - offset))
     params["scales"][both] = narrow.log().repeat(2, 1)
     # As much mass in all: 2 a' NARROWED = a.
