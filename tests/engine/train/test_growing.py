@@ -36,16 +36,17 @@ def covariance(gaussians: Gaussians):
     return axes @ axes.transpose(1, 2)
 
 
-def mass(gaussians: Gaussians):
-    return torch.sigmoid(gaussians.opacities[:, 0]) * gaussians.scales.exp().prod(dim=1)
+def optical_depth(gaussians: Gaussians):
+    """-log(1 - opacity), integrated over space but for a constant."""
+    return -torch.log1p(-torch.sigmoid(gaussians.opacities[:, 0])) * gaussians.scales.exp().prod(dim=1)
 
 
 @given(SEEDS, st.integers(1, 9))
-def test_two_have_the_mass_the_middle_and_the_variance_of_the_one(seed, count):
+def test_two_have_the_optical_depth_the_middle_and_the_variance_of_the_one(seed, count):
     before = random_gaussians(count, seed=seed)
     after, _ = halved(before, [True] * count)
     first, second = after[:count], after[count:]
-    assert torch.allclose(mass(first) + mass(second), mass(before), rtol=1e-4)
+    assert torch.allclose(optical_depth(first) + optical_depth(second), optical_depth(before), rtol=1e-4)
     assert torch.allclose((first.means + second.means) / 2, before.means, atol=1e-6)
     apart = (first.means - second.means) / 2
     both = covariance(first) + apart[:, :, None] * apart[:, None]
@@ -69,11 +70,12 @@ def test_they_lie_along_the_longest_axis_that_is_drawn(seed):
 
 def test_the_others_and_their_statistics_stay_and_the_halves_inherit():
     before = random_gaussians(5, seed=2)
-    growth = {"weight": torch.arange(5.0)}
+    growth = {"weight": torch.arange(5.0), "passes": torch.arange(5.0)}
     after, found = halved(before, [False, True, False, True, False], growth=growth)
     for name in PARAM_NAMES:
         assert torch.equal(getattr(after, name)[:3], getattr(before, name)[[0, 2, 4]])
-    assert found["weight"].tolist() == [0, 2, 4, 1, 3, 1, 3]
+    assert found["weight"].tolist() == [0, 2, 4, 0.5, 1.5, 0.5, 1.5]
+    assert found["passes"].tolist() == [0, 2, 4, 1, 3, 1, 3]
     assert growth["weight"].tolist() == [0, 1, 2, 3, 4]
 
 
@@ -114,3 +116,13 @@ def test_those_grow_that_want_to_most(room, expected):
 
 def test_where_there_is_more_room_than_gaussians_only_those_grow_that_want_to():
     assert chosen(torch.tensor([0.0, 1.0]), 5).tolist() == [False, True]
+
+
+def test_the_opaque_stay_opaque():
+    before = random_gaussians(3)
+    before.opacities[:] = torch.tensor([[30.0], [6.0], [0.0]])
+    after, _ = halved(before, [True] * 3)
+    shown = torch.sigmoid(after.opacities[:3, 0])
+    assert bool(after.opacities.isfinite().all())
+    assert bool((shown[:2] > 0.99).all())
+    assert float(shown[2]) == pytest.approx(1 - 0.5 ** (1 / 1.2))

@@ -1,9 +1,9 @@
 """Growing: where views ask for more, one Gaussian becomes two, side by side along its longest axis.
 
 3DGS (Kerbl et al., 2023) puts a copy onto a small one, whose picture is then as of two, and draws at random
-where the halves of a large one go: either upsets the picture, for tens of steps. Two that have together the
-mass, the middle and the variance of the one change it as little as two can. To cut the longest axis is Deng
-et al.'s (2025, arXiv:2508.12313).
+where the halves of a large one go: either upsets the picture, for tens of steps. Here the two have together
+the optical depth, the middle and the variance of the one. To cut the longest axis is Deng et al.'s (2025,
+arXiv:2508.12313).
 """
 
 from collections.abc import Mapping
@@ -16,10 +16,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
+from abcd_ns.engine.train.density.shedding import WEIGHED
 
 APART, NARROWED = 0.8, 0.6
 """Of the standard deviation of the one along its axis: how far from its middle the two lie, and their own.
 The squares add up to 1, so that the variance of both together is that of the one."""
+LEAST = 1e-6
+"""Transmittance of the most opaque, whose optical depth would have no end."""
+WEIGHT = WEIGHED[0]
 
 
 def chosen(wanted: Float[Tensor, "n"], room: int | None) -> Bool[Tensor, "n"]:
@@ -48,11 +52,11 @@ def halve(
     moments begin anew.
 
     Args:
-        growth: statistics by name, [n] each.
+        growth: statistics by name, [n] each; both halves inherit them, and half of the weight.
         axes: along which Gaussians extend, the first of three: a surfel's third scale is nothing.
 
     Returns:
-        The statistics; both halves inherit them.
+        The statistics afterwards.
     """
     found, rows = dict(growth), torch.where(which)[0]  # a device is waited for once
     if not len(rows):
@@ -69,6 +73,9 @@ def halve(
     both = slice(-2 * len(rows), None)
     params["means"][both] = torch.cat((means + offset, means - offset))
     params["scales"][both] = narrow.log().repeat(2, 1)
-    # As much mass in all: 2 a' NARROWED = a.
-    params["opacities"][both] = torch.logit(opacities / (2 * NARROWED)).repeat(2, 1)
+    # Transmittances multiply, so that optical depths, -log(1 - opacity), add up: 2 NARROWED of each's in all.
+    transmits = (1 - opacities).clamp_min(LEAST) ** (1 / (2 * NARROWED))
+    params["opacities"][both] = torch.logit(1 - transmits).repeat(2, 1)
+    if WEIGHT in found:
+        found[WEIGHT][both] /= 2
     return found
