@@ -85,5 +85,11 @@ def test_crops_have_room_for_the_windows_of_ssim():
     shown = (1 - DRAW(block, view, sh_degree=0).transmittance) > 1e-3
     rows, columns = torch.where(shown)
     crop = survey(block, 0, [view], DRAW, 0.999).crops[view.index]
-    assert crop.x <= int(columns.float().quantile(0.01)) - CROP_MARGIN
-    assert crop.y <= int(rows.float().quantile(0.01)) - CROP_MARGIN
+    ends = (
+        (crop.x, crop.x + crop.width, view.width, columns),
+        (crop.y, crop.y + crop.height, view.height, rows),
+    )
+    for first, last, size, shows in ends:
+        low, high = (int(shows.float().quantile(share)) for share in (0.01, 0.99))
+        assert 0 < first <= low - CROP_MARGIN
+        assert high + CROP_MARGIN <= last < size

@@ -12,6 +12,7 @@ from abcd_ns.engine.render.primitive import SPLATS, SURFELS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl, for_primitive
+from abcd_ns.engine.train.density.growing import NARROWED
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
 from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
@@ -60,7 +61,9 @@ def test_the_wide_are_split_whatever_their_gradients_and_the_scenes_units_say(si
     control.after_step(params, optimizers, {}, infos, clock(room=room), wide)
     assert len(params["means"]) == 8 + split
     assert torch.equal(params["scales"][: 8 - split], before[split:])  # the others, as they were
-    assert torch.all(params["scales"][8 - split :].view(2, split, 3) <= before[:split])
+    narrowed = before[:split] - params["scales"][8 - split :].view(2, split, 3)
+    expected = torch.tensor([0.0, 0.0, -math.log(NARROWED)]).expand(2, split, 3)
+    assert torch.allclose(narrowed.sort(dim=2).values, expected, atol=1e-5)  # one axis of each
 
 
 def test_wide_is_what_covers_a_twentieth_of_the_nearest_cameras_picture():
