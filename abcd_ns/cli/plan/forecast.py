@@ -30,7 +30,7 @@ PLACES = {
 }
 """Where room is taken, and in which words it is said where there is not enough, with what to do about it."""
 LAYERS_BY_STEPS = 0.15
-"""Time for layers by the time of steps: they take 9 to 18% of runs on a CPU (docs/results)."""
+"""Time for layers by the time of steps: they take 10 to 18% of runs on a CPU (docs/results)."""
 
 
 Shares = dict[str, int]

@@ -82,7 +82,7 @@ class TrainingConfig:
     """Points of the cloud that lie in a cube so many pixels wide, in the view that sees them from nearest,
     begin as one Gaussian; 0 begins with all."""
     seed: int = 0
-    """Of the order of blocks and views, backgrounds and splits."""
+    """Of the order of blocks and views, of backgrounds, and of what `mcmc` moves."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 
