@@ -162,8 +162,7 @@ class VisitTraining:
         clock = self.live.density_clock(taken, self.batch, self._visits.room())
         self.live.refine(rendered.infos if sound else (), clock)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
-            self.live.shed()
-            self.live.lower_degrees()
+            self.live.judge()
             self.live.hold_back_giants()
         run.announce(StepTaken(run.state.step, active.number, active.done, psnr))
 
@@ -206,8 +205,7 @@ class VisitTraining:
         """What the visit has made of its block, on the CPU; its layers go."""
         active = self.run.active
         if not active.is_all:
-            self.live.shed()
-            self.live.lower_degrees()
+            self.live.judge()
         self.live.hold_back_giants()
         if not active.is_whole:
             self.live.count_visit()

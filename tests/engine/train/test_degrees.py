@@ -192,3 +192,16 @@ def test_a_run_that_was_interrupted_keeps_its_degrees(tmp_path, blocks):
     train(again, photos)
     for name, value in whole_scene(through).items():
         assert torch.equal(value, getattr(whole_scene(again), name)), name
+
+
+def test_a_visit_that_draws_each_view_once_is_enough_to_judge_by(tmp_path):
+    views, truth = ring_of_views(6), half_matt()
+    coordinator = make_coordinator(tmp_path, truth, views, blocks=1, steps=20, density=STILL, batch=1)
+    photos, live = Photos(truth, views), coordinator.visit.live
+    while coordinator.run.share < degrees.START:
+        train_step(coordinator, photos)
+    live.growth = {**live.growth, **weighed(len(live))}
+    assert live.growth["passes"].tolist() == [1.0] * len(live)
+    live.judge()
+    assert float(live.growth[GONE].max()) > 0
+    assert live.growth["passes"].tolist() == [0.5] * len(live)

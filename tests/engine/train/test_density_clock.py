@@ -60,11 +60,9 @@ def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
 
 
 @pytest.mark.parametrize(
-    ("run", "views", "every"),
-    [(1200, 26, 30), (3600, 26, 60), (3600, 255, 60), (30_000, 26, 100), (30_000, 255, 255)],
+    ("run", "views", "every"), [(1200, 26, 100), (3600, 255, 255), (30_000, 26, 100), (30_000, 255, 255)]
 )
-def test_a_warm_up_is_refined_by_its_share_of_a_short_run(run, views, every):
-    """And as one block is in a long one."""
+def test_a_warm_up_is_refined_as_one_block_is(run, views, every):
     control, refined, due = DensityControl(DensityConfig()), 0, []
     for steps in range(1, int(0.35 * run) + 1):
         at = clock(steps=steps, progress=steps / run, views=views, refined=refined, warm_up=True)
@@ -73,12 +71,6 @@ def test_a_warm_up_is_refined_by_its_share_of_a_short_run(run, views, every):
             refined = steps
     assert {b - a for a, b in pairwise(due)} == {every}
     assert due[0] == max(every, math.ceil(run / 60))
-
-
-def test_a_warm_up_whose_run_has_no_end_is_refined_as_one_block_is():
-    control = DensityControl(DensityConfig(refine_start=0.0))
-    assert control.is_due(clock(steps=100, progress=0.0, refined=0, warm_up=True))
-    assert not control.is_due(clock(steps=99, progress=0.0, refined=0, warm_up=True))
 
 
 def test_opacities_are_reset_only_where_there_is_time_to_make_it_good():

@@ -34,7 +34,7 @@ FAINT, FAINTER = 0.1, 0.25
 """Who fills more than most is haze with an opacity under the first, and under this share of the median: after
 a reset of opacities all are faint."""
 PASSES = 4
-"""A block that is the whole scene sheds whenever each of its views was drawn so often."""
+"""A block that is the whole scene is judged whenever each of its views was drawn so often."""
 
 
 class _Weigh(torch.autograd.Function):
@@ -98,6 +98,8 @@ def may_grow(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
 
 def faded(growth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n"]]:
     """The statistics when all have been judged: what is seen from now on soon counts for more."""
+    if any(name not in growth for name in WEIGHED):
+        return dict(growth)
     half = torch.where(growth["passes"] >= FULL_PASS, 0.5, 1.0)
     return {name: value * half if name in WEIGHED else value for name, value in growth.items()}
 

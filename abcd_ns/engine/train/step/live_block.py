@@ -12,6 +12,7 @@ from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
+from abcd_ns.engine.train.density.shedding import faded
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.train.memory import check_room
@@ -52,7 +53,7 @@ class LiveBlock:
         run.health.begin_visit(active, run.state.health)
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
         if active.done == 0 and not (active.saved or active.is_whole or active.sole):
-            self.lower_degrees()
+            self._lower_degrees()
 
     def detached(self) -> BlockState:
         """The live block, on the CPU; it stays live."""
@@ -98,13 +99,16 @@ class LiveBlock:
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.hold_back_giants()
 
-    def shed(self) -> None:
-        """Take out Gaussians that fill too little of the block's views; tells how many."""
+    def judge(self) -> None:
+        """Take out Gaussians that fill too little of the block's views, and tell how many; and harmonics that
+        change too little. What is seen from now on soon counts for more."""
         run, before = self._run, len(self)
         self.growth = run.density.shed(run.params, run.optimizers, self.growth, run.share)
         run.health.count("shed", before - len(self))
+        self._lower_degrees()
+        self.growth = faded(self.growth)
 
-    def lower_degrees(self) -> None:
+    def _lower_degrees(self) -> None:
         """Let spherical harmonics go that change too little in the block's views, once it is time."""
         run = self._run
         if run.density.weighs and run.share >= START:
