@@ -60,9 +60,11 @@ def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
 
 
 @pytest.mark.parametrize(
-    ("run", "views", "every"), [(1200, 26, 100), (3600, 255, 255), (30_000, 26, 100), (30_000, 255, 255)]
+    ("run", "views", "every"),
+    [(1200, 26, 30), (1200, 68, 68), (3600, 26, 60), (3600, 255, 255), (30_000, 26, 100), (30_000, 255, 255)],
 )
-def test_a_warm_up_is_refined_as_one_block_is(run, views, every):
+def test_a_warm_up_is_refined_by_its_share_of_a_short_run_but_by_all_views(run, views, every):
+    """And as one block is in a long one."""
     control, refined, due = DensityControl(DensityConfig()), 0, []
     for steps in range(1, int(0.35 * run) + 1):
         at = clock(steps=steps, progress=steps / run, views=views, refined=refined, warm_up=True)

@@ -33,6 +33,11 @@ class DensityClock:
     """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
     show it."""
 
+    @property
+    def pace(self) -> float:
+        """Views that the whole run would draw, if it went on as it has so far."""
+        return self.steps / max(self.progress, 1e-9)
+
     def reached(self, every: int) -> bool:
         """Whether `steps` has come to a multiple of `every` in this step."""
         return self.steps // every > (self.steps - self.taken) // every

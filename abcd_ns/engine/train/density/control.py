@@ -41,6 +41,10 @@ GRADIENTS = ("grad2d", "count")
 """What gsplat's default strategy adds up for each Gaussian, under its names."""
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.4
 """Share of a visit among others after which none is refined; of a warm-up after which no opacity is reset."""
+WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
+"""A warm-up is refined whenever this share has been drawn of the views that the run would draw at its pace,
+or so many views if these are more, or all of the scene's: also a short one is to fill its room, but by what
+every view asks for."""
 PLAIN_GRADIENT = 0.25
 """Thresholds of gradients, as a share of those of absolute ones: 0.0002 (3DGS, 2DGS) of 0.0008 (AbsGS)."""
 MCMC_MIN_OPACITY = 0.005
@@ -68,7 +72,7 @@ class DensityConfig:
     unless that is in the last third. Who fills less than the `price` goes later, too."""
     refine_every: int = 100
     """Views drawn to train a block between its refinements; never fewer than show the block, but half of a
-    first visit's at most."""
+    first visit's at most, and in the warm-up a sixtieth of the run's, if no fewer than show the scene."""
     reset_every: int = 3000
     """Views drawn between opacity resets of a block without others, and in the first part of a warm-up
     (`default` strategy); 0 means never."""
@@ -147,7 +151,9 @@ class DensityControl:
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         if clock.refined is None:
             return clock.reached(every)
-        if not clock.warm_up and clock.spent > REFINE_UNTIL:
+        if clock.warm_up:
+            every = min(every, max(LEAST_EVERY, views, round(WARM_UP_EVERY * clock.pace)))
+        elif clock.spent > REFINE_UNTIL:
             return False
         return clock.steps - clock.refined >= every
 
