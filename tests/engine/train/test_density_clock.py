@@ -75,6 +75,12 @@ def test_a_warm_up_is_refined_by_its_share_of_a_short_run_but_by_all_views(run, 
     assert due[0] == max(every, math.ceil(run / 60))
 
 
+def test_a_warm_up_whose_run_has_no_end_is_refined_as_one_block_is():
+    control = DensityControl(DensityConfig(refine_start=0.0))
+    assert control.is_due(clock(steps=100, progress=0.0, refined=0, warm_up=True))
+    assert not control.is_due(clock(steps=99, progress=0.0, refined=0, warm_up=True))
+
+
 def test_opacities_are_reset_only_where_there_is_time_to_make_it_good():
     control = DensityControl(DensityConfig(reset_every=500))
     assert control.resets(clock(steps=500))
