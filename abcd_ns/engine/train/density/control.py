@@ -26,7 +26,7 @@ from abcd_ns.engine.train.density.relocation import binomials, compute_relocatio
 from abcd_ns.engine.train.density.shedding import (
     FAINT,
     LAST,
-    WEIGHED,
+    are_weighed,
     fills,
     haze,
     may_grow,
@@ -250,7 +250,7 @@ class DensityControl:
         Returns:
             The block's statistics from now on.
         """
-        if not self.weighs or any(name not in growth for name in WEIGHED):
+        if not self.weighs or not are_weighed(growth):
             return growth
         price, faint = (risen(each, progress, self.config.refine_stop) for each in (self.config.price, FAINT))
         opacities = torch.sigmoid(params["opacities"][:, 0])

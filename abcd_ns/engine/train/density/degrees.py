@@ -17,7 +17,7 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0, sh_basis_rows, sh_degree_of, up_to_degree
-from abcd_ns.engine.train.density.shedding import WEIGHED, fills
+from abcd_ns.engine.train.density.shedding import are_weighed, fills
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
@@ -66,7 +66,7 @@ def lower(
     Returns:
         The block's statistics from now on.
     """
-    if any(name not in growth for name in WEIGHED):
+    if not are_weighed(growth):
         return growth
     dc, rest = params["features_dc"], params["features_rest"]
     found = lowered(live_gaussians(params).detach(), growth, views)

@@ -78,6 +78,11 @@ def weigh(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:
     return dict(zip(WEIGHED, (weight.nan_to_num(0.0, 0.0, 0.0), passes), strict=True))
 
 
+def are_weighed(growth: Mapping[str, Tensor]) -> bool:
+    """Whether the statistics say anything of weights."""
+    return all(name in growth for name in WEIGHED)
+
+
 def fills(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
     """Pixels that each fills in all of its block's views together; NaN for who was not drawn in all yet: such
     a one is not judged, for no comparison finds it to be less.
@@ -98,7 +103,7 @@ def may_grow(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
 
 def faded(growth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n"]]:
     """The statistics when all have been judged: what is seen from now on soon counts for more."""
-    if any(name not in growth for name in WEIGHED):
+    if not are_weighed(growth):
         return dict(growth)
     half = torch.where(growth["passes"] >= FULL_PASS, 0.5, 1.0)
     return {name: value * half if name in WEIGHED else value for name, value in growth.items()}
