@@ -104,10 +104,10 @@ class Dispatcher(Coordinator):
             NothingSeenError: no view sees any block.
             WorkersError: there are no workers, or a visit lost LOSSES of them.
         """
-        self.stopwatch.start()
         if not self._shown and self.device.type == "cuda":
             torch.cuda.empty_cache()  # of what was trained here: a worker may share this device
         while self._counted >= self.state.step and not self.finished:
+            self.stopwatch.start()  # a listener may have paused it
             self._lend()
             if self._counted < self.state.step or self.finished:
                 break
@@ -122,8 +122,8 @@ class Dispatcher(Coordinator):
         return not self._lent and super().finished
 
     def pause(self) -> None:
-        """No time counts until the next step, unless workers go on."""
-        if not self._lent:
+        """No time counts until the next step, nor does anyone train, unless workers cannot be held."""
+        if not self._lent or self.workers.hold():
             super().pause()
 
     def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:

@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
+from multiprocessing.sharedctypes import RawValue
 from typing import Any, NoReturn
 
 import torch
@@ -75,6 +76,9 @@ class ForkedWorkers(Members[Place]):
 
     def __init__(self, count: int, worker: VisitWorker) -> None:
         self._worker, self._owner, now = worker, os.getpid(), time.monotonic()
+        self._stood_still = RawValue(ctypes.c_double, 0.0)
+        """Seconds in all; processes that were forked read it, too."""
+        self._held_since: float | None = None
         super().__init__([Place(number, since=now, free_since=now) for number in range(count)])
 
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
@@ -83,6 +87,7 @@ class ForkedWorkers(Members[Place]):
 
     def submit(self, lease: Lease) -> None:
         """Fork a process for a visit."""
+        self._let_go_on()
         member = self._longest_idle()
         member.take(lease)
         member.heard = time.monotonic()
@@ -90,10 +95,36 @@ class ForkedWorkers(Members[Place]):
         member.pid = os.fork()
         if member.pid == 0:
             member.pipe.close()
-            _live(theirs, lambda tell: self._worker.visit(lease.task, lease.state(), lease.drawn, tell))
+            visit, task = self._worker.visit, lease.task
+            _live(theirs, lambda tell: visit(task, lease.state(), lease.drawn, tell, self._clock))
         theirs.close()
 
+    def _clock(self) -> float:
+        return time.perf_counter() - self._stood_still.value
+
+    def hold(self) -> bool:
+        if self._held_since is None:
+            self._held_since = time.perf_counter()
+            self._signal(signal.SIGSTOP)
+        return True
+
+    def _let_go_on(self) -> None:
+        if self._held_since is None:
+            return
+        # Before they can read it. They have not been silent: they could not speak.
+        held, self._held_since = time.perf_counter() - self._held_since, None
+        self._stood_still.value += held
+        for member in self._members:
+            member.heard += held
+        self._signal(signal.SIGCONT)
+
+    def _signal(self, number: signal.Signals) -> None:
+        for pid in self.pids:
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+
     def wait(self, seconds: float) -> list[Report]:
+        self._let_go_on()
         busy = {member.pipe: member for member in self._members if member.lease is not None}
         reports = [report for pipe in wait(list(busy), seconds) for report in self._hear(busy[pipe])]
         for member in self._members:

@@ -76,6 +76,9 @@ class Members(Workers, Generic[M]):
         """Processes of those that are at work."""
         return [member.pid for member in self._members if member.lease is not None]
 
+    def hold(self) -> bool:
+        return not self.pids  # those of other machines go on
+
     def seen(self) -> Sequence[WorkerSeen]:
         return [member.seen() for member in self._members]
 

@@ -1,6 +1,7 @@
 """Trains single visits of somebody else's run, on parameters of its own."""
 
 import copy
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -91,6 +92,7 @@ class VisitWorker:
         state: BlockState,
         drawn: Mapping[int, Callable[[], Gaussians]],
         listen: Callable[[Event], None] = lambda _: None,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> VisitOutcome:
         """Train a block between the others.
 
@@ -98,12 +100,14 @@ class VisitWorker:
             state: what it begins with.
             drawn: by block, what reads it as others draw it; only those are read that some picture shows.
             listen: is told of what happens.
+            clock: of training time.
         """
         scene = LentScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
         run = self._run_of(task, scene)
 
         run.announce.subscribe(listen)
         run.announce.subscribe(self._read_ahead)
+        run.stopwatch = Stopwatch(task.seconds, clock)
         run.stopwatch.start()
         pictures, layers = self._setup.layer_room.parted(ROOM if task.beside else 0.0)
         training = VisitTraining(run, OnLease(run, task, len(state)), LayerSource(run, layers))
@@ -152,7 +156,6 @@ class VisitWorker:
         )
         run.poses.restore(task.poses)
         run.take_poses()
-        run.stopwatch = Stopwatch(task.seconds)
         return run
 
     def _take_step(self, training: VisitTraining, shared: SharedResidual) -> None:

@@ -40,6 +40,10 @@ class InProcessWorkers:
         """To be trained when someone waits for it."""
         self._leases.append(lease)
 
+    def hold(self) -> bool:
+        """Nothing is under way meanwhile."""
+        return True
+
     def wait(self, seconds: float) -> list[Report]:  # noqa: ARG002 - nothing is under way meanwhile
         """Train the visit that was submitted first."""
         if not self._leases:

@@ -67,6 +67,9 @@ class Unreliable:
             self.answered_late += 1
         return [*late, Lost(lease.number, fate)]
 
+    def hold(self):
+        return self._inner.hold()
+
     def seen(self):
         return self._inner.seen()
 

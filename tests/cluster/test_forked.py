@@ -6,6 +6,8 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -110,6 +112,50 @@ def test_so_is_one_that_nothing_is_heard_of(make, photos, steady, tmp_path, monk
     train(run, photos)
     assert sum(worker.deaths for worker in run.workers.seen()) == 1
     assert equal(steady[0], whole_scene(run))
+
+
+def state_of(pid: int) -> str:
+    """By Linux: R runs, S sleeps, T stands still."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def test_while_time_is_paused_nobody_trains(make, photos, steady):
+    run = make()
+    while not run.workers.pids:
+        train_step(run, photos)
+    run.pause()
+    before, pids = run.stopwatch.seconds, run.workers.pids
+    until = time.monotonic() + 20
+    while {state_of(pid) for pid in pids} != {"T"} and time.monotonic() < until:
+        time.sleep(0.01)
+    assert {state_of(pid) for pid in pids} == {"T"}
+    assert run.stopwatch.seconds == before
+    train(run, photos)
+    assert equal(steady[0], whole_scene(run))
+
+
+class Timing:
+    """Its visits take a second and end with what they took, by the clock that it is given and by another."""
+
+    def visit(self, task, state, drawn, listen, clock):
+        began, started = clock(), time.perf_counter()
+        while time.perf_counter() - started < 1.0:
+            time.sleep(0.01)
+        raise UserError(f"{clock() - began} {time.perf_counter() - started}")
+
+
+def test_what_is_paused_counts_for_no_visit():
+    workers = ForkedWorkers(1, Timing())
+    workers.submit(SimpleNamespace(number=1, task=None, state=lambda: None, drawn={}))
+    time.sleep(0.2)
+    assert workers.hold()
+    assert workers.hold()  # as good as once
+    time.sleep(0.5)
+    with pytest.raises(UserError) as told:
+        while True:
+            workers.wait(5.0)
+    counted, passed = map(float, str(told.value).split())
+    assert 0.5 <= passed - counted < passed
 
 
 class Slow(TorchRasterizer):

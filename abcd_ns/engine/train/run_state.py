@@ -2,6 +2,7 @@
 
 import copy
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -177,21 +178,26 @@ class RunState:
 
 
 class Stopwatch:
-    """Seconds of training; can be paused for what does not count."""
+    """Seconds of training; can be paused for what does not count.
 
-    def __init__(self, seconds: float = 0.0) -> None:
-        self._before = seconds
+    Args:
+        seconds: so far.
+        clock: tells the time, in seconds since whenever.
+    """
+
+    def __init__(self, seconds: float = 0.0, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._before, self._clock = seconds, clock
         self._since: float | None = None
 
     @property
     def seconds(self) -> float:
-        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        running = 0.0 if self._since is None else self._clock() - self._since
         return self._before + running
 
     def start(self) -> None:
         """Count from now on; harmless when it already does."""
         if self._since is None:
-            self._since = time.perf_counter()
+            self._since = self._clock()
 
     def pause(self) -> None:
         """Stop counting until `start`."""
