@@ -50,7 +50,7 @@ from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from abcd_ns.nerfstudio.options import SAME, mirror
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
-from abcd_ns.nerfstudio.run.resuming import MadeFor, RunRequest, new_store, take_over
+from abcd_ns.nerfstudio.run.resuming import ASKED, MadeFor, RunRequest, new_store, take_over
 from abcd_ns.nerfstudio.run.run_log import keep_log
 from abcd_ns.nerfstudio.views import training_views, views_of
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with, dispatcher_for, number_of_workers
@@ -77,8 +77,8 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """How blocks are trained."""
     blocks: int = 0
-    """Number of blocks that space is cut into; 1 is ordinary 3DGS. 0 takes as few as `device_budget_gb`
-    allows, one where the scene fits, and cuts blocks that outgrow it in two."""
+    """Number of blocks that space is cut into; nothing then holds them within `device_budget_gb`. 0 takes as few
+    as it allows, one where the scene fits, and cuts blocks that outgrow it in two."""
     device_budget_gb: float = 0.0
     """Memory of the device that training may take, GiB, by which `blocks` 0 is decided; 0 takes 0.9 of what
     is free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
@@ -322,7 +322,7 @@ class AbcdPipeline(VanillaPipeline):
         else:
             tree = build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
         keep = self._scaffold_size(len(gaussians), tree.num_blocks, fitted)
-        header = {"tree": tree.to_json(), **fitted, SCAFFOLD: keep or 0}
+        header = {"tree": tree.to_json(), **fitted, SCAFFOLD: keep or 0, ASKED: self.config.blocks}
         store = new_store(folder, {**header, **made_for.header()})
         if training.recipe.overlap > 0:
             store.commit(independent_at_rest(tree, gaussians))

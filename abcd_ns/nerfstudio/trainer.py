@@ -26,8 +26,15 @@ from abcd_ns.nerfstudio.flags import hidden
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
-from abcd_ns.nerfstudio.run import STATE
-from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, find_start, pin_name
+from abcd_ns.nerfstudio.run import STATE, STORE
+from abcd_ns.nerfstudio.run.resuming import (
+    RunRequest,
+    Start,
+    check_blocks,
+    check_folder,
+    find_start,
+    pin_name,
+)
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
@@ -93,6 +100,9 @@ class AbcdTrainerConfig(TrainerConfig):
             self.machine.device_type = "cpu"
             CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
         with exit_on_user_error():
+            start = find_start(self)
+            check_folder(self.get_base_dir() / STATE / STORE, start)
+            check_blocks(start, self.pipeline.blocks)
             check_options(self)
             found = inspect(self.pipeline.datamanager.reader())
             if self.pipeline.blocks == 0:

@@ -55,12 +55,19 @@ def assert_same(found: Path, expected: Path) -> None:
     assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
 
 
-def refusal(config, capsys) -> str:
-    """What a run that cannot begin says before it exits with code 2."""
+def written(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def refusal(config, capsys, late: bool = False) -> str:
+    """What a run that cannot begin says before it exits with code 2, with nothing written unless photos or
+    blocks have to be read to find out."""
     capsys.readouterr()
+    before = written(config.output_dir)
     with pytest.raises(SystemExit) as ended:
         run(config)
     assert ended.value.code == 2
+    assert late or written(config.output_dir) == before
     said = capsys.readouterr().out
     assert "error:" in said
     return said
@@ -240,18 +247,24 @@ def test_a_damaged_store_is_named(data, stopped, tmp_path, capsys):
     for path in (stopped / "abcd" / "store").glob("block-*"):
         content = path.read_bytes()
         path.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
-    said = refusal(configure(data, tmp_path / "b", load_dir=stopped), capsys)
+    said = refusal(configure(data, tmp_path / "b", load_dir=stopped), capsys, late=True)
     assert "is damaged: its checksum is wrong. Go back to a pinned generation" in said
 
 
 def test_other_options_than_the_stores_are_refused_and_both_are_shown(data, stopped, tmp_path, capsys):
     config = configure(data, tmp_path / "b", load_dir=stopped)
     config.pipeline.training.sh_degree = 1
-    said = refusal(config, capsys)
+    said = refusal(config, capsys, late=True)
     assert "it was made for sh degree 3, not 1" in said
     other = configure(data, tmp_path / "b", load_dir=stopped)
     other.pipeline.training.recipe = Recipe(exact=True)
-    assert "blocks are trained in turn, not jointly" in refusal(other, capsys)
+    assert "blocks are trained in turn, not jointly" in refusal(other, capsys, late=True)
+
+
+def test_another_number_of_blocks_is_refused(data, stopped, tmp_path, capsys):
+    said = refusal(configure(data, tmp_path / "b", blocks=5, load_dir=stopped), capsys)
+    assert "was begun with --pipeline.blocks 3, not 5" in said
+    run(configure(data, tmp_path / "b", blocks=0, load_dir=stopped, steps=12))
 
 
 def test_other_photos_than_the_stores_are_refused_and_both_are_shown(tmp_path):
@@ -288,6 +301,25 @@ def test_a_folder_without_a_run_says_so(data, tmp_path, capsys, what):
         "not begun": "was ended before it began: start it anew",
     }
     assert expected[what] in refusal(configure(data, tmp_path / "out", load_dir=models), capsys)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"load_step": 10}, "--load-step 10 does not say of which run: add --load-dir"),
+        ({"load_checkpoint": Path("x"), "load_dir": Path("y")}, "leave out --load-dir and --load-step"),
+        ({"load_checkpoint": Path("x"), "load_step": 10}, "leave out --load-dir and --load-step"),
+        ({"load_checkpoint": Path("x")}, "There is no checkpoint x"),
+    ],
+)
+def test_options_that_do_not_say_where_to_go_on_are_refused(data, tmp_path, capsys, options, said):
+    assert said in refusal(configure(data, tmp_path / "out", **options), capsys)
+
+
+def test_another_runs_folder_is_not_taken_whatever_is_gone_on_with(data, stopped, tmp_path, capsys):
+    other = run_folder(Path(shutil.copytree(stopped.parents[2], tmp_path / "other")))
+    said = refusal(configure(data, stopped.parents[2], load_dir=other), capsys)
+    assert f"{stopped / 'abcd' / 'store'} holds a run already" in said
 
 
 # RAM

@@ -19,6 +19,8 @@ from abcd_ns.nerfstudio.run.settings import Plain
 
 MADE_FOR = "made for"
 """The entry of a store's header that tells what it can be trained on with."""
+ASKED = "blocks asked for"
+"""The entry of a store's header that has `--pipeline.blocks` as it was when the run began."""
 
 
 @dataclass(frozen=True)
@@ -114,12 +116,16 @@ def find_start(config: TrainerConfig) -> Start | None:
     is newer. It may name the run's folder or `nerfstudio_models` in it, with or without checkpoints there.
 
     Raises:
-        UserError: there is nothing to go on from.
+        UserError: there is nothing to go on from, or the options name two things.
     """
-    if config.load_dir is None and config.load_checkpoint is None:
-        return None
-    if config.load_dir is None:
+    if config.load_checkpoint is not None:
+        if config.load_dir is not None or config.load_step is not None:
+            raise UserError("--load-checkpoint names all there is to name: leave out --load-dir and --load-step.")
         return _at_checkpoint(config.load_checkpoint)
+    if config.load_dir is None:
+        if config.load_step is not None:
+            raise UserError(f"--load-step {config.load_step} does not say of which run: add --load-dir.")
+        return None
     run = _run_of(config.load_dir)
     if config.load_step is not None:
         return _at_checkpoint(run / config.relative_model_dir / f"{pin_name(config.load_step)}.ckpt")
@@ -134,6 +140,49 @@ def find_start(config: TrainerConfig) -> Start | None:
 def pin_name(step: int) -> str:
     """The store's pin that belongs to a checkpoint: its file name without the ending."""
     return f"step-{step:09d}"
+
+
+def check_folder(folder: Path, start: Start | None) -> None:
+    """See that a run may have its store in `folder`, before it writes anything beside it.
+
+    Args:
+        start: what the run goes on from.
+
+    Raises:
+        UserError: another run's store is there, or another run is writing to it.
+    """
+    if not (folder / "manifest.json").exists():
+        return
+    if start is None or not folder.samefile(start.store):
+        raise _is_taken(folder)
+    ParameterStore.open(folder).close()
+
+
+def check_blocks(start: Start | None, asked: int) -> None:
+    """See that a run that goes on is not asked to be cut otherwise, which it could not be.
+
+    Args:
+        asked: `--pipeline.blocks`; 0 is content with any number.
+
+    Raises:
+        UserError: it is; both numbers are shown.
+    """
+    if start is None or asked == 0:
+        return
+    with ParameterStore.open(start.store, start.pin, read_only=True) as store:
+        before = store.header.get(ASKED, asked)  # older runs did not write it down
+    if before != asked:
+        raise UserError(
+            f"The run in {start.store} was begun with --pipeline.blocks {before}, not {asked}: leave the option "
+            "out, or begin anew without --load-dir."
+        )
+
+
+def _is_taken(folder: Path) -> UserError:
+    run = folder.parent.parent
+    return UserError(
+        f"{folder} holds a run already: go on with it by --load-dir {run}, or choose another --timestamp."
+    )
 
 
 def take_over(start: Start, folder: Path, made_for: MadeFor) -> ParameterStore:
@@ -167,10 +216,7 @@ def new_store(folder: Path, header: dict[str, Any]) -> ParameterStore:
     except StoreError as error:
         if not (folder / "manifest.json").exists():
             raise
-        raise UserError(
-            f"{folder} holds a run already: go on with it by --load-dir {folder.parent.parent}, or choose "
-            "another --timestamp."
-        ) from error
+        raise _is_taken(folder) from error
 
 
 def _run_of(load_dir: Path) -> Path:
