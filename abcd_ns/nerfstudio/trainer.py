@@ -1,10 +1,11 @@
 """nerfstudio's trainer, with checkpoints that a run can truly go on from, and an end that loses nothing."""
 
 import dataclasses
+import signal
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -164,7 +165,7 @@ class AbcdTrainer(Trainer):
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
-        with exit_on_user_error():
+        with self._at_once("Stopped before training began."), exit_on_user_error():
             super().setup(*args, **kwargs)
         self.pipeline.coordinator.announce.subscribe(self._may_stop)
         at = TrainingCallbackLocation
@@ -175,6 +176,20 @@ class AbcdTrainer(Trainer):
     def train(self) -> None:
         """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
         self._trains = threading.get_ident()
+        with self._at_once("Stopped at once; what was written until then is safe."):
+            self._train()
+
+    @contextmanager
+    def _at_once(self, said: str) -> Iterator[None]:
+        """Ctrl-C where nothing waits for the end of a step: nerfstudio would show where, and exit with 0."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self._say(said)
+            self._say_how_to_go_on()
+            raise SystemExit(128 + signal.SIGINT) from None
+
+    def _train(self) -> None:
         try:
             with self._signals:
                 self._complete()
@@ -244,7 +259,8 @@ class AbcdTrainer(Trainer):
 
     def _say_how_to_go_on(self) -> None:
         command = command_to_go_on(sys.argv, self.config.method_name, self.checkpoint_dir)
-        if command is not None:  # else whoever started this training knows better
+        begun = (self.base_dir / STATE / STORE).is_dir()
+        if command is not None and begun:  # else whoever started this training knows better
             self._say(f"To go on:\n  {command}")
 
     def _say(self, text: str) -> None:

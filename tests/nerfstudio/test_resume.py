@@ -168,6 +168,37 @@ def test_a_signal_commits_and_says_how_to_go_on(
     assert_same(resumed.base_dir, undisturbed)
 
 
+def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypatch):
+    config = configure(data, tmp_path / "signal")
+    monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
+
+    def interrupt(happened) -> None:
+        if isinstance(happened, StepTaken) and happened.step == 17:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(SystemExit) as ended:
+        run(config, listener=interrupt)
+    assert ended.value.code == 130
+    said = capsys.readouterr().out
+    assert "Stopped at once" in said
+    assert f"ns-train abcd --load-dir {run_folder(tmp_path / 'signal')}/nerfstudio_models" in said
+
+
+def test_ctrl_c_before_the_first_step_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
+    monkeypatch.setattr("abcd_ns.nerfstudio.pipeline.build_kd", interrupt)
+    with pytest.raises(SystemExit) as ended:
+        run(configure(data, tmp_path / "signal"))
+    assert ended.value.code == 130
+    said = capsys.readouterr().out
+    assert "Stopped before training began." in said
+    assert "--load-dir" not in said
+
+
 def test_going_on_for_no_more_steps_completes_the_run(data, stopped, tmp_path):
     ParameterStore.open(stopped / "abcd" / "store").close()
     before = RunState.from_json(ParameterStore.open(stopped / "abcd" / "store", read_only=True).state)
