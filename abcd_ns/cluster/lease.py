@@ -149,8 +149,8 @@ class Workers(Protocol):
         """Give a visit to one that is idle."""
 
     def hold(self) -> bool:
-        """Let those that are at work stand still until they are waited for, or a visit is submitted; whether that
-        can be done."""
+        """Let those that are at work stand still until they are waited for, or given more; whether that can be
+        done."""
 
     def wait(self, seconds: float) -> list[Report]:
         """What has happened, in order; waits for something so long at most.

@@ -1,5 +1,7 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
+import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +15,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import thin_out
 from abcd_ns.engine.render import loss
@@ -43,7 +46,7 @@ from abcd_ns.nerfstudio.fit import (
     device_budget,
     find_fit,
 )
-from abcd_ns.nerfstudio.flags import named_too
+from abcd_ns.nerfstudio.flags import named_too, opens_ours
 from abcd_ns.nerfstudio.inspection import factor_of
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
@@ -77,8 +80,8 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """How blocks are trained."""
     blocks: int = 0
-    """Number of blocks that space is cut into; nothing then holds them within `device_budget_gb`. 0 takes as few
-    as it allows, one where the scene fits, and cuts blocks that outgrow it in two."""
+    """Number of blocks that space is cut into; nothing then holds them within `device_budget_gb`. 0 takes as
+    few as it allows, one where the scene fits, and cuts blocks that outgrow it in two."""
     device_budget_gb: float = 0.0
     """Memory of the device that training may take, GiB, by which `blocks` 0 is decided; 0 takes 0.9 of what
     is free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
@@ -102,6 +105,12 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Stop after this many seconds of training; evaluation and saving do not count."""
 
 
+def _as_a_command() -> AbstractContextManager:
+    """Where a command of nerfstudio's opens a run, what the user can mend ends it in one line, as `ns-train`;
+    who opens one from Python is given the exception."""
+    return exit_on_user_error() if opens_ours(sys.argv) else nullcontext()
+
+
 class AbcdPipeline(VanillaPipeline):
     """ABCD in nerfstudio. Constructed without side effects: evaluation tools make one, too."""
 
@@ -116,7 +125,8 @@ class AbcdPipeline(VanillaPipeline):
             config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / GIB
         # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
         guard.install()
-        super().__init__(config, *args, **kwargs)
+        with _as_a_command():
+            super().__init__(config, *args, **kwargs)
         self.coordinator: Trainer | None = None
         """Drives the training, once it has begun."""
         self._rendered: Rendered | None = None
@@ -176,7 +186,8 @@ class AbcdPipeline(VanillaPipeline):
         if self.coordinator is not None:
             self.coordinator.pause()
         self.datamanager.take_poses(self.model.poses)
-        found = super().get_average_eval_image_metrics(step, output_path, get_std)
+        with _as_a_command():
+            found = super().get_average_eval_image_metrics(step, output_path, get_std)
         if self.coordinator is not None:
             self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
@@ -185,7 +196,8 @@ class AbcdPipeline(VanillaPipeline):
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """As VanillaPipeline's; cameras stand where their poses were refined to."""
-        super().load_pipeline(loaded_state, step)
+        with _as_a_command():
+            super().load_pipeline(loaded_state, step)
         self.datamanager.take_poses(self.model.poses)
 
     def _after_step(self) -> None:

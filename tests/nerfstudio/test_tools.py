@@ -4,6 +4,7 @@ import copy
 import io
 import json
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -224,6 +225,29 @@ def test_a_network_that_fails_is_one_line(monkeypatch):
     monkeypatch.setattr("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", fails)
     with pytest.raises(metrics.UserError, match="no route to host"):
         metrics._lpips.__wrapped__("cpu")
+
+
+@pytest.mark.parametrize(("moved", "words"), [("data", "elsewhere"), ("photos", "is not a picture")])
+def test_what_a_user_can_mend_ends_a_tool_in_one_line(
+    data, trained, tmp_path, capsys, monkeypatch, moved, words
+):
+    scene = tmp_path / "elsewhere"
+    if moved == "photos":
+        for photo in (Path(shutil.copytree(data, scene)) / "images").iterdir():
+            photo.write_bytes(b"no photo")
+    config = yaml.load((trained / "config.yml").read_text(), Loader=yaml.Loader)
+    config.data = config.pipeline.datamanager.data = scene
+    folder = tmp_path / "abcd" / "run"
+    folder.mkdir(parents=True)
+    (folder / "config.yml").write_text(yaml.dump(config))
+    monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(folder / "config.yml")])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        evaluated(folder, tmp_path)
+    assert ended.value.code == 2
+    said = capsys.readouterr().out
+    assert "error:" in said
+    assert words in said
 
 
 # What TensorBoard, wandb and comet are given

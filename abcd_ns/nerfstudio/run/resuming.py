@@ -120,7 +120,7 @@ def find_start(config: TrainerConfig) -> Start | None:
     """
     if config.load_checkpoint is not None:
         if config.load_dir is not None or config.load_step is not None:
-            raise UserError("--load-checkpoint names all there is to name: leave out --load-dir and --load-step.")
+            raise UserError("--load-checkpoint says it all: leave out --load-dir and --load-step.")
         return _at_checkpoint(config.load_checkpoint)
     if config.load_dir is None:
         if config.load_step is not None:
@@ -173,8 +173,8 @@ def check_blocks(start: Start | None, asked: int) -> None:
         before = store.header.get(ASKED, asked)  # older runs did not write it down
     if before != asked:
         raise UserError(
-            f"The run in {start.store} was begun with --pipeline.blocks {before}, not {asked}: leave the option "
-            "out, or begin anew without --load-dir."
+            f"The run in {start.store} was begun with --pipeline.blocks {before}, not {asked}: leave the "
+            "option out, or begin anew without --load-dir."
         )
 
 
