@@ -149,7 +149,7 @@ class Workers(Protocol):
         """Give a visit to one that is idle."""
 
     def hold(self) -> bool:
-        """Let those that are at work stand still until they are waited for, or given more; whether that can be
+        """Let those that are at work stand still until they are waited for, or given more; whether it can be
         done."""
 
     def wait(self, seconds: float) -> list[Report]:

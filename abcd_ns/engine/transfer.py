@@ -31,8 +31,10 @@ class Download:
         kind = event_of(tensor.device)
         self._there = tensor.to("cpu", non_blocking=kind is not None)
         self._event = kind and kind()
-        if self._event is not None:  # of this device, which need not be the current one
-            self._event.record(torch.get_device_module(tensor.device).current_stream(tensor.device))
+        if self._event is not None:
+            # Of this device, which need not be the current one; Apple's has one stream, which has no name.
+            stream = getattr(torch.get_device_module(tensor.device), "current_stream", None)
+            self._event.record(*([stream(tensor.device)] if stream else []))
 
     def read(self) -> Tensor:
         """It; waits until it is there."""

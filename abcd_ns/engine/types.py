@@ -15,6 +15,12 @@ NEAR_PLANE = 0.01
 """gsplat's near plane; world units."""
 
 
+def as_indices(rows: Tensor | slice) -> Tensor | slice:
+    """`rows` to take out of many tensors: of a mask the indices, for whose number a device is waited once."""
+    is_mask = isinstance(rows, Tensor) and rows.dtype == torch.bool
+    return rows.nonzero()[:, 0] if is_mask else rows
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians as they are optimised: before activation, in world space."""
@@ -55,6 +61,7 @@ class Gaussians:
 
     def __getitem__(self, rows: Integer[Tensor, "m"] | Tensor | slice) -> "Gaussians":
         """The Gaussians at `rows` (indices, a boolean mask or a slice)."""
+        rows = as_indices(rows)
         return Gaussians(**{name: value[rows] for name, value in self.items()})
 
     def to(self, *args, **kwargs) -> "Gaussians":

@@ -1,8 +1,10 @@
 """Between host and device; the rest is seen on the simulated device."""
 
+from types import SimpleNamespace
+
 import torch
 
-from abcd_ns.engine.transfer import upload
+from abcd_ns.engine.transfer import Download, upload
 
 
 class OnDevice(torch.Tensor):
@@ -22,3 +24,17 @@ class OnDevice(torch.Tensor):
 def test_what_is_on_the_device_is_not_pinned():
     there = torch.zeros(3).as_subclass(OnDevice)
     assert upload(there, torch.device("cuda")) is there
+
+
+class Event:
+    """As torch.mps has it."""
+
+    def record(self) -> None: ...
+
+    def synchronize(self) -> None: ...
+
+
+def test_a_device_whose_stream_has_no_name_is_copied_from_too(monkeypatch):
+    monkeypatch.setattr("abcd_ns.engine.transfer.event_of", lambda _: Event)
+    monkeypatch.setattr(torch, "get_device_module", lambda _: SimpleNamespace(Event=Event))
+    assert Download(torch.arange(3)).read().tolist() == [0, 1, 2]

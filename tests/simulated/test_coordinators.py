@@ -1,6 +1,8 @@
 """Whole trainings by the engine on the simulated device: whatever is on the wrong side raises."""
 
+import gc
 import math
+import weakref
 
 import pytest
 import torch
@@ -10,6 +12,7 @@ from abcd_ns.engine.gaussians.block_state import MOMENTS
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
+from abcd_ns.engine.store.derived_scenes import HeldScene
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
@@ -73,12 +76,32 @@ def test_what_is_hardly_missed_goes_at_the_end(tmp_path, start, views, photos, m
     target = lambda sample: (photos(sample.view.index, sample.crop).to(DEVICE), None)  # noqa: E731
     options = {"blocks": 2, "steps": 6, "pass_gaussians": together, "target": target}
     coordinator = on_device(tmp_path, start, views, **options, density=DensityConfig())
-    told = listen(coordinator, ShedAtEnd)
-    train(coordinator, photos)
+    told, held = listen(coordinator, ShedAtEnd), []
+
+    class Watched(HeldScene):
+        def __init__(self, *given) -> None:
+            super().__init__(*given)
+            held.append(weakref.ref(self))
+
+    monkeypatch.setattr("abcd_ns.engine.train.step.last_shedding.HeldScene", Watched)
+    gc.disable()
+    try:
+        train(coordinator, photos)
+        assert [scene() for scene in held] == [None]  # the device has its memory back at once
+    finally:
+        gc.enable()
     (found,) = told
     assert found.gone > 0
     assert coordinator.count() == found.gaussians
     assert found.before - found.after <= 0.5
+
+
+def test_a_mask_is_waited_for_once(start, simulated_gsplat):
+    there = start.to(DEVICE)
+    mask = there.opacities > 0
+    before = simulated_gsplat.waited
+    assert len(there[mask]) == int((start.opacities > 0).sum())
+    assert simulated_gsplat.waited == before + 1
 
 
 @pytest.mark.parametrize("light", ["exposure", "bilateral"])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.packed import WAITS, Packed, pack
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.types import Gaussians, as_indices
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Adam's running moments, under torch's names."""
@@ -70,6 +70,7 @@ class BlockState:
 
     def __getitem__(self, rows: Tensor | slice) -> "BlockState":
         """The Gaussians at `rows` with all that belongs to them; the clocks stay the block's."""
+        rows = as_indices(rows)
         return self._each(lambda part: part[rows])
 
     def _each(self, change: Callable[[Any], Any]) -> "BlockState":

@@ -7,6 +7,7 @@ import torch
 
 from abcd_ns.engine.events import ShedAtEnd, Shedding
 from abcd_ns.engine.render.loss import psnr
+from abcd_ns.engine.store.derived_scenes import ChangedScene
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step import last_shedding
@@ -199,13 +200,13 @@ def test_what_comes_back_from_random_signs_is_what_is_missing_without_a_gaussian
     coordinator, _ = completed(tmp_path, ring, pictured, steps=5, density=replace(STILL, price=0.0))
     everything, draw, view = whole_scene(coordinator), coordinator.run.rasterizer, ring[0]
     whole = coordinator._last._whole
-    probed = _Probe(coordinator.scene)
-    pictures, signs = whole.pictures([view], probed.scene), random_signs(0)
+    probed, signs = _Probe(), random_signs(0)
+    pictures = whole.pictures([view], ChangedScene(coordinator.scene, probed.with_leaf))
     times = 400
     for _ in range(times):
         pictures.backward([view], lambda _, picture: signs(picture.color.shape).to(picture.color))
         probed.take_note()
-    found = probed.worth(0) / times
+    found = probed.worth(0, coordinator.scene) / times
     with torch.no_grad():
         before = draw(everything, view, sh_degree=1).color
         for row in found.argsort(descending=True)[:10].tolist():

@@ -51,13 +51,12 @@ LEAST_ERROR = 1e-10
 class _Probe:
     """Opacities of a scene as leaves: of what comes back it keeps what Gaussians are worth."""
 
-    def __init__(self, scene: BlockScene) -> None:
-        self.scene = ChangedScene(scene, self._with_leaf)
-        self._rest = scene
+    def __init__(self) -> None:
         self._leaves: dict[int, Tensor] = {}
         self._worth: dict[int, Tensor] = {}
 
-    def _with_leaf(self, block: int, gaussians: Gaussians) -> Gaussians:
+    def with_leaf(self, block: int, gaussians: Gaussians) -> Gaussians:
+        """A block as it is to be drawn."""
         if block not in self._leaves:
             self._leaves[block] = gaussians.opacities.detach().clone().clamp_(max=OPAQUE).requires_grad_()
         return replace(gaussians, opacities=self._leaves[block])
@@ -72,10 +71,10 @@ class _Probe:
             self._worth[block] = self._worth.get(block, 0.0) + change.flatten().square()
             logits.grad = None
 
-    def worth(self, block: int) -> Float[Tensor, "n"]:
-        """By now, of those that are drawn; 0 for who showed in no view."""
+    def worth(self, block: int, scene: BlockScene) -> Float[Tensor, "n"]:
+        """By now, of those that are drawn of the scene's block; 0 for who showed in no view."""
         found = self._worth.get(block)
-        return torch.zeros(len(self._rest.gaussians(block))) if found is None else found.cpu()
+        return torch.zeros(len(scene.gaussians(block))) if found is None else found.cpu()
 
 
 class LastShedding:
@@ -137,8 +136,8 @@ class LastShedding:
         blocks = range(run.scene.tree.num_blocks)
         trained = sum(run.scene.clocks(block).steps for block in blocks) // len(blocks)
         chosen = evenly(views, max(trained // RANKING, FEWEST))
-        probe = _Probe(scene)
-        pictures = self._whole.pictures(chosen, probe.scene)
+        probe = _Probe()
+        pictures = self._whole.pictures(chosen, ChangedScene(scene, probe.with_leaf))
         drawn = random_signs(run.config.seed)
 
         def gradient(view: View, picture: Raster) -> Float[Tensor, "h w 3"]:
@@ -151,7 +150,7 @@ class LastShedding:
             run.announce(PhotosWanted(tuple(view.index for view in group)))
             pictures.backward(group, gradient, probe.take_note)
         nowhere = 0.0 if len(chosen) == len(views) else torch.inf
-        worth = [PER_NEPER / len(chosen) * probe.worth(block) for block in blocks]
+        worth = [PER_NEPER / len(chosen) * probe.worth(block, scene) for block in blocks]
         return [torch.where(of_block > 0, of_block, nowhere) for of_block in worth]
 
     @torch.no_grad()
