@@ -14,7 +14,7 @@ class Block:
     number: int
     """From 1, as the progress line counts."""
     gaussians: int | None
-    """None where there is no checkpoint."""
+    """None where no checkpoint has the block."""
     parameters: int | None
     """Of how many numbers they are; None where it is not known."""
     shed: int | None
@@ -35,10 +35,11 @@ class Block:
 
 def describe_blocks(run: RunFolder) -> list[Block]:
     """All blocks, by number."""
-    counts = [None] * run.story.blocks
+    counts = []
     if run.checkpoint is not None:
         tree = run.checkpoint.tree
         counts = tree.assign(run.checkpoint.means).bincount(minlength=tree.num_blocks).tolist()
+    counts += [None] * (run.story.blocks - len(counts))  # cut off since the checkpoint, or there is none
     return [_describe(run, block, count) for block, count in enumerate(counts)]
 
 

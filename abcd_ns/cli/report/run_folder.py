@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -78,6 +78,8 @@ def open_run(path: Path) -> RunFolder:
     settings = read_settings(path)
     story = read_story(path / STATE / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
+    if checkpoint is not None:  # the log does not tell of a block that was cut off and not yet visited
+        story = replace(story, blocks=max(story.blocks, checkpoint.tree.num_blocks))
     return RunFolder(path, settings, story, checkpoint, *_read_store(path / STATE / STORE, checkpoint))
 
 

@@ -69,6 +69,8 @@ class Story:
     """None where the run is still going on, or was killed."""
     moments: tuple[tuple[int, float], ...]
     """(step, training time) of every line."""
+    blocks: int
+    """That space is cut into, as far as is known: one that is cut off during a run has the next number."""
 
     @property
     def step(self) -> int:
@@ -84,11 +86,6 @@ class Story:
         """Training time when so many steps had been taken, between the lines by proportion."""
         steps, seconds = zip(*self.moments, strict=True)
         return float(np.interp(step, steps, seconds))
-
-    @property
-    def blocks(self) -> int:
-        """That space is cut into."""
-        return self.trainings[-1].blocks
 
     @property
     def gaussians(self) -> int:
@@ -123,16 +120,18 @@ def read_story(path: Path) -> Story:
     lines = [_read_line(text, f"{path}, line {number}") for number, text in enumerate(texts, start=1)]
     if not any(isinstance(line, TrainingLine) for line in lines):
         raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
+    trainings, visits = _of(lines, TrainingLine), _join_visits(lines)
     return Story(
-        trainings=_of(lines, TrainingLine),
+        trainings=trainings,
         samples=_of(lines, SampleLine),
-        visits=_join_visits(lines),
+        visits=visits,
         sweeps=_of(lines, SweepEndLine),
         workers=_of(lines, WorkerLine),
         held_out=tuple(line for line in _of(lines, HeldOutLine) if line.psnr is not None),
         shed_at_end=next(reversed(_of(lines, ShedAtEndLine)), None),
         end=next(reversed(_of(lines, EndLine)), None),
         moments=tuple((line.step, line.seconds) for line in lines),
+        blocks=max([trainings[-1].blocks, *(1 + v.block for v in visits if v.block is not None)]),
     )
 
 

@@ -13,8 +13,10 @@ from abcd_ns.cli.report.run_folder import Checkpoint, RunFolder, default_config
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.lab.results.run import ViewScore
+from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.nerfstudio.run.log_lines import KINDS
-from abcd_ns.nerfstudio.run.settings import SCHEMA, Settings, flat_options
+from abcd_ns.nerfstudio.run.run_log import LOG_FILE
+from abcd_ns.nerfstudio.run.settings import SCHEMA, SETTINGS_FILE, Settings, flat_options
 from tests.lab.compare.records import MACHINE, VERSIONS
 
 TRAINING = {
@@ -83,6 +85,15 @@ def made_up_run(tmp_path: Path, **settings) -> RunFolder:
     """A run without a folder."""
     story = read_story(write_log(tmp_path / "log.jsonl", log_lines()))
     return RunFolder(tmp_path, made_up_settings(**settings), story, made_up_checkpoint(tmp_path))
+
+
+def made_up_folder(path: Path) -> Path:
+    """A run's folder with its settings and its log alone."""
+    (path / STATE).mkdir(parents=True)
+    settings = json.dumps(dataclasses.asdict(made_up_settings()), default=str)
+    (path / STATE / SETTINGS_FILE).write_text(settings)
+    write_log(path / STATE / LOG_FILE, log_lines())
+    return path
 
 
 def made_up_score(row: int, psnr: float, name: str | None = None) -> ViewScore:

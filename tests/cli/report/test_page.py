@@ -3,7 +3,6 @@
 import base64
 import dataclasses
 import hashlib
-import json
 import re
 import shlex
 from html.parser import HTMLParser
@@ -20,7 +19,7 @@ from abcd_ns.cli.report.held_out import HeldOut, data_uri, pick
 from abcd_ns.cli.report.options import changed_options, training_command
 from abcd_ns.cli.report.page import render_page, sparkline
 from abcd_ns.cli.report.plan import make_plan, push_apart
-from abcd_ns.cli.report.run_folder import open_run
+from abcd_ns.cli.report.run_folder import CHECKPOINTS, open_run
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.cli.report.svg import DARK
 from abcd_ns.engine.gaussians.spherical_harmonics import count_parameters
@@ -30,12 +29,11 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.lab.runs.evaluate import Drawn, HeldOutView
-from abcd_ns.nerfstudio.run.run_log import LOG_FILE
-from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from tests.cli.report.runs import (
     TRAINING,
     line,
     log_lines,
+    made_up_folder,
     made_up_held_out,
     made_up_run,
     made_up_score,
@@ -291,17 +289,29 @@ def test_what_gaussians_fill_is_the_weight_that_was_added_up_over_the_views(tmp_
     count = len(tensors["means"])
     passes = torch.full((count,), 0.5).index_fill(0, torch.tensor([0]), 0.0)
     rest[0] = ({**tensors, "growth.weight": torch.full((count,), 3.0), "growth.passes": passes}, meta)
-    folder = tmp_path / "run"
-    (folder / "abcd").mkdir(parents=True)
-    (folder / "abcd" / SETTINGS_FILE).write_text(
-        json.dumps(dataclasses.asdict(made_up_settings()), default=str)
-    )
-    write_log(folder / "abcd" / LOG_FILE, log_lines())
+    folder = made_up_folder(tmp_path / "run")
     with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
         store.commit(rest, state=RunState(views={0: 4, 1: 4}).to_json())
     found = open_run(folder)
     assert found.filled == {0: 6.0}
     assert sum(found.parameters.values()) == count_parameters(scene.features_rest)
+
+
+def test_blocks_are_those_of_the_log_and_of_the_checkpoint(tmp_path):
+    """The log does not tell when a block is cut, and a checkpoint may be older than the log."""
+    run = made_up_run(tmp_path)
+    older = dataclasses.replace(run, story=dataclasses.replace(run.story, blocks=4))
+    assert [block.gaussians for block in describe_blocks(older)] == [200, 200, 200, None]
+    folder = made_up_folder(tmp_path / "run")
+    assert open_run(folder).story.blocks == 3
+    for blocks, known in ((2, 3), (5, 5)):
+        tree = build_kd(run.checkpoint.means, blocks)
+        state = {"_model._extra_state": {"tree": tree.to_json()}, **run.checkpoint.pipeline}
+        (folder / CHECKPOINTS).mkdir(exist_ok=True)
+        torch.save({"step": 39, "pipeline": state}, folder / CHECKPOINTS / "step-000000039.ckpt")
+        found = open_run(folder)
+        assert found.story.blocks == len(describe_blocks(found)) == known
+        assert {fact.name: fact.value for fact in headline(found, None)}["blocks"] == str(known)
 
 
 def test_states_of_blocks_say_why_one_was_not_trained(tmp_path):

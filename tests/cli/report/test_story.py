@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from abcd_ns.cli.report.charts import draw_block_quality, draw_visits
 from abcd_ns.cli.report.headline import _shed_at_end
 from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.lab.results.records import RecordError
@@ -36,6 +37,19 @@ def test_a_visit_whose_beginning_is_lost_began_as_long_ago_as_it_says(tmp_path):
     end = line("visit end", 60, 30.0, visit=7, visit_seconds=4.5)
     story = read_story(write_log(tmp_path / "log.jsonl", [line("training", 50, 27.0, **TRAINING), end]))
     assert [(visit.number, visit.began) for visit in story.visits] == [(7, 25.5)]
+
+
+def test_blocks_that_were_cut_off_during_the_run_count(tmp_path):
+    lines = log_lines()
+    lines[0] = line("training", 0, 0.0, **TRAINING | {"blocks": 1})
+    story = read_story(write_log(tmp_path / "log.jsonl", lines))
+    assert story.blocks == 3
+    shown = draw_visits(story).axes[0]
+    lowest, highest = sorted(shown.get_ylim())
+    assert all(lowest < bar.get_y() and bar.get_y() + bar.get_height() < highest for bar in shown.patches)
+    assert len(draw_block_quality(story).axes[0].lines) == 3
+    alone = read_story(write_log(tmp_path / "log.jsonl", lines[:3]))
+    assert (alone.blocks, draw_block_quality(alone)) == (1, None)
 
 
 def test_a_log_cut_anywhere_is_read_up_to_its_last_whole_line(tmp_path):
