@@ -203,8 +203,8 @@ def _read_store(
 
 
 def _filled(store: ParameterStore, block: int) -> float | None:
-    """Pixels; None where nobody was weighed, as by methods that keep everything."""
-    with suppress(KeyError):
+    """Pixels; None where nobody was weighed, as by methods that keep everything, or nobody can say."""
+    with suppress(KeyError, StoreError):  # a run that goes on may have put another shard in its place
         weight, passes = store.load(block, [f"growth.{name}" for name in WEIGHED])[0].values()
         if bool((passes > 0).any()):
             return float((weight / passes)[passes > 0].median())

@@ -297,6 +297,25 @@ def test_what_gaussians_fill_is_the_weight_that_was_added_up_over_the_views(tmp_
     assert sum(found.parameters.values()) == count_parameters(scene.features_rest)
 
 
+def test_a_run_that_commits_while_its_blocks_are_read_has_a_page(tmp_path, monkeypatch):
+    """Without a checkpoint nothing keeps what is at rest: a commit takes the shards from under a reader."""
+    scene = random_gaussians(6)
+    tree = build_kd(scene.means, 2)
+    folder = made_up_folder(tmp_path / "run")
+    load = ParameterStore.load
+    with ParameterStore.create(folder / "abcd/store", {"tree": tree.to_json()}) as store:
+        store.commit(blocks_at_rest(tree, scene), state=RunState(views={0: 4, 1: 4}).to_json())
+
+        def commit_then_load(reader: ParameterStore, *args):
+            store.commit(blocks_at_rest(tree, scene))
+            return load(reader, *args)
+
+        monkeypatch.setattr(ParameterStore, "load", commit_then_load)
+        found = open_run(folder)
+    assert found.filled == {}
+    assert list(found.parameters) == [0, 1]
+
+
 def test_blocks_are_those_of_the_log_and_of_the_checkpoint(tmp_path):
     """The log does not tell when a block is cut, and a checkpoint may be older than the log."""
     run = made_up_run(tmp_path)
