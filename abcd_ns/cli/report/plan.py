@@ -54,6 +54,13 @@ class Plan:
         """Gaussians by block."""
         return np.bincount(self.owner, minlength=self.tree.num_blocks)
 
+    @cached_property
+    def by_block(self) -> list[Float[np.ndarray, "m 3"]]:
+        """The means of each block's Gaussians."""
+        # Sorted once: to search all of them for each block would take as many passes as there are blocks.
+        order = np.argsort(self.owner, kind="stable")
+        return np.split(self.means[order], np.cumsum(self.counts)[:-1])
+
 
 def make_plan(tree: BlockTree, means: Float[Tensor, "n 3"], cameras: Sequence[Cameras] = ()) -> Plan:
     """The scene of a checkpoint.
@@ -211,5 +218,5 @@ class _Sheet:
     def _middle(self, block: int) -> np.ndarray:
         """Where a block's Gaussians are, or else its cell."""
         lower, upper = self._cell(block)
-        own = self.plan.means[self.plan.owner == block][:, self.chosen]
+        own = self.plan.by_block[block][:, self.chosen]
         return np.clip(np.median(own, axis=0), lower, upper) if len(own) else (lower + upper) / 2

@@ -369,3 +369,11 @@ def test_a_sparkline_rises_where_values_do():
     (noise,) = re.findall(r'points="([^"]+)"', sparkline([20.0, 20.01]))
     heights = [float(point.split(",")[1]) for point in noise.split()]
     assert abs(heights[0] - heights[1]) < 1
+
+
+def test_means_by_block_are_those_that_a_search_finds():
+    means = torch.randn(300, 3, generator=torch.Generator().manual_seed(0))
+    plan = make_plan(build_kd(means, 7), means[:40])
+    for block, found in enumerate(plan.by_block):
+        assert np.array_equal(found, plan.means[plan.owner == block])
+    assert len(plan.by_block) == 7
