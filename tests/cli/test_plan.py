@@ -7,11 +7,13 @@ import math
 import pytest
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast
 from abcd_ns.cli.plan.forecast import Forecast, device_shares, disk_shares, views_of_blocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
+from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import FITTED, Fit
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with
@@ -41,6 +43,22 @@ def test_views_of_blocks_counts_as_a_loop_over_points_does():
             expected[block] += 1
     assert views_of_blocks(tree, points, views) == tuple(expected)
     assert 0 < sum(expected) < 30
+
+
+def test_of_many_points_a_choice_from_every_block_is_looked_at(monkeypatch):
+    points, views = random_gaussians(3000).means * 3, ring_of_views(5)
+    tree, looked_at, depths_of = build_kd(points, 6), [], View.depths_of
+    everything = views_of_blocks(tree, points, views)
+
+    def count(view: View, some: Tensor):
+        looked_at.append(tree.assign(some).bincount(minlength=6).tolist())
+        return depths_of(view, some)
+
+    monkeypatch.setattr("abcd_ns.cli.plan.forecast.MOST_POINTS", 1000)
+    monkeypatch.setattr(View, "depths_of", count)
+    assert views_of_blocks(tree, points, views) == everything
+    assert [sum(by_block) for by_block in looked_at] == [1000] * 5
+    assert {number for by_block in looked_at for number in by_block} <= {166, 167}
 
 
 def test_a_forecast_adds_up():
