@@ -1,7 +1,8 @@
 """Serves the crops of photos that the active block is trained on, with its cached F and B layers."""
 
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -18,11 +19,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from torch.utils.data import DataLoader
 
 from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.data.input_errors import InputError
 from abcd_ns.engine.events import Event, PhotosWanted
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
+from abcd_ns.errors import IMPORT_TROUBLE
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.flags import hidden
 from abcd_ns.nerfstudio.views import place_cameras
@@ -30,6 +33,8 @@ from abcd_ns.units import GIB
 
 BATCH = "abcd_batch"
 """The key of a camera's metadata under which what to train on travels from here to the model."""
+TROUBLE = (*IMPORT_TROUBLE, ArithmeticError, AssertionError, LookupError)
+"""What readers end with where data is not what they expect."""
 
 
 OUR_READER = "abcd-data"
@@ -66,6 +71,28 @@ def reader_name(config: DataParserConfig) -> str:
     """The name of a reader on the command line; of one that nerfstudio does not know, its class's."""
     kind = type(config)
     return next((name for name, known in READERS.items() if type(known) is kind), kind.__name__)
+
+
+@contextmanager
+def reading(config: DataParserConfig) -> Iterator[None]:
+    """Put what a reader stumbles over into a sentence.
+
+    Raises:
+        InputError: the body ended with what readers end with.
+    """
+    name = reader_name(config)
+    try:
+        yield
+    except EOFError as error:  # of input()
+        raise InputError(
+            f"{name} asks the question above, and there is no terminal to answer it: run the command in "
+            f"one, or change what it is about by an option of `ns-train abcd {name} --help`."
+        ) from error
+    except TROUBLE as error:
+        raise InputError(
+            f"{name} cannot read {config.data} ({type(error).__name__}: {error}); `ns-train abcd {name} "
+            "--help` lists its options."
+        ) from error
 
 
 @hidden(*UNUSED)
@@ -110,11 +137,12 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     """Of decoded training photos and masks that may be kept on the device; of the others, crops are copied
     there for each step. Of no use on the CPU."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, config: AbcdDataManagerConfig, *args: Any, **kwargs: Any) -> None:
         self._coordinator: Trainer | None = None
         self._on_device: dict[tuple[str, int], torch.Tensor] = {}
         self._used = 0
-        super().__init__(*args, **kwargs)
+        with reading(config.reader()):
+            super().__init__(config, *args, **kwargs)
         self._eval_order = random.Random(0)
 
     def create_train_dataset(self) -> AbcdDataset:

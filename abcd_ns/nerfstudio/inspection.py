@@ -7,11 +7,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.prepare import check_masks
-from abcd_ns.errors import IMPORT_TROUBLE
-from abcd_ns.nerfstudio.datamanager import reader_name
-
-TROUBLE = (*IMPORT_TROUBLE, ArithmeticError, AssertionError, LookupError)
-"""What readers end with where data is not what they expect."""
+from abcd_ns.nerfstudio.datamanager import reading
 
 
 @dataclass(frozen=True)
@@ -49,16 +45,5 @@ def factor_of(parser: DataParser) -> int:
 
 
 def _read(parser: DataParser, split: str) -> DataparserOutputs:
-    name, data = reader_name(parser.config), parser.config.data
-    try:
+    with reading(parser.config):
         return parser.get_dataparser_outputs(split=split)
-    except EOFError as error:  # of input()
-        raise InputError(
-            f"{name} asks the question above, and there is no terminal to answer it: run the command in "
-            f"one, or change what it is about by an option of `ns-train abcd {name} --help`."
-        ) from error
-    except TROUBLE as error:
-        raise InputError(
-            f"{name} cannot read {data} ({type(error).__name__}: {error}); `ns-train abcd {name} --help` "
-            "lists its options."
-        ) from error

@@ -23,6 +23,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from abcd_ns.cli.mesh.command import mesh
+from abcd_ns.cli.report.command import report
 from abcd_ns.cli.report.options import training_command
 from abcd_ns.cli.report.run_folder import load_pipeline, open_run
 from abcd_ns.data.input_errors import InputError
@@ -30,6 +32,7 @@ from abcd_ns.engine.render.loss import psnr
 from abcd_ns.nerfstudio import metrics
 from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.model import AbcdModel
+from abcd_ns.nerfstudio.trainer import AbcdTrainer
 from tests.data.test_layouts import write_blender
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, VIEWS, WIDTH
@@ -337,10 +340,15 @@ def test_cameras_stay_as_they_are(data, tmp_path):
 # Data of other readers
 
 
-def test_a_scene_that_nerfstudios_colmap_reader_reads_trains_as_ours_does(data, tmp_path):
-    config = configure(data, tmp_path, steps=8)
+@pytest.fixture(scope="module")
+def theirs(data, tmp_path_factory) -> AbcdTrainer:
+    """A run whose data nerfstudio's own reader has read."""
+    config = configure(data, tmp_path_factory.mktemp("theirs"), steps=8)
     config.pipeline.datamanager.dataparser = ColmapDataParserConfig(colmap_path=Path("sparse/0"))
-    theirs = run(config)
+    return run(config)
+
+
+def test_a_scene_that_nerfstudios_colmap_reader_reads_trains_as_ours_does(data, theirs, tmp_path):
     ours = run(configure(data, tmp_path / "ours", steps=8))
     for name in ("train_dataset", "eval_dataset"):
         a, b = (getattr(trainer.pipeline.datamanager, name) for trainer in (theirs, ours))
@@ -354,6 +362,17 @@ def test_a_scene_that_nerfstudios_colmap_reader_reads_trains_as_ours_does(data, 
     assert isinstance(load_pipeline(found, found.checkpoint, data).model, AbcdModel)
     again = shlex.split(training_command(found.settings).replace("\\\n", ""))
     assert again[again.index("colmap") :] == ["colmap", "--colmap-path", "sparse/0"]
+
+
+def test_the_wrong_data_for_another_reader_is_one_line(theirs, tmp_path):
+    found, out = open_run(theirs.base_dir), tmp_path / "new.ply"
+    with pytest.raises(InputError, match=f"colmap cannot read {tmp_path}"):
+        load_pipeline(found, found.checkpoint, tmp_path)
+    assert report(theirs.base_dir, data=tmp_path, out=tmp_path / "page.html") == 0
+    assert "colmap cannot read" in (tmp_path / "page.html").read_text()
+    with pytest.raises(InputError, match=f"colmap cannot read {tmp_path}"):
+        mesh(theirs.base_dir, data=tmp_path, out=out, frame="nerfstudio")
+    assert not out.exists()
 
 
 def test_a_scene_without_points_begins_at_random_and_says_so(tmp_path, capsys):
