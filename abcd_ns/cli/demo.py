@@ -21,7 +21,7 @@ from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.pictures import PictureArray, draw_comparison, psnr_of, read_picture
 from abcd_ns.lab.results.style import STYLE
-from abcd_ns.lab.runs.runner import take_folder
+from abcd_ns.lab.runs.runner import take_folder, taking
 
 SCENE = {"courts": 1, "views_per_court": 56, "width": 256, "height": 192, "points_per_court": 24_000}
 """What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
@@ -98,17 +98,19 @@ def demo(
         blocks: Blocks that space is cut into.
 
     Raises:
-        UserError: `out` holds something else, an option is out of range, or nerfstudio is not installed.
+        UserError: `out` holds something else or cannot be written, an option is out of range, or nerfstudio
+            is not installed.
     """
     if not 0 < seconds < math.inf:
         raise UserError(f"--seconds is {seconds}; it must be above 0 and finite.")
     if blocks < 1:
         raise UserError(f"--blocks is {blocks}; it must be at least 1.")
     console = Console()
-    take_folder(out, out / MARKER, "demo")
-    (out / MARKER).write_text("Made by `abcd demo`. Everything here may be deleted.\n", encoding="utf-8")
     logs = out / "logs"
-    logs.mkdir(exist_ok=True)
+    with taking(out):
+        take_folder(out, out / MARKER, "demo")
+        (out / MARKER).write_text("Made by `abcd demo`. Everything here may be deleted.\n", encoding="utf-8")
+        logs.mkdir(exist_ok=True)
     try:
         _carry_out(Steps(console, logs), out, seconds, blocks, console)
     except StepFailed as error:

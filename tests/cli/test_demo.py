@@ -170,6 +170,8 @@ def test_a_folder_of_something_else_is_left_alone(commands, tmp_path):
     assert os.listdir(tmp_path / "mine") == ["thesis.tex"]
     with pytest.raises(UserError, match="is a file"):
         demo(out=tmp_path / "mine" / "thesis.tex")
+    with pytest.raises(UserError, match=r"thesis.tex/demo cannot be written: Not a directory"):
+        demo(out=tmp_path / "mine" / "thesis.tex" / "demo")
     assert commands.calls() == []
 
 

@@ -192,6 +192,12 @@ def test_foreign_folder_is_refused_even_with_overwrite(tmp_path: Path) -> None:
     assert contents(tmp_path) == {"images/holiday.jpg": b"dear"}
 
 
+def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"file/scene cannot be written: Not a directory; name another"):
+        synth(tmp_path / "file" / "scene", Settings(**TINY))
+
+
 @pytest.mark.usefixtures("bare")
 def test_other_scene_is_replaced_only_on_request(tmp_path: Path) -> None:
     synth(tmp_path, Settings(**SMALL))

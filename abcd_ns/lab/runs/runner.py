@@ -6,7 +6,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +34,28 @@ def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = Fal
         overwrite: drop the runs that are there.
 
     Raises:
-        UserError: `out` holds something else, or runs that do not share that.
+        UserError: `out` holds something else, or runs that do not share that, or cannot be written.
     """
     marker = out / f"{kind.replace(' ', '-')}.json"
-    if take_folder(out, marker, kind) and overwrite:
-        shutil.rmtree(out / "runs", ignore_errors=True)
-    elif marker.exists():
-        _check_same(read_json(marker), shared, out)
-    write_json(marker, dict(shared))
+    with taking(out):
+        if take_folder(out, marker, kind) and overwrite:
+            shutil.rmtree(out / "runs", ignore_errors=True)
+        elif marker.exists():
+            _check_same(read_json(marker), shared, out)
+        write_json(marker, dict(shared))
+
+
+@contextmanager
+def taking(out: Path) -> Iterator[None]:
+    """Around what makes a user's folder one of ours and marks it.
+
+    Raises:
+        UserError: the operating system does not let it.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror}; name another folder.") from None
 
 
 def take_folder(out: Path, marker: Path, kind: str) -> bool:

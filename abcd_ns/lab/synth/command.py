@@ -17,7 +17,7 @@ from rich.text import Text
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_json, write_json
-from abcd_ns.lab.runs.runner import take_folder
+from abcd_ns.lab.runs.runner import take_folder, taking
 from abcd_ns.lab.synth.colmap_writer import write_model
 from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points
 from abcd_ns.lab.world.court import Layout, Site, build_world, court_cameras
@@ -95,14 +95,15 @@ def synth(
         overwrite: Replace an earlier result of this command that has other settings or is incomplete.
 
     Raises:
-        UserError: a setting is out of range, or `out` holds something else.
+        UserError: a setting is out of range, or `out` holds something else or cannot be written.
     """
     settings.check()
     console = Console(stderr=True)
-    if not _prepare(out, settings, overwrite):
-        console.print(Text(f"{out} already holds this scene; nothing to do."), soft_wrap=True)
-        return
-    write_json(out / MARKER, _marker(settings, complete=False))
+    with taking(out):
+        if not _prepare(out, settings, overwrite):
+            console.print(Text(f"{out} already holds this scene; nothing to do."), soft_wrap=True)
+            return
+        write_json(out / MARKER, _marker(settings, complete=False))
     pictures, points = _draw(out, settings, console)
     (out / "SOURCE.md").write_text(_source(settings, pictures, points), encoding="utf-8")
     write_json(out / MARKER, _marker(settings, complete=True))

@@ -160,6 +160,18 @@ def test_a_file_is_no_folder(plan):
         run(plan)
 
 
+def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(plan, tmp_path):
+    (tmp_path / "file").write_text("")
+    inside = tmp_path / "file" / "out"
+    with pytest.raises(UserError, match=rf"^{inside} cannot be written: Not a directory; name"):
+        run(dataclasses.replace(plan, out=inside))
+    plan.out.mkdir()
+    (plan.out / "comparison.json").write_text("{}")
+    (plan.out / ".comparison.json.tmp").mkdir()  # in the marker's way, as a folder of another user's is
+    with pytest.raises(UserError, match=rf"^{plan.out} cannot be written"):
+        run(plan, overwrite=True)
+
+
 def test_splatfacto_is_left_out_with_a_reason_where_it_cannot_run(plan, worker, monkeypatch):
     jobs = tuple(Job("splatfacto", seed, plan.settings) for seed in (0, 1))
     wanted = dataclasses.replace(plan, jobs=(*jobs, plan.jobs[1]))
