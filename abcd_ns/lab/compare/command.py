@@ -89,9 +89,13 @@ def compare(
         overwrite: Drop the runs that OUT holds.
 
     Raises:
-        UserError: an option cannot be used, or OUT holds something else.
+        UserError: an option or the scene cannot be used, or OUT holds something else.
     """
+    # Here and not above: nerfstudio takes seconds to import, and `--help` has no use for it.
+    from abcd_ns.lab.runs.configs import check_scene
+
     plan = make_plan(options.over(read_options(config)) if config else options)
+    check_scene(plan.jobs[0])
     return carry_out(plan, Console(), overwrite)
 
 

@@ -10,6 +10,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, carry_out, impossible, make_plan
 from abcd_ns.lab.job import Job, Plan
@@ -170,6 +171,15 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(plan, tmp_path)
     (plan.out / ".comparison.json.tmp").mkdir()  # in the marker's way, as a folder of another user's is
     with pytest.raises(UserError, match=rf"^{plan.out} cannot be written"):
         run(plan, overwrite=True)
+
+
+def test_a_scene_that_cannot_be_read_is_refused_before_the_first_run(plan, worker, capsys):
+    """It is a folder, but holds no model."""
+    words = ["compare", "--data", plan.settings.data, "--out", str(plan.out), "--steps", "10"]
+    assert cli.main(words) == 2
+    assert "holds no model" in " ".join(capsys.readouterr().err.split())
+    assert not plan.out.exists()
+    assert worker.calls() == []
 
 
 def test_splatfacto_is_left_out_with_a_reason_where_it_cannot_run(plan, worker, monkeypatch):
