@@ -1,5 +1,6 @@
 """Joins datamanager and model to a coordinator when training begins."""
 
+import math
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,7 @@ from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import thin_out
 from abcd_ns.engine.render import loss
-from abcd_ns.engine.space.partition import build_grid, build_kd, robust_range
+from abcd_ns.engine.space.partition import MAX_CELLS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
@@ -35,6 +36,7 @@ from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
+from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.fit import (
@@ -368,11 +370,21 @@ class AbcdPipeline(VanillaPipeline):
 
 
 def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:
-    """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all."""
+    """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all.
+
+    Raises:
+        UserError: these would be over MAX_CELLS.
+    """
     low, high = robust_range(gaussians.means.double().cpu())
     extent = (high - low).clamp_min(1e-9).tolist()
     counts = [1, 1, 1]
-    while counts[0] * counts[1] * counts[2] < blocks:
+    while (cells := math.prod(counts)) < blocks and cells <= MAX_CELLS:
         widest = max(range(3), key=lambda axis: extent[axis] / counts[axis])
         counts[widest] += 1
+    if cells > MAX_CELLS:
+        grid = " x ".join(map(str, counts))
+        raise UserError(
+            f"--pipeline.blocks {blocks} asks for a grid of {grid} cells here or more, and {MAX_CELLS} are "
+            "the most: give fewer, or --pipeline.partition kd."
+        )
     return counts[0], counts[1], counts[2]

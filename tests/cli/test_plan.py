@@ -199,6 +199,7 @@ def test_workers_need_blocks_to_go_round_and_what_they_are_sent_is_said(capsys):
     "option",
     [
         {"blocks": -1},
+        {"blocks": 65_537},
         {"steps": 0},
         {"max_gaussians": -5},
         {"workers": 0},

@@ -2,16 +2,19 @@
 
 import copy
 import dataclasses
+import math
 import re
 from pathlib import Path
 
 import pytest
+import torch
 import tyro
 import yaml
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, method_configs
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from abcd_ns import methods
+from abcd_ns.engine.space.partition import MAX_CELLS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
@@ -28,7 +31,9 @@ from abcd_ns.nerfstudio.options import (
     mirror,
     refuse_flags,
 )
+from abcd_ns.nerfstudio.pipeline import grid_counts
 from abcd_ns.nerfstudio.run.settings import flat_options
+from tests.reference.scenes import random_gaussians
 
 METHODS = {
     found.config.method_name: found.config
@@ -170,6 +175,28 @@ def test_what_must_be_0_or_more_is_refused_where_it_is_not(name, value):
     setattr(config.pipeline, name, value)
     with pytest.raises(UserError, match=f"--pipeline.{name.replace('_', '-')} must be 0 or more and finite"):
         check_options(config)
+
+
+@pytest.mark.parametrize("partition", ["kd", "grid"])
+def test_more_blocks_than_fit_in_memory_are_refused(partition):
+    config = copy.deepcopy(METHODS["abcd"])
+    config.pipeline.partition, config.pipeline.blocks = partition, MAX_CELLS
+    check_options(config)
+    config.pipeline.blocks += 1
+    with pytest.raises(UserError, match=r"--pipeline\.blocks must be 65536 or less, not 65537"):
+        check_options(config)
+
+
+@pytest.mark.parametrize(
+    ("extent", "blocks"), [((1.0, 1.0, 1.0), 65_000), ((1.0, 1.0, 0.004), 65_100), ((1.0, 0.0, 0.0), 10**9)]
+)
+def test_a_grid_of_more_cells_than_fit_in_memory_is_refused_by_its_flag(extent, blocks):
+    """It has more of them than were asked for, or as many; and that is found out soon."""
+    gaussians = random_gaussians(50)
+    gaussians.means[:] = torch.linspace(0, 1, 50)[:, None] * torch.tensor(extent)
+    with pytest.raises(UserError, match=rf"--pipeline.blocks {blocks} .* give fewer, or --pipeline.part"):
+        grid_counts(gaussians, blocks)
+    assert math.prod(grid_counts(gaussians, 1000)) >= 1000
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 0.0, float("nan"), float("inf")])

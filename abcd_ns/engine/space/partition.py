@@ -9,7 +9,8 @@ from torch import Tensor
 from abcd_ns.engine.space.tree import EVERYWHERE, BlockTree, Box, in_float64, tree_from_rows
 
 MAX_CELLS = 65_536
-"""The most cells that a grid may have: far more than any scene needs, few enough to fit in memory."""
+"""The most blocks that space may be cut into to begin with, and the most cells of a grid: far more than any
+scene needs, few enough to fit in memory."""
 
 
 def best_split(points: Float[Tensor, "n 3"], box: Box, share: float = 0.5) -> tuple[int, float]:

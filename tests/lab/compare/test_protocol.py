@@ -62,6 +62,7 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"steps": None, "seconds": 0.0}, "--seconds is 0.0"),
         ({"steps": None, "seconds": float("nan")}, "--seconds is nan"),
         ({"blocks": 0}, "--blocks is 0"),
+        ({"blocks": 65_537}, "--blocks is 65537; it must be at most 65536"),
         ({"downscale": 0}, "--downscale is 0"),
         ({"evals": 0}, "--evals is 0"),
         ({"max_gaussians": -1}, "--max-gaussians is -1"),

@@ -157,6 +157,12 @@ def test_conditions_out_of_range_are_refused(scene, more, message):
         BlocksStudy(**given(scene, **more), blocks=(1, 2)).plan()
 
 
+@pytest.mark.parametrize("blocks", [(1, 65_537), (65_537, 65_538)])
+def test_more_blocks_than_fit_in_memory_are_refused(scene, blocks):
+    with pytest.raises(UserError, match="blocks=65537: blocks must be 1 to 65536, not 65537"):
+        BlocksStudy(**given(scene), blocks=blocks).plan()
+
+
 @pytest.mark.parametrize("blocks", [(), (0, 1), (2, 2), (3,)])
 def test_numbers_of_blocks_must_be_several_and_different(scene, blocks):
     with pytest.raises(UserError, match=r"--blocks.* give "):
@@ -169,7 +175,8 @@ def test_numbers_of_blocks_must_be_several_and_different(scene, blocks):
         ((), "at least one change"),
         (("blocks=2", "blocks=2"), "'blocks=2' is given twice"),
         (("training.warmup=0", "training.warmup=0.0"), "'training.warmup=0' is given twice"),
-        (("blocks=0",), "blocks must be 1 or more"),
+        (("blocks=0",), "blocks must be 1 to 65536, not 0"),
+        (("blocks=65537",), "blocks must be 1 to 65536, not 65537"),
         (("training.batch=1", "training.btach=2"), "no option 'training.btach'"),
         (("model.num_downscales=1",), "has no effect here"),
     ],
