@@ -1,5 +1,6 @@
 """Reads and checks everything that a scene consists of, once for all of its splits."""
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,6 +124,8 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
         raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
+    if not 0 < options.scale_factor < math.inf:
+        raise InputError(f"--scale-factor is {options.scale_factor}; it must be above 0 and finite.")
     problems = Problems()
     try:
         scene = read_scene(options.data, options.images_path, options.masks_path)

@@ -110,10 +110,11 @@ def check_options(config: TrainerConfig) -> None:
     pipeline = config.pipeline
     if config.machine.num_devices * config.machine.num_machines > 1:
         raise UserError("For several devices give --pipeline.workers; leave out --machine.num-devices.")
-    for name in ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb"):
-        if not 0 <= getattr(pipeline, name) < math.inf:
+    for name in ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "datamanager.photo_cache_gb"):
+        value = attrgetter(name)(pipeline)
+        if not 0 <= value < math.inf:
             flag = name.replace("_", "-")
-            raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {getattr(pipeline, name)}.")
+            raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")
     if pipeline.blocks > MAX_CELLS:
         raise UserError(f"--pipeline.blocks must be {MAX_CELLS} or less, not {pipeline.blocks}.")
     if pipeline.max_seconds is not None and not 0 < pipeline.max_seconds < math.inf:

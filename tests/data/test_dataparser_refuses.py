@@ -1,6 +1,7 @@
 """Scenes that cannot be trained on: each fault is refused with one line that names its file."""
 
 import json
+import math
 import os
 import shutil
 import struct
@@ -231,6 +232,7 @@ def test_long_lists_are_cut_with_a_count():
     [
         ({"downscale_factor": 0}, "downscale-factor"),
         ({"downscale_factor": 2.5}, "downscale-factor"),
+        *(({"scale_factor": value}, "scale-factor is") for value in (0.0, -1.0, math.nan, math.inf)),
         ({"downscale_factor": 50}, "leaves nothing"),
         ({"eval_interval": 1}, "eval-interval"),
     ],

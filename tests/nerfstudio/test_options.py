@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import math
 import re
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -168,11 +169,14 @@ def test_what_has_no_effect_is_refused_from_files_too(change, says):
     assert says in str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["device_budget_gb", "near_plane", "ram_budget_gb"])
+@pytest.mark.parametrize(
+    "name", ["device_budget_gb", "near_plane", "ram_budget_gb", "datamanager.photo_cache_gb"]
+)
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
 def test_what_must_be_0_or_more_is_refused_where_it_is_not(name, value):
     config = copy.deepcopy(METHODS["abcd"])
-    setattr(config.pipeline, name, value)
+    way, _, last = f"pipeline.{name}".rpartition(".")
+    setattr(attrgetter(way)(config), last, value)
     with pytest.raises(UserError, match=f"--pipeline.{name.replace('_', '-')} must be 0 or more and finite"):
         check_options(config)
 
@@ -207,6 +211,14 @@ def test_a_time_limit_that_is_none_is_refused(seconds):
         check_options(config)
     config.pipeline.max_seconds = 0.5
     check_options(config)
+
+
+@pytest.mark.parametrize("share", [-0.1, 0.0, float("nan"), float("inf")])
+def test_a_decay_to_no_rate_is_refused(share):
+    config = copy.deepcopy(METHODS["abcd"])
+    config.pipeline.training.means_lr_decay = share
+    with pytest.raises(UserError, match=r"--pipeline\.training\.means-lr-decay must be above 0 and finite"):
+        check_options(config)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """How a scene is trained: every option of the engine, with its default."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -110,6 +111,7 @@ class TrainingConfig:
             ("window-weight", 0 <= self.window_weight < 1, "from 0 to below 1"),
             ("batch", self.batch >= 0, "0 or more"),
             ("visit-views", self.visit_views > 0, "above 0"),
+            ("means-lr-decay", 0 < self.means_lr_decay < math.inf, "above 0 and finite"),
             ("first-passes", self.first_passes > 0, "above 0"),
         ):
             if not fits:
