@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
-from abcd_ns.engine.render import Rasterizer, Shot
-from abcd_ns.engine.space.influence import AT_ONCE, COARSE_SIDE, coarser
+from abcd_ns.engine.render import Rasterizer
+from abcd_ns.engine.space.influence import COARSE_SIDE, coarser, in_passes
 from abcd_ns.engine.space.visibility import footprint
 from abcd_ns.engine.store.special_blocks import BlockName
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -75,9 +75,9 @@ def _extents_of_most(
     them alone."""
     times = [max(max(view.width, view.height) // COARSE_SIDE, 1) for view in views]
     small = [coarser(view, by) for view, by in zip(views, times, strict=True)]
-    most, extents = max(AT_ONCE // max(len(gaussians), 1), 1), list[Tensor]()
-    for few in (small[k : k + most] for k in range(0, len(small), most)):
-        rasters = rasterizer.draw(gaussians.detach(), [Shot(view, view.full) for view in few], sh_degree=0)
+    extents = list[Tensor]()
+    for shots in in_passes(gaussians, small):
+        rasters = rasterizer.draw(gaussians.detach(), shots, sh_degree=0)
         extents += [extent_of_most(1 - raster.transmittance, share) for raster in rasters]
     return torch.stack(extents).cpu() * torch.tensor(times)[:, None]
 

@@ -8,7 +8,7 @@ others are drawn small for it.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -17,12 +17,13 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Rasterizer, Shot
+from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, runs
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.types import Gaussians, View
 
 AT_ONCE = 1 << 17
-"""Gaussians times views that are drawn in one pass: of small images, calls would cost more than what they
-compute."""
+"""Gaussians times views that are drawn in one pass by a CPU: of small images, calls would cost more than what
+they compute."""
 COARSE, COARSE_SIDE = 2, 80
 """Influences of whole views are found in images that are so many times smaller, and those of large images in
 such as are about so many pixels long: what counts is the order of a block's views, and there may be many."""
@@ -98,15 +99,21 @@ def influence(
     """
     blocks = int(owner.max()) + 1 if len(owner) else 0
     found: Influence = {}
-    views, most = tuple(views), max(AT_ONCE // max(len(gaussians), 1), 1)
-    for few in (views[k : k + most] for k in range(0, len(views), most)):
-        small = [coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE)) for view in few]
-        shots = [Shot(view, view.full) for view in small]
+    small = [coarser(view, max(COARSE, max(view.width, view.height) // COARSE_SIDE)) for view in views]
+    for shots in in_passes(gaussians, small):
         each = weights(gaussians, rasterizer, shots, antialiased=antialiased)
-        sums = each.new_zeros(len(few), blocks).index_add_(1, owner, each).tolist()
-        for view, row in zip(small, sums, strict=True):
+        sums = each.new_zeros(len(shots), blocks).index_add_(1, owner, each).tolist()
+        for view, row in zip((shot.view for shot in shots), sums, strict=True):
             _put(found, view.index, [value / view.full.pixels for value in row])
     return found
+
+
+def in_passes(gaussians: Gaussians, small: Sequence[View]) -> Iterator[list[Shot]]:
+    """Small images, whole, in runs that are best drawn at once. An accelerator is waited for once in each."""
+    splats = AT_ONCE if gaussians.device.type == "cpu" else DEVICE_SPLATS
+    shots = [Shot(view, view.full) for view in small]
+    crops = [shot.crop for shot in shots]
+    return runs(shots, crops, DEVICE_PIXELS, gaussians=len(gaussians), splats=splats, padded=True)
 
 
 class InfluenceTable:
