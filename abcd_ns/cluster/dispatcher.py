@@ -107,7 +107,7 @@ class Dispatcher(Coordinator):
         if not self._shown and self.device.type == "cuda":
             torch.cuda.empty_cache()  # of what was trained here: a worker may share this device
         while self._counted >= self.state.step and not self.finished:
-            self.stopwatch.start()  # a listener may have paused it
+            self.resume()  # a listener may have paused it
             self._lend()
             if self._counted < self.state.step or self.finished:
                 break
@@ -125,6 +125,11 @@ class Dispatcher(Coordinator):
         """No time counts until the next step, nor does anyone train, unless workers cannot be held."""
         if not self._lent or self.workers.hold():
             super().pause()
+
+    def resume(self) -> None:
+        """Time counts again, and workers go on."""
+        self.workers.go_on()
+        super().resume()
 
     def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
         """As the coordinator's, for a step that was taken here."""

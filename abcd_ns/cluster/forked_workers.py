@@ -87,7 +87,6 @@ class ForkedWorkers(Members[Place]):
 
     def submit(self, lease: Lease) -> None:
         """Fork a process for a visit."""
-        self._let_go_on()
         member = self._longest_idle()
         member.take(lease)
         member.heard = time.monotonic()
@@ -108,14 +107,13 @@ class ForkedWorkers(Members[Place]):
             self._signal(signal.SIGSTOP)
         return True
 
-    def _let_go_on(self) -> None:
+    def go_on(self) -> None:
         if self._held_since is None:
             return
-        # Before they can read it. They have not been silent: they could not speak.
         held, self._held_since = time.perf_counter() - self._held_since, None
-        self._stood_still.value += held
+        self._stood_still.value += held  # first: whoever goes on may read the clock at once
         for member in self._members:
-            member.heard += held
+            member.heard += held  # nobody was silent: they could not speak
         self._signal(signal.SIGCONT)
 
     def _signal(self, number: signal.Signals) -> None:
@@ -124,7 +122,6 @@ class ForkedWorkers(Members[Place]):
                 os.kill(pid, number)
 
     def wait(self, seconds: float) -> list[Report]:
-        self._let_go_on()
         busy = {member.pipe: member for member in self._members if member.lease is not None}
         reports = [report for pipe in wait(list(busy), seconds) for report in self._hear(busy[pipe])]
         for member in self._members:

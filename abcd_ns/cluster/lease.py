@@ -149,8 +149,10 @@ class Workers(Protocol):
         """Give a visit to one that is idle."""
 
     def hold(self) -> bool:
-        """Let those that are at work stand still until they are waited for, or given more; whether it can be
-        done."""
+        """Let those that are at work stand still; whether that can be done. Harmless when done twice."""
+
+    def go_on(self) -> None:
+        """Let those that stand still go on; to be called before anybody is waited for, or given a visit."""
 
     def wait(self, seconds: float) -> list[Report]:
         """What has happened, in order; waits for something so long at most.

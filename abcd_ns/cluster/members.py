@@ -77,7 +77,9 @@ class Members(Workers, Generic[M]):
         return [member.pid for member in self._members if member.lease is not None]
 
     def hold(self) -> bool:
-        return not self.pids  # those of other machines go on
+        return not any(member.lease is not None for member in self._members)
+
+    def go_on(self) -> None: ...
 
     def seen(self) -> Sequence[WorkerSeen]:
         return [member.seen() for member in self._members]

@@ -34,7 +34,10 @@ class Download:
         if self._event is not None:
             # Of this device, which need not be the current one; Apple's has one stream, which has no name.
             stream = getattr(torch.get_device_module(tensor.device), "current_stream", None)
-            self._event.record(*([stream(tensor.device)] if stream else []))
+            if stream is None:
+                self._event.record()
+            else:
+                self._event.record(stream(tensor.device))
 
     def read(self) -> Tensor:
         """It; waits until it is there."""

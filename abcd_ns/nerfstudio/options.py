@@ -11,7 +11,7 @@ from typing import Any
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-from abcd_ns.engine.space.partition import MAX_CELLS
+from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.errors import UserError
@@ -115,8 +115,8 @@ def check_options(config: TrainerConfig) -> None:
         if not 0 <= value < math.inf:
             flag = name.replace("_", "-")
             raise UserError(f"--pipeline.{flag} must be 0 or more and finite, not {value}.")
-    if pipeline.blocks > MAX_CELLS:
-        raise UserError(f"--pipeline.blocks must be {MAX_CELLS} or less, not {pipeline.blocks}.")
+    if pipeline.blocks > MAX_BLOCKS:
+        raise UserError(f"--pipeline.blocks must be {MAX_BLOCKS} or less, not {pipeline.blocks}.")
     if pipeline.max_seconds is not None and not 0 < pipeline.max_seconds < math.inf:
         refused = f"--pipeline.max-seconds must be above 0 and finite, not {pipeline.max_seconds}"
         raise UserError(f"{refused}; leave it out for no limit.")

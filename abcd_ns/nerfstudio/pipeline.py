@@ -20,7 +20,7 @@ from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import thin_out
 from abcd_ns.engine.render import loss
-from abcd_ns.engine.space.partition import MAX_CELLS, build_grid, build_kd, robust_range
+from abcd_ns.engine.space.partition import MAX_BLOCKS, build_grid, build_kd, robust_range
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
@@ -48,7 +48,7 @@ from abcd_ns.nerfstudio.fit import (
     device_budget,
     find_fit,
 )
-from abcd_ns.nerfstudio.flags import named_too, opens_ours
+from abcd_ns.nerfstudio.flags import named_too, opens_ours, trains_ours
 from abcd_ns.nerfstudio.inspection import factor_of
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
@@ -108,9 +108,10 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
 
 
 def _as_a_command() -> AbstractContextManager:
-    """Where a command of nerfstudio's opens a run, what the user can mend ends it in one line, as `ns-train`;
-    who opens one from Python is given the exception."""
-    return exit_on_user_error() if opens_ours(sys.argv) else nullcontext()
+    """Where a command of nerfstudio's opens a run, what the user can mend ends it in one line. Who opens one
+    from Python is given the exception, and so is a training, which has blocks to put to rest before."""
+    opens = opens_ours(sys.argv) and not trains_ours(sys.argv)
+    return exit_on_user_error() if opens else nullcontext()
 
 
 class AbcdPipeline(VanillaPipeline):
@@ -373,18 +374,18 @@ def grid_counts(gaussians: Gaussians, blocks: int) -> tuple[int, int, int]:
     """Cells along x, y, z, as near to cubes as the scene's shape allows, at least `blocks` in all.
 
     Raises:
-        UserError: these would be over MAX_CELLS.
+        UserError: these would be over MAX_BLOCKS.
     """
     low, high = robust_range(gaussians.means.double().cpu())
     extent = (high - low).clamp_min(1e-9).tolist()
     counts = [1, 1, 1]
-    while (cells := math.prod(counts)) < blocks and cells <= MAX_CELLS:
+    while (cells := math.prod(counts)) < blocks and cells <= MAX_BLOCKS:
         widest = max(range(3), key=lambda axis: extent[axis] / counts[axis])
         counts[widest] += 1
-    if cells > MAX_CELLS:
+    if cells > MAX_BLOCKS:
         grid = " x ".join(map(str, counts))
         raise UserError(
-            f"--pipeline.blocks {blocks} asks for a grid of {grid} cells here or more, and {MAX_CELLS} are "
-            "the most: give fewer, or --pipeline.partition kd."
+            f"{blocks} blocks make a grid of {grid} cells or more here, and {MAX_BLOCKS} are the most: give "
+            "fewer --pipeline.blocks, or --pipeline.partition kd."
         )
     return counts[0], counts[1], counts[2]

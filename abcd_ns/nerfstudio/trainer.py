@@ -1,12 +1,12 @@
 """nerfstudio's trainer, with checkpoints that a run can truly go on from, and an end that loses nothing."""
 
 import dataclasses
-import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +34,11 @@ from abcd_ns.nerfstudio.run.resuming import (
     check_blocks,
     check_folder,
     find_start,
+    has_begun,
     pin_name,
 )
 from abcd_ns.nerfstudio.run.settings import flat_options
-from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, command_to_go_on
+from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_go_on
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
 
@@ -84,7 +85,8 @@ class AbcdTrainerConfig(TrainerConfig):
 
     def save_config(self) -> None:
         """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
-        self.check()
+        with at_once(partial(CONSOLE.print, "Stopped before anything was written.")):
+            self.check()
         with exit_on_user_error():
             try:
                 super().save_config()
@@ -93,7 +95,8 @@ class AbcdTrainerConfig(TrainerConfig):
                 raise UserError(words) from None
 
     def check(self) -> None:
-        """Choose the device and look at the options and the data, before anything is written.
+        """Choose the device, and look at the options, the folder, what the run goes on from, and the data,
+        before anything is written.
 
         Exits with code 2 and one line for each fault that the user can mend.
         """
@@ -165,7 +168,10 @@ class AbcdTrainer(Trainer):
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
-        with self._at_once("Stopped before training began."), exit_on_user_error():
+        with (
+            at_once(partial(self._say_that_it_ended, "Stopped before training began.")),
+            exit_on_user_error(),
+        ):
             super().setup(*args, **kwargs)
         self.pipeline.coordinator.announce.subscribe(self._may_stop)
         at = TrainingCallbackLocation
@@ -176,18 +182,13 @@ class AbcdTrainer(Trainer):
     def train(self) -> None:
         """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
         self._trains = threading.get_ident()
-        with self._at_once("Stopped at once; what was written until then is safe."):
+        said = "Stopped at once; what was written until then is safe."
+        with at_once(partial(self._say_that_it_ended, said)):
             self._train()
 
-    @contextmanager
-    def _at_once(self, said: str) -> Iterator[None]:
-        """Ctrl-C where nothing waits for the end of a step: nerfstudio would show where, and exit with 0."""
-        try:
-            yield
-        except KeyboardInterrupt:
-            self._say(said)
-            self._say_how_to_go_on()
-            raise SystemExit(128 + signal.SIGINT) from None
+    def _say_that_it_ended(self, said: str) -> None:
+        self._say(said)
+        self._say_how_to_go_on()
 
     def _train(self) -> None:
         try:
@@ -259,8 +260,9 @@ class AbcdTrainer(Trainer):
 
     def _say_how_to_go_on(self) -> None:
         command = command_to_go_on(sys.argv, self.config.method_name, self.checkpoint_dir)
-        begun = (self.base_dir / STATE / STORE).is_dir()
-        if command is not None and begun:  # else whoever started this training knows better
+        if command is not None and has_begun(
+            self.base_dir / STATE / STORE
+        ):  # else whoever started this training knows better
             self._say(f"To go on:\n  {command}")
 
     def _say(self, text: str) -> None:

@@ -44,6 +44,8 @@ class InProcessWorkers:
         """Nothing is under way meanwhile."""
         return True
 
+    def go_on(self) -> None: ...
+
     def wait(self, seconds: float) -> list[Report]:  # noqa: ARG002 - nothing is under way meanwhile
         """Train the visit that was submitted first."""
         if not self._leases:

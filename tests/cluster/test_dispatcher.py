@@ -70,6 +70,9 @@ class Unreliable:
     def hold(self):
         return self._inner.hold()
 
+    def go_on(self):
+        self._inner.go_on()
+
     def seen(self):
         return self._inner.seen()
 

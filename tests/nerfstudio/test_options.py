@@ -15,7 +15,7 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, method_c
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from abcd_ns import methods
-from abcd_ns.engine.space.partition import MAX_CELLS
+from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
@@ -184,7 +184,7 @@ def test_what_must_be_0_or_more_is_refused_where_it_is_not(name, value):
 @pytest.mark.parametrize("partition", ["kd", "grid"])
 def test_more_blocks_than_fit_in_memory_are_refused(partition):
     config = copy.deepcopy(METHODS["abcd"])
-    config.pipeline.partition, config.pipeline.blocks = partition, MAX_CELLS
+    config.pipeline.partition, config.pipeline.blocks = partition, MAX_BLOCKS
     check_options(config)
     config.pipeline.blocks += 1
     with pytest.raises(UserError, match=r"--pipeline\.blocks must be 65536 or less, not 65537"):
@@ -198,7 +198,7 @@ def test_a_grid_of_more_cells_than_fit_in_memory_is_refused_by_its_flag(extent, 
     """It has more of them than were asked for, or as many; and that is found out soon."""
     gaussians = random_gaussians(50)
     gaussians.means[:] = torch.linspace(0, 1, 50)[:, None] * torch.tensor(extent)
-    with pytest.raises(UserError, match=rf"--pipeline.blocks {blocks} .* give fewer, or --pipeline.part"):
+    with pytest.raises(UserError, match=rf"^{blocks} blocks make .* give fewer --pipeline.blocks"):
         grid_counts(gaussians, blocks)
     assert math.prod(grid_counts(gaussians, 1000)) >= 1000
 

@@ -185,17 +185,27 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypa
     assert f"ns-train abcd --load-dir {run_folder(tmp_path / 'signal')}/nerfstudio_models" in said
 
 
-def test_ctrl_c_before_the_first_step_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        ("trainer.inspect", "Stopped before anything was written."),
+        ("pipeline.build_kd", "Stopped before training began."),
+        ("pipeline.blocks_at_rest", "Stopped before training began."),
+    ],
+)
+def test_ctrl_c_before_the_first_step_ends_a_run_in_one_line(
+    data, tmp_path, capsys, monkeypatch, where, words
+):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
-    monkeypatch.setattr("abcd_ns.nerfstudio.pipeline.build_kd", interrupt)
+    monkeypatch.setattr(f"abcd_ns.nerfstudio.{where}", interrupt)
     with pytest.raises(SystemExit) as ended:
         run(configure(data, tmp_path / "signal"))
     assert ended.value.code == 130
     said = capsys.readouterr().out
-    assert "Stopped before training began." in said
+    assert words in said
     assert "--load-dir" not in said
 
 

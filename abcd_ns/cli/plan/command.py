@@ -27,7 +27,7 @@ from abcd_ns.cli.plan.forecast import (
 from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
-from abcd_ns.engine.space.partition import MAX_CELLS, build_kd
+from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
 from abcd_ns.engine.train.memory import levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
@@ -88,8 +88,8 @@ def plan(
     Raises:
         UserError: the data cannot be used, or an option is out of range.
     """
-    if not 0 <= wanted.blocks <= MAX_CELLS:
-        raise UserError(f"--blocks is {wanted.blocks}; it must lie between 0 and {MAX_CELLS}.")
+    if not 0 <= wanted.blocks <= MAX_BLOCKS:
+        raise UserError(f"--blocks is {wanted.blocks}; it must lie between 0 and {MAX_BLOCKS}.")
     if not 0 <= wanted.device_budget_gb < math.inf:
         raise UserError(f"--device-budget-gb must be 0 or more and finite, not {wanted.device_budget_gb}.")
     given = {name: getattr(wanted, name) for name in ("max_gaussians", "steps", "workers")}

@@ -189,11 +189,18 @@ def _read_store(
         return RunState(), {}, {}
     try:
         store = ParameterStore.open(folder, read_only=True)
-        if checkpoint is not None and checkpoint.path.stem in store.pins:
+        kept = checkpoint is not None and checkpoint.path.stem in store.pins
+        if kept:
             store = ParameterStore.open(folder, checkpoint.path.stem)
         state = RunState.from_json(store.state)
         seen = [block for block, views in state.views.items() if views]
-        filled = {block: px for block in seen if (px := _filled(store, block)) is not None}
+        # What no checkpoint keeps, a run that goes on may take from under a reader.
+        unknown = (KeyError,) if kept else (KeyError, StoreError)
+        filled = {}
+        for block in seen:
+            with suppress(*unknown):
+                filled[block] = _filled(store, block)
+        filled = {block: px for block, px in filled.items() if px is not None}
         parameters = {
             block: store.meta(block)["parameters"] for block in store.blocks if isinstance(block, int)
         }
@@ -203,9 +210,10 @@ def _read_store(
 
 
 def _filled(store: ParameterStore, block: int) -> float | None:
-    """Pixels; None where nobody was weighed, as by methods that keep everything, or nobody can say."""
-    with suppress(KeyError, StoreError):  # a run that goes on may have put another shard in its place
-        weight, passes = store.load(block, [f"growth.{name}" for name in WEIGHED])[0].values()
-        if bool((passes > 0).any()):
-            return float((weight / passes)[passes > 0].median())
-    return None
+    """Pixels; None where nobody was weighed yet.
+
+    Raises:
+        KeyError: nobody is, as by methods that keep everything.
+    """
+    weight, passes = store.load(block, [f"growth.{name}" for name in WEIGHED])[0].values()
+    return float((weight / passes)[passes > 0].median()) if bool((passes > 0).any()) else None

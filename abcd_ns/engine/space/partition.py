@@ -8,7 +8,7 @@ from torch import Tensor
 
 from abcd_ns.engine.space.tree import EVERYWHERE, BlockTree, Box, in_float64, tree_from_rows
 
-MAX_CELLS = 65_536
+MAX_BLOCKS = 65_536
 """The most blocks that space may be cut into to begin with, and the most cells of a grid: far more than any
 scene needs, few enough to fit in memory."""
 
@@ -65,10 +65,10 @@ def build_grid(points: Float[Tensor, "n 3"], counts: tuple[int, int, int]) -> Bl
         counts: the cells on each axis.
 
     Raises:
-        ValueError: `counts` are not positive, over MAX_CELLS in all, or a point is not finite.
+        ValueError: `counts` are not positive, over MAX_BLOCKS in all, or a point is not finite.
     """
-    if min(counts) < 1 or math.prod(counts) > MAX_CELLS:
-        raise ValueError(f"a grid has at least one cell on each axis and {MAX_CELLS} in all, not {counts}")
+    if min(counts) < 1 or math.prod(counts) > MAX_BLOCKS:
+        raise ValueError(f"a grid has at least one cell on each axis and {MAX_BLOCKS} in all, not {counts}")
     _check_finite(points)
     start, stop = robust_range(in_float64(points).cpu())
     # Without any extent every cell size is as good as another; 1 keeps the planes apart.

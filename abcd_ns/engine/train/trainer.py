@@ -77,6 +77,10 @@ class Trainer(ABC):
         """From now on no time counts, until the next step; but where others go on training it does."""
         self.stopwatch.pause()
 
+    def resume(self) -> None:
+        """Time counts again; steps do this by themselves."""
+        self.stopwatch.start()
+
     # -- where it stands -----------------------------------------------------------------------------
 
     @property

@@ -29,7 +29,7 @@ def make_settings(data: Any, out: Any, seeds: Sequence[int], **given: Any) -> Se
         UserError: an option is missing, out of range or contradicts another.
     """
     # Here and not above: torch takes seconds to import, and `--help` has no use for it.
-    from abcd_ns.engine.space.partition import MAX_CELLS
+    from abcd_ns.engine.space.partition import MAX_BLOCKS
 
     if data is None:
         raise UserError("Give the scene with --data FOLDER.")
@@ -43,8 +43,8 @@ def make_settings(data: Any, out: Any, seeds: Sequence[int], **given: Any) -> Se
     if seconds is not None and not 0 < seconds < float("inf"):
         raise UserError(f"--seconds is {seconds}; it must be above 0 and finite.")
     check_ranges({name: given[name] for name in LOWEST})
-    if given["blocks"] > MAX_CELLS:
-        raise UserError(f"--blocks is {given['blocks']}; it must be at most {MAX_CELLS}.")
+    if given["blocks"] > MAX_BLOCKS:
+        raise UserError(f"--blocks is {given['blocks']}; it must be at most {MAX_BLOCKS}.")
     check_numbers("--seeds", seeds, 0)
     return Settings(data=str(Path(data).resolve()), **given)
 

@@ -8,7 +8,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns import methods
-from abcd_ns.engine.space.partition import MAX_CELLS
+from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import HELD_OUT_EVERY, METHODS, Job
 from abcd_ns.lab.runs.options import change_options
@@ -57,8 +57,8 @@ def check_options(job: Job) -> None:
     """
     pipeline = _abcd(job).pipeline
     mirror(pipeline.training, pipeline.model)
-    if not 1 <= pipeline.blocks <= MAX_CELLS:
-        raise UserError(f"{job.variant.name}: blocks must be 1 to {MAX_CELLS}, not {pipeline.blocks}.")
+    if not 1 <= pipeline.blocks <= MAX_BLOCKS:
+        raise UserError(f"{job.variant.name}: blocks must be 1 to {MAX_BLOCKS}, not {pipeline.blocks}.")
 
 
 def registered(method: str) -> AbcdTrainerConfig | None:

@@ -26,6 +26,7 @@ class Training:
         self.stopwatch = self.coordinator.stopwatch if ours else Stopwatch()
         self._budget = Budget(settings.steps, settings.seconds)
         self._pause = self.coordinator.pause if ours else self.stopwatch.pause
+        self._resume = self.coordinator.resume if ours else self.stopwatch.start
         self.points: list[CurvePoint] = []
         self.seconds_of_looks = 0.0
         """Spent on evaluation."""
@@ -54,7 +55,7 @@ class Training:
             self.coordinator.announce(HeldOutScored(found, None))
         self.points.append(CurvePoint(seconds, steps, found, self.gaussians))
         self.seconds_of_looks += time.perf_counter() - began
-        self.stopwatch.start()
+        self._resume()
 
     def _follow_steps(self) -> None:
         """For a trainer that is not ABCD's: count the time here, and stop when it is up."""

@@ -9,6 +9,7 @@ from typing import Any
 from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.engine.render import PrimitiveName
+from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.manifest import pin_names
 from abcd_ns.engine.train.config import TrainingConfig
@@ -171,11 +172,20 @@ def check_blocks(start: Start | None, asked: int) -> None:
         return
     with ParameterStore.open(start.store, start.pin, read_only=True) as store:
         before = store.header.get(ASKED, asked)  # older runs did not write it down
-    if before != asked:
+        there = BlockTree.from_json(store.header["tree"]).num_blocks
+    if asked not in (before, there):
         raise UserError(
-            f"The run in {start.store} was begun with --pipeline.blocks {before}, not {asked}: leave the "
-            "option out, or begin anew without --load-dir."
+            f"The run in {start.store} was begun with --pipeline.blocks {before}, not {asked}: give that "
+            "number, or begin anew without --load-dir."
         )
+
+
+def has_begun(folder: Path) -> bool:
+    """Whether a run has put anything into its store in `folder`, so that it can be gone on with."""
+    try:
+        return bool(ParameterStore.open(folder, read_only=True).blocks)
+    except StoreError:
+        return False
 
 
 def _is_taken(folder: Path) -> UserError:

@@ -3,7 +3,8 @@
 import shlex
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
@@ -23,6 +24,17 @@ class Stopped(BaseException):
     def exit_code(self) -> int:
         """What a shell expects of a process that was ended by a signal."""
         return 128 + self.received
+
+
+@contextmanager
+def at_once(say: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C where nothing waits for the end of a step ends the process as shells expect, with what `say`
+    says: nerfstudio shows a traceback, and exits with 0."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say()
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 class StopSignals:

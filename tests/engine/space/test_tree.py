@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.space.partition import MAX_CELLS, best_split, build_grid, build_kd
+from abcd_ns.engine.space.partition import MAX_BLOCKS, best_split, build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree, Box
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -191,7 +191,7 @@ def test_grid_survives_points_without_extent(points):
 
 def test_grid_refuses_bad_input():
     points = torch.rand(100, 3)
-    for counts in ((1, 0, 1), (MAX_CELLS, 2, 1)):
+    for counts in ((1, 0, 1), (MAX_BLOCKS, 2, 1)):
         with pytest.raises(ValueError, match="at least one cell on each axis"):
             build_grid(points, counts)
     with pytest.raises(ValueError, match="1 of 1 points are NaN"):
