@@ -31,6 +31,8 @@ from abcd_ns.errors import UserError, is_out_of_memory
 
 SILENCE = 600.0
 """Seconds without a word after which a worker counts as lost: a view of large blocks may take many."""
+FIRST_WORD = 5.0
+"""Seconds in which a process that was just forked says that it lives."""
 TELL_EVERY = 0.5
 """Seconds between two words of a worker's progress."""
 PR_SET_PDEATHSIG = 1
@@ -65,6 +67,8 @@ class Place(Member):
     pipe: Connection | None = None
     heard: float = 0.0
     """When it last said something, or was started."""
+    lives: bool = False
+    """Whether it has said anything: from then on it ends when this process does."""
 
 
 class ForkedWorkers(Members[Place]):
@@ -89,7 +93,7 @@ class ForkedWorkers(Members[Place]):
         """Fork a process for a visit."""
         member = self._longest_idle()
         member.take(lease)
-        member.heard = time.monotonic()
+        member.heard, member.lives = time.monotonic(), False
         member.pipe, theirs = Pipe()
         member.pid = os.fork()
         if member.pid == 0:
@@ -103,6 +107,9 @@ class ForkedWorkers(Members[Place]):
 
     def hold(self) -> bool:
         if self._held_since is None:
+            for member in self._members:
+                if member.lease is not None and not member.lives:
+                    member.pipe.poll(FIRST_WORD)
             self._held_since = time.perf_counter()
             self._signal(signal.SIGSTOP)
         return True
@@ -135,7 +142,7 @@ class ForkedWorkers(Members[Place]):
                 self._end(member)
 
     def _hear(self, member: Place) -> list[Report]:
-        member.heard = time.monotonic()
+        member.heard, member.lives = time.monotonic(), True
         try:
             said = member.pipe.recv()
         except (OSError, EOFError):
@@ -194,6 +201,7 @@ def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> 
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the training process decides
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        pipe.send(None)
         torch.set_num_threads(1)
         pipe.send(Parcel.of(visit(_Telling(pipe))))
         status = 0

@@ -210,8 +210,9 @@ def test_any_other_error_ends_the_run_in_one_line(make, photos, tmp_path, error,
     assert not any(is_alive(pid) for pid in pids)
 
 
-def test_no_worker_outlives_the_training_process(tmp_path):
-    """Not even one that is killed; `kill -9` runs no handler."""
+@pytest.mark.parametrize("then", ["", "run.workers.hold()"])
+def test_no_worker_outlives_the_training_process(tmp_path, then):
+    """Not even one that is killed; `kill -9` runs no handler. Nor does one that stands still."""
     script = f"""
 import os, sys, time
 from pathlib import Path
@@ -221,6 +222,7 @@ from tests.reference.scenes import ring_of_views
 worker = lambda run: VisitWorker(setup_of(run), TorchRasterizer(), lambda s: time.sleep(600))
 run = make_run(Path({str(tmp_path)!r}), ring_of_views(8), lambda run: ForkedWorkers(2, worker(run)))
 run._lend()
+{then}
 print(*run.workers.pids, flush=True)
 time.sleep(600)
 """
