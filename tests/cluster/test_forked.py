@@ -159,6 +159,7 @@ def test_what_is_paused_counts_for_no_visit():
     time.sleep(0.5)
     workers.go_on()
     timing.may_end.set()
+    assert workers.wait(60.0) == []  # it lives
     with pytest.raises(UserError) as told:
         workers.wait(60.0)
     counted, passed = map(float, str(told.value).split())
