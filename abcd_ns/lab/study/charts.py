@@ -100,10 +100,10 @@ def _draw_gap(axes: Axes, arms: Sequence[Arm]) -> None:
     best, worst = found
     goal, left, right = best.psnr - GOAL_DB, arms[0], arms[-1]
     axes.axhspan(goal, best.psnr, color="#ececec", zorder=0, linewidth=0)
-    at_right = right.psnr < left.psnr  # where the line is farther below
-    look = {"xycoords": ("axes fraction", "data"), "va": "top", "fontsize": 7, "color": "#777777"}
+    at_right = abs(right.psnr - goal) > abs(left.psnr - goal)  # where the line is farther away
+    look = {"xycoords": ("axes fraction", "data"), "va": "bottom", "fontsize": 7, "color": "#777777"}
     place, side = (0.99, "right") if at_right else (0.01, "left")
-    write_beside(axes, f"best - {GOAL_DB:g} dB", (place, goal), (0, -2), ha=side, **look)
+    write_beside(axes, f"best - {GOAL_DB:g} dB", (place, goal), (0, 2), ha=side, **look)
     for arm, word, above in ((best, "best", 9), (worst, "worst", -16)):
         shift, side = (-4, "left") if arm is left else (4, "right") if arm is right else (0, "center")
         at, color = (arm.value, arm.psnr), COLORS[arm.method]
