@@ -260,10 +260,9 @@ class AbcdTrainer(Trainer):
 
     def _say_how_to_go_on(self) -> None:
         command = command_to_go_on(sys.argv, self.config.method_name, self.checkpoint_dir)
-        if command is not None and has_begun(
-            self.base_dir / STATE / STORE
-        ):  # else whoever started this training knows better
-            self._say(f"To go on:\n  {command}")
+        if command is None or not has_begun(self.base_dir / STATE / STORE):
+            return  # whoever started this training knows better, or there is nothing to go on from yet
+        self._say(f"To go on:\n  {command}")
 
     def _say(self, text: str) -> None:
         CONSOLE.print(text, highlight=False, markup=False, emoji=False, soft_wrap=True)
