@@ -200,7 +200,6 @@ def _read_store(
         for block in seen:
             with suppress(*unknown):
                 filled[block] = _filled(store, block)
-        filled = {block: px for block, px in filled.items() if px is not None}
         parameters = {
             block: store.meta(block)["parameters"] for block in store.blocks if isinstance(block, int)
         }
@@ -209,11 +208,13 @@ def _read_store(
         raise UserError(one_line(str(error))) from None
 
 
-def _filled(store: ParameterStore, block: int) -> float | None:
-    """Pixels; None where nobody was weighed yet.
+def _filled(store: ParameterStore, block: int) -> float:
+    """Pixels.
 
     Raises:
-        KeyError: nobody is, as by methods that keep everything.
+        KeyError: nobody was weighed, as by methods that keep everything.
     """
     weight, passes = store.load(block, [f"growth.{name}" for name in WEIGHED])[0].values()
-    return float((weight / passes)[passes > 0].median()) if bool((passes > 0).any()) else None
+    if not bool((passes > 0).any()):
+        raise KeyError(block)
+    return float((weight / passes)[passes > 0].median())

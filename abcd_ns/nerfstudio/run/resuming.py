@@ -11,7 +11,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from abcd_ns.engine.render import PrimitiveName
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
-from abcd_ns.engine.store.manifest import pin_names
+from abcd_ns.engine.store.manifest import manifest_path, pin_names
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -152,7 +152,7 @@ def check_folder(folder: Path, start: Start | None) -> None:
     Raises:
         UserError: another run's store is there, or another run is writing to it.
     """
-    if not (folder / "manifest.json").exists():
+    if not manifest_path(folder).exists():
         return
     if start is None or not folder.samefile(start.store):
         raise _is_taken(folder)
@@ -224,7 +224,7 @@ def new_store(folder: Path, header: dict[str, Any]) -> ParameterStore:
     try:
         return ParameterStore.create(folder, header)
     except StoreError as error:
-        if not (folder / "manifest.json").exists():
+        if not manifest_path(folder).exists():
             raise
         raise _is_taken(folder) from error
 
