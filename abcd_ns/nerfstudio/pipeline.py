@@ -82,8 +82,8 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """How blocks are trained."""
     blocks: int = 0
-    """Number of blocks that space is cut into. 0 takes as few as `device_budget_gb` allows, one where the scene
-    fits, and cuts blocks that outgrow it in two; a number forces so many, which nothing holds within it."""
+    """Number of blocks that space is cut into. 0 takes as few as `device_budget_gb` allows, one where the
+    scene fits, and cuts blocks that outgrow it in two; a number forces so many, which nothing holds in it."""
     device_budget_gb: float = 0.0
     """Memory of the device that training may take, GiB, by which `blocks` 0 is decided; 0 takes 0.9 of what
     is free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
