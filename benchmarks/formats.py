@@ -22,12 +22,12 @@ import tyro
 from plyfile import PlyData
 
 from abcd_ns.cli.export.command import TRANSFORMS, export
-from abcd_ns.cli.export.formats import SUFFIXES
-from abcd_ns.cli.export.glb import attributes
-from abcd_ns.cli.export.ply import columns
 from abcd_ns.cli.report.run_folder import load_pipeline, open_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.types import Gaussians
+from abcd_ns.formats.glb import attributes
+from abcd_ns.formats.ply import columns
+from abcd_ns.formats.scene_file import SUFFIXES
 from abcd_ns.lab.runs.evaluate import held_out_views, undisturbed
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 

@@ -1,4 +1,4 @@
 """`abcd export`: a trained scene as files for other programs, whole or in parts.
 
-`formats` knows the suffixes; `ply` and `glb` are written block by block, `packed` all at once.
+`shown` picks the Gaussians from the blocks at rest; abcd_ns.formats writes them.
 """

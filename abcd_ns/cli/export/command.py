@@ -12,15 +12,15 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from abcd_ns.cli.export.formats import PACKED, rounding, suffix_of, write_scene
-from abcd_ns.cli.export.glb import Z_TO_Y
-from abcd_ns.cli.export.packed import BYTES_AT_ONCE
 from abcd_ns.cli.export.shown import Box, Shown
 from abcd_ns.cli.run_path import find_run
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.atomic import replacing
 from abcd_ns.errors import UserError
+from abcd_ns.formats.glb import Z_TO_Y
+from abcd_ns.formats.packed import BYTES_AT_ONCE
+from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
 from abcd_ns.nerfstudio.run import STATE, STORE
 
 TRANSFORMS = "dataparser_transforms.json"

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from abcd_ns.cli.export.ply import GENERATOR
+from abcd_ns.formats.ply import GENERATOR
 
 SPECK = 0.001
 """Clusters with fewer faces than this share of the largest one's are left out."""

@@ -49,6 +49,8 @@ MEASURES = (
     Measure("ordering gap (dB)", "ordering_gap_db", 1),
     Measure("Gaussians", "gaussians", 0),
     Measure("parameters", "parameters", 0),
+    Measure("as .ply (MiB)", "ply_bytes", 2, MIB),
+    Measure("as .spz (MiB)", "spz_bytes", 2, MIB),
     Measure("blocks", "blocks", 0),
     Measure("steps", "steps", 0),
     Measure("training (s)", "train_seconds", 1),
@@ -68,7 +70,8 @@ SCALE_MEASURES = (
     Measure("visit (s)", "memory.visit_seconds", 1),
     Measure("of it, layers (s)", "memory.layer_seconds", 1),
 )
-_QUALITY = ("psnr_merged", "ssim_merged", "psnr", "gaussians", "parameters", "steps", "train_seconds")
+_SIZE = ("gaussians", "parameters", "ply_bytes", "spz_bytes")
+_QUALITY = ("psnr_merged", "ssim_merged", "psnr", *_SIZE, "steps", "train_seconds")
 _MEMORY = ("peak_rss_bytes", "peak_device_bytes", "store_bytes")
 _OF_OPTIONS = ("psnr_merged", "ssim_merged", "gaussians", "parameters", "steps", "train_seconds")
 

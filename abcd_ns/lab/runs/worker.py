@@ -16,10 +16,11 @@ from PIL import Image
 from torch import Tensor
 
 from abcd_ns.engine.train.schedule import evenly
+from abcd_ns.formats.sizes import MOST_AT_ONCE, ply_bytes, spz_bytes
 from abcd_ns.lab.job import Job
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.evaluate import draw_held_out, mean, ordering_gap, score, squared_gap
+from abcd_ns.lab.runs.evaluate import draw_held_out, everything, mean, ordering_gap, score, squared_gap
 from abcd_ns.lab.runs.training import Training
 from abcd_ns.lab.runs.work import memory_of_run, work
 from abcd_ns.machine import describe_versions, disk_bytes, without_home
@@ -60,6 +61,7 @@ def run(job: Job, folder: Path) -> Run:
         ordering_gap_note=note,
         gaussians=training.gaussians,
         parameters=training.parameters,
+        **file_bytes(training),
         **memory,
         store_bytes=disk_bytes(folder / "abcd" / STORE),
         layer_seconds=training.layer_seconds,
@@ -67,6 +69,14 @@ def run(job: Job, folder: Path) -> Run:
         views=tuple(scores),
         versions=describe_versions(),
     )
+
+
+def file_bytes(training: Training) -> dict[str, int | None]:
+    """Of the scene as files; nothing where RAM should not hold it at once."""
+    if training.gaussians > MOST_AT_ONCE:
+        return {}
+    scene = everything(training.pipeline.model)
+    return {"ply_bytes": ply_bytes(scene), "spz_bytes": spz_bytes(scene)}
 
 
 def set_up(job: Job, out: Path) -> Training:

@@ -26,6 +26,7 @@ from abcd_ns.lab.results.style import (
     tick_at,
     write_beside,
 )
+from abcd_ns.units import MIB
 
 WAYS = {PRICE: ("#0072B2", "o"), LIMIT: ("#8A6A00", "s"), MCMC: ("#B3306B", "D")}
 """Colour and mark of each way to a number of Gaussians."""
@@ -123,37 +124,48 @@ def _draw_line(axes: Axes, arms: Sequence[Arm], value: Value, **look) -> Line2D:
 
 
 def _draw_gaussians(results: Results) -> Figure:
-    figure = Figure(figsize=(6.6, 3.7), layout="constrained")
-    axes, ends = figure.add_subplot(), {}
-    for way, arms in curves(results).items():
-        color, marker = WAYS[way]
-        if any(len(arm.runs) > 1 for arm in arms):
-            points = [(run.gaussians, run.psnr_merged) for arm in arms for run in arm.runs]
-            scatter(axes, *zip(*points, strict=True), color)
-        x, y = [arm.gaussians for arm in arms], [arm.psnr for arm in arms]
-        plot(axes, x, y, arms[0].method, color=color, marker=marker)
-        ends[way] = (x[-1], y[-1])
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.margins(x=0.08, y=0.15)
-    if (default := find_default(results)) is not None:
-        _mark_stop(axes, default)
-    axes.yaxis.set_major_locator(MaxNLocator(7))
-    axes.set_xlabel("Gaussians at the end")
-    axes.set_ylabel("held-out PSNR (dB)")
-    axes.set_title(f"{_title(results, results.methods[0])}\nstar: where it stops by itself", loc="left")
-    lay_grid(axes)
+    """PSNR against the number of Gaussians and, where it is known, against the size of their .spz."""
+    sizes: list[tuple[str, Value, Callable[[float], str]]] = [
+        ("Gaussians at the end", lambda run: run.gaussians, short)
+    ]
+    if all(run.spz_bytes is not None for run in results.runs):
+        sizes.append(("MiB as .spz", lambda run: run.spz_bytes / MIB, "{:.3g}".format))
+    figure = Figure(figsize=(2.6 + 4.0 * len(sizes), 3.7), layout="constrained")
+    panels = figure.subplots(1, len(sizes), sharey=True, squeeze=False)[0]
+    for axes, (label, size, write) in zip(panels, sizes, strict=True):
+        ends = {way: _draw_way(axes, way, arms, size) for way, arms in curves(results).items()}
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _, write=write: write(value)))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.margins(x=0.08, y=0.15)
+        if (default := find_default(results)) is not None:
+            _mark_stop(axes, default, fmean(map(size, default.runs)), write)
+        axes.yaxis.set_major_locator(MaxNLocator(7))
+        axes.set_xlabel(label)
+        lay_grid(axes)
+    panels[0].set_ylabel("held-out PSNR (dB)")
+    panels[0].set_title(f"{_title(results, results.methods[0])}\nstar: where it stops by itself", loc="left")
     right = axes.get_xlim()[1] * 1.06
     label_ends(axes, ends, right, {way: color for way, (color, _) in WAYS.items()}, lambda way, _: way)
     return figure
 
 
-def _mark_stop(axes: Axes, arm: Arm) -> None:
-    color, at = WAYS[PRICE][0], (arm.gaussians, arm.psnr)
+def _draw_way(axes: Axes, way: str, arms: Sequence[Arm], size: Value) -> tuple[float, float]:
+    """One curve, and a dot for each seed where there are several; returns its end."""
+    color, marker = WAYS[way]
+    if any(len(arm.runs) > 1 for arm in arms):
+        points = [(size(run), run.psnr_merged) for arm in arms for run in arm.runs]
+        scatter(axes, *zip(*points, strict=True), color)
+    x, y = [fmean(map(size, arm.runs)) for arm in arms], [arm.psnr for arm in arms]
+    plot(axes, x, y, arms[0].method, color=color, marker=marker)
+    return x[-1], y[-1]
+
+
+def _mark_stop(axes: Axes, arm: Arm, size: float, write: Callable[[float], str]) -> None:
+    color, at = WAYS[PRICE][0], (size, arm.psnr)
     axes.plot(*at, "*", markersize=15, color=color, markeredgecolor="white", zorder=4)
-    text = f"{short(arm.gaussians)}, {arm.psnr:.2f} dB"
+    text = f"{write(size)}, {arm.psnr:.2f} dB"
     write_beside(axes, text, at, (-6, 9), ha="right", color=color, **HALO)
 
 

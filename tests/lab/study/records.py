@@ -55,7 +55,7 @@ def gaussians_study(seeds: tuple[int, ...] = (0,)) -> Results:
     arms = []
     for variant, count, behind in ways:
         psnrs = {seed: 26 - behind - 5 * (900 / count) ** 0.9 + chance.gauss(0, 0.03) for seed in seeds}
-        arms.append(made_up_arm(variant, None, psnrs, gaussians=count))
+        arms.append(made_up_arm(variant, None, psnrs, gaussians=count, spz_bytes=16 * count))
     return made_up_study("gaussians", *arms, seeds=seeds)
 
 

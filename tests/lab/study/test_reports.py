@@ -159,10 +159,17 @@ def test_charts_name_what_they_show_and_are_the_same_every_time(make, seeds, tmp
     texts = texts_of(paths[1])
     wanted = {
         "blocks": ["held-out PSNR (dB)", "blocks", "27", "Gaussians", "peak RAM (GiB)", "best - 0.5 dB"],
-        "gaussians": ["held-out PSNR (dB)", "20k", "by price", "by limit", "MCMC"],
+        "gaussians": ["held-out PSNR (dB)", "20k", "by price", "by limit", "MCMC", "MiB as .spz"],
         "options": ["training.warmup=0", "change", "PSNR", "Gaussians"],
     }[name_of(study)]
     assert [text for text in wanted if text not in texts] == []
+
+
+def test_sizes_are_left_out_where_a_run_did_not_ask_for_them(tmp_path):
+    known = made_up_arm("default", None, {0: 25.0}, gaussians=4000, spz_bytes=2**20)
+    unknown = frontier_arm("training.density.price=1", 9000, 25.1)
+    *_, svg = draw_study(made_up_study("gaussians", known, unknown), tmp_path)
+    assert [text for text in texts_of(svg) if "MiB" in text] == []
 
 
 def test_what_chance_does_hardly_shows_in_a_chart_of_options(tmp_path):

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.cli.export.glb import write_glb
-from abcd_ns.cli.export.packed import check_installed, write_packed
-from abcd_ns.cli.export.ply import write_ply
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
+from abcd_ns.formats.glb import write_glb
+from abcd_ns.formats.packed import check_installed, write_packed
+from abcd_ns.formats.ply import write_ply
 
 PACKED = (".compressed.ply", ".spz", ".sog")
 SUFFIXES = (*PACKED, ".ply", ".glb")

@@ -17,10 +17,10 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 
 from abcd_ns.cli.export.command import export
-from abcd_ns.cli.export.formats import SUFFIXES, suffix_of, write_scene
-from abcd_ns.cli.export.glb import EXTENSION, Z_TO_Y, write_glb
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.errors import UserError
+from abcd_ns.formats.glb import EXTENSION, Z_TO_Y, write_glb
+from abcd_ns.formats.scene_file import SUFFIXES, suffix_of, write_scene
 from tests.cli.test_export import FRAME, run, scene  # noqa: F401
 from tests.reference.scenes import random_gaussians
 

@@ -18,11 +18,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.cli.export.ply import GENERATOR
 from abcd_ns.engine.gaussians.frames import quaternion
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
+from abcd_ns.formats.ply import GENERATOR
 from abcd_ns.units import bytes_in_words
 
 EXTENSION = "KHR_gaussian_splatting"

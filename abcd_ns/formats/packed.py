@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from abcd_ns.cli.export.ply import columns, header, rows
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
+from abcd_ns.formats.ply import columns, header, rows
 
 BYTES_AT_ONCE = 1000
 """RAM that a Gaussian of degree 3 needs while it is packed: its row, and up to 755 bytes (.spz), measured."""
