@@ -37,7 +37,8 @@ class TrainingConfig:
     view, whichever comes first. 0 for none."""
     batch: int = 0
     """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and in the
-    warm-up, and 4 elsewhere: with small blocks a step's overhead would outweigh its work."""
+    warm-up, and elsewhere 4, but for a block that was trained on few views: with small blocks a step's
+    overhead would outweigh its work."""
     influence_share: float = 0.995
     """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
     the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this

@@ -167,6 +167,7 @@ class Planner(Visits):
             sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
             steps=plan.steps,
             views=(*chosen, *looked_at),
+            batch=self._batch(block),
             looked_at=looked_at,
             showing=showing,
         )
@@ -215,12 +216,18 @@ class Planner(Visits):
         passes = passes_of_sweep(state.sweep, config.first_passes, last, max(used.values()))
         blocks = self._scene.tree.num_blocks
         passes = passes_at_once(passes, at_once, blocks)
-        batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
         if state.sweep % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
-        steps = (passes / batch, remaining, config.seed, config.recipe.visit_steps)
-        state.queue = list(plan_sweep(state.sweep, used, *steps))
+        steps = (passes, remaining, config.seed, config.recipe.visit_steps)
+        batches = {block: self._batch(block) for block in used}
+        state.queue = list(plan_sweep(state.sweep, used, *steps, batches))
+
+    def _batch(self, block: int) -> int:
+        """Views in a step of the block: fewer while it is young, where its steps are larger for that."""
+        config, blocks = self._config, self._scene.tree.num_blocks
+        trained = self._scene.clocks(block).adam_views if config.recipe.fast_start else None
+        return views_per_step(config.batch, blocks, config.limits.batch_limit, trained)
 
     def _look_at_arrivals(self, state: RunState) -> None:
         """A block that no view saw may be seen once others have come into it."""

@@ -57,6 +57,8 @@ class ActiveVisit:
     done: int = 0
     saved: bool = False
     """Whether the live block was put to rest in the middle of the visit, see special_blocks.LIVE."""
+    batch: int = 0
+    """Views in each of its steps; 0 for as many as steps have at most."""
     sole: bool = False
     """Whether the block is the whole scene: then the visit lasts as long as the run, if the block need not be
     cut."""

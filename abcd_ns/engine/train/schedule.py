@@ -15,7 +15,11 @@ from typing import NamedTuple, TypeVar
 T = TypeVar("T")
 
 DEFAULT_BATCH = 4
-"""Views in a step where there are several blocks."""
+"""Views in a step where there are several blocks, of one that was trained on many views."""
+YOUNG = 500
+"""Views that a block was trained on, the warm-up's included, up to which a step draws one; two up to twice as
+many, and so on. A young block's steps are as large whatever they draw, see `rates_of_young`: so there are
+more of them."""
 SCAFFOLD_PASSES = 24
 """Uses of each view in the warm-up: at most, where it has no room for all Gaussians that there are, as so few
 soon are as good as they can be. Elsewhere it goes on until then, for ..."""
@@ -112,38 +116,46 @@ def plan_sweep(
     remaining: int | None,
     seed: int,
     each: int = 0,
+    batches: Mapping[int, int] | None = None,
 ) -> tuple[VisitPlan, ...]:
     """The visits of one sweep, in a random order that depends on `seed` and `sweep` alone.
 
     Args:
         views: by block, the number of views that a visit uses; blocks with none are left out.
-        passes: steps of a visit = passes x views, rounded up; less than 1 where a step draws several views.
+        passes: how often a visit uses each of its views.
         remaining: steps left in the budget, or None without one. Where they do not suffice for the sweep,
             or would leave less than half a sweep behind, all visits are scaled to use up exactly these.
         each: steps of every visit, whatever its views; 0 shares them out by views.
+        batches: by block, the views that a step draws; 1 where it is missing.
     """
+    batches = batches or {}
     seen = {block: count for block, count in sorted(views.items()) if count > 0}
     order = list(seen)
     random.Random(f"sweep {seed} {sweep}").shuffle(order)
     if each > 0:
-        seen, passes = dict.fromkeys(seen, 1), each
-    steps = {block: math.ceil(passes * count) for block, count in seen.items()}
+        seen, passes, batches = dict.fromkeys(seen, 1), each, {}
+    steps = {block: math.ceil(passes * count / batches.get(block, 1)) for block, count in seen.items()}
     full = sum(steps.values())
     if remaining is None or remaining >= full + full // 2:
         return tuple(VisitPlan(block, steps[block]) for block in order)
     if not seen:
         return ()
-    shares = _apportion(remaining, [seen[block] for block in order])
+    most = max(batches.values(), default=1)
+    shares = _apportion(remaining, [seen[block] * most // batches.get(block, 1) for block in order])
     return tuple(VisitPlan(block, share) for block, share in zip(order, shares, strict=True) if share > 0)
 
 
-def views_per_step(batch: int, blocks: int, limit: int = 0) -> int:
+def views_per_step(batch: int, blocks: int, limit: int = 0, trained: int | None = None) -> int:
     """`TrainingConfig.batch`, its 0 resolved.
 
     Args:
         limit: `Limits.batch_limit`.
+        trained: views that a block was trained on; None for the most that a step draws.
     """
-    return batch or (1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH))
+    if batch:
+        return batch
+    most = 1 if blocks == 1 else min(DEFAULT_BATCH, limit or DEFAULT_BATCH)
+    return most if trained is None else min(most, 1 << (trained // YOUNG).bit_length())
 
 
 def evenly(values: Sequence[T], wanted: int) -> list[T]:

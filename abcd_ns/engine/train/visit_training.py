@@ -68,9 +68,11 @@ class VisitTraining:
 
     @property
     def batch(self) -> int:
-        """Views in a step of the visit that is under way."""
+        """Views in a step of the visit that is under way; the most that one draws where none is."""
         config = self.run.config
-        return views_per_step(config.batch, self.run.blocks, config.limits.batch_limit)
+        most = views_per_step(config.batch, self.run.blocks, config.limits.batch_limit)
+        active = self.run.state.active
+        return most if active is None else active.batch or most
 
     def attach(self, active: ActiveVisit) -> None:
         """Make the block of the run's active visit live and draw its layers, at its beginning or where a save

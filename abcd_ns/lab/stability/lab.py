@@ -267,16 +267,16 @@ def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, waiti
     Args:
         waiting: Gaussians that have no room in the warm-up.
     """
-    batch, batch_warm = views_per_step(config.batch, blocks), views_per_step(config.batch, 1)
+    batch_warm = views_per_step(config.batch, 1)
 
     def drawn_in(steps: int) -> int:
         if blocks == 1 or config.warmup == 0:
-            return steps * batch
+            return steps * views_per_step(config.batch, blocks, trained=0)
         uses, share = batch_warm / views, config.warmup
         taken = range(1, steps)
         is_over = (warm_up_is_over(step / steps, step * uses, share, waiting) for step in taken)
         warm = next((step for step, over in zip(taken, is_over, strict=True) if over), steps)
-        return warm * batch_warm + (steps - warm) * batch
+        return warm * batch_warm + (steps - warm) * views_per_step(config.batch, blocks, trained=warm)
 
     return max(bisect_left(range(drawn + 1), drawn, key=drawn_in), 1)
 

@@ -11,6 +11,7 @@ from abcd_ns.engine.train.schedule import (
     LAYER_TIME,
     SHORTER,
     WINDOW_COST,
+    YOUNG,
     exponential_decay,
     passes_at_once,
     passes_for_layers,
@@ -19,6 +20,7 @@ from abcd_ns.engine.train.schedule import (
     settling,
     sh_degree_at,
     view_order,
+    views_per_step,
     views_per_visit,
     visit_views,
 )
@@ -45,6 +47,28 @@ def test_sweeps_use_up_the_budget_exactly(views, passes, budget, seed):
         left -= sum(plan.steps for plan in plans)
         sweeps += 1
     assert left == 0
+
+
+@given(views=VIEWS, passes=st.integers(1, 6), batches=st.dictionaries(st.integers(0, 30), st.integers(1, 4)))
+def test_a_visit_uses_its_views_as_often_whatever_a_step_draws(views, passes, batches):
+    for plan in plan_sweep(0, views, passes, None, 0, batches=batches):
+        batch, uses = batches.get(plan.block, 1), passes * views[plan.block]
+        assert uses <= plan.steps * batch < uses + batch
+
+
+def test_the_last_sweep_shares_views_also_where_steps_draw_different_numbers():
+    plans = plan_sweep(3, {0: 10, 1: 30}, passes=4, remaining=50, seed=0, batches={0: 1, 1: 2})
+    assert {plan.block: plan.steps for plan in plans} == {0: 20, 1: 30}
+
+
+@pytest.mark.parametrize(
+    ("trained", "draws"), [(0, 1), (YOUNG - 1, 1), (YOUNG, 2), (2 * YOUNG, 4), (1000 * YOUNG, 4), (None, 4)]
+)
+def test_the_steps_of_a_young_block_draw_fewer_views(trained, draws):
+    assert views_per_step(0, 8, trained=trained) == draws
+    assert views_per_step(0, 8, limit=2, trained=trained) == min(draws, 2)
+    assert views_per_step(3, 8, trained=trained) == 3  # as is asked for
+    assert views_per_step(0, 1, trained=trained) == 1
 
 
 def test_the_last_sweep_is_shared_in_proportion():

@@ -6,6 +6,7 @@ from abcd_ns.engine.events import PhotosWanted, SweepEnded, VisitBegan
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import LOOK_AGAIN
+from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import listen, make_coordinator
@@ -48,6 +49,27 @@ def test_photos_of_a_step_and_of_those_to_come_are_wanted(tmp_path, views, start
             follows = order[step * coordinator.batch :][: coordinator.batch + COMING]
             assert list(views_told[: len(follows)]) == follows
     assert any(len(views_told) > coordinator.batch for views_told in told[0])
+
+
+def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(
+    tmp_path, views, start, monkeypatch
+):
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.YOUNG", 20)  # these see a few dozen
+    options = {"blocks": 3, "steps": 150, "fast_start": True, "density": DensityConfig(strategy="off")}
+    coordinator, drawn, expected = make_coordinator(tmp_path, start, views, **options), set(), 0
+    while not coordinator.finished:
+        batch = coordinator.next_batch()
+        active = coordinator.run.active
+        if active.done == 0:
+            expected = views_per_step(0, 3, trained=coordinator.visit.live.clocks.adam_views)
+        assert len(batch.samples) == coordinator.batch == expected
+        drawn.add(expected)
+        coordinator.after_step(coordinator.render(batch))
+        if active.done == 1 and expected == 2:  # in the midst of a visit
+            coordinator.save()
+            coordinator.scene.store.close()
+            coordinator = make_coordinator(tmp_path, start, views, resume=True, **options)
+    assert drawn == {1, 2, 4}
 
 
 def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(
