@@ -270,15 +270,31 @@ def steps_for(drawn: int, config: TrainingConfig, blocks: int, views: int, waiti
     batch_warm = views_per_step(config.batch, 1)
 
     def drawn_in(steps: int) -> int:
-        if blocks == 1 or config.warmup == 0:
-            return steps * views_per_step(config.batch, blocks, trained=0)
+        if blocks == 1:
+            return steps * batch_warm
+        if config.warmup == 0:
+            return drawn_by_blocks(steps, config, blocks, 0)
         uses, share = batch_warm / views, config.warmup
         taken = range(1, steps)
         is_over = (warm_up_is_over(step / steps, step * uses, share, waiting) for step in taken)
         warm = next((step for step, over in zip(taken, is_over, strict=True) if over), steps)
-        return warm * batch_warm + (steps - warm) * views_per_step(config.batch, blocks, trained=warm)
+        return warm * batch_warm + drawn_by_blocks(steps - warm, config, blocks, warm * batch_warm)
 
     return max(bisect_left(range(drawn + 1), drawn, key=drawn_in), 1)
+
+
+def drawn_by_blocks(steps: int, config: TrainingConfig, blocks: int, trained: int) -> int:
+    """Views that so many steps draw, which blocks take in turn.
+
+    Args:
+        trained: views that each of them was trained on before.
+    """
+    drawn, known = 0, config.recipe.fast_start
+    for taken in range(0, steps, blocks):
+        batch = views_per_step(config.batch, blocks, trained=trained if known else None)
+        drawn += batch * min(steps - taken, blocks)
+        trained += batch
+    return drawn
 
 
 def merged(coordinator: Coordinator) -> Gaussians:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES
+from abcd_ns.engine.train.schedule import SCAFFOLD_PASSES, views_per_step
 from abcd_ns.lab.stability.lab import Lab, make_stage, steps_for
 
 
@@ -20,10 +20,15 @@ from abcd_ns.lab.stability.lab import Lab, make_stage, steps_for
 def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, waiting, blocks):
     config = TrainingConfig(warmup=0.2, batch=0)
     steps = steps_for(drawn, config, blocks, views, waiting)
-    batch, least = (1, 0.0) if blocks == 1 else (4, 0.2 * steps)
+    least = 0.0 if blocks == 1 else 0.2 * steps
     enough = SCAFFOLD_PASSES * views
-    warm = min(enough, least) if waiting else min(max(enough, least), 2 * least)
-    assert math.ceil(warm) + (steps - math.ceil(warm)) * batch == pytest.approx(drawn, abs=3 * batch)
+    warm = math.ceil(min(enough, least) if waiting else min(max(enough, least), 2 * least))
+    trained, found = [warm] * blocks, warm
+    for step in range(steps - warm):  # a block after the other
+        batch = views_per_step(0, blocks, trained=trained[step % blocks])
+        trained[step % blocks] += batch
+        found += batch
+    assert found == pytest.approx(drawn, abs=3 * views_per_step(0, blocks))
 
 
 def test_a_labs_seed_is_that_of_its_trainings_unless_they_name_one(tmp_path):
