@@ -57,7 +57,7 @@ class Lent:
     taken: int
     """Gaussians that waited for the block and are in its visit."""
     ends: int
-    """Steps that each place for a visit has been given when this one is to end."""
+    """Views that each place for a visit has been given to draw when this one is to end."""
     submitted: bool = False
     losses: int = 0
     outcome: VisitOutcome | None = None
@@ -181,7 +181,7 @@ class Dispatcher(Coordinator):
         state.in_flight.append(active)
         own = self.workers.share(with_mail(scene, block))
         lease = Lease(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
-        return Lent(active, lease, len(mail or ()), self._ended + active.steps)
+        return Lent(active, lease, len(mail or ()), self._ended + active.steps * max(active.batch, 1))
 
     def _light_of(self, views: Sequence[int]) -> dict[int, Tensor]:
         """The transforms of these views by now."""

@@ -1,7 +1,6 @@
 """Smaller files, by the package gaussforge, all at once: .spz, .sog and .compressed.ply."""
 
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 
@@ -23,8 +22,8 @@ def check_installed() -> None:
         ) from None
 
 
-def write_packed(path: Path, count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians]) -> None:
-    """Write Gaussians, `count` in all, once all are there.
+def packed(count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians]) -> bytes:
+    """A file of Gaussians, `count` in all, once all are there.
 
     Args:
         kind: "spz", "sog" or "compressed.ply".
@@ -44,8 +43,8 @@ def write_packed(path: Path, count: int, sh_degree: int, kind: str, parts: Itera
     del table
     found = gaussforge.GaussForge().convert(whole, "ply", kind)
     if "error" in found:
-        raise UserError(f"{path} cannot be written: gaussforge says {found['error']}.")
-    path.write_bytes(found["data"])
+        raise UserError(f".{kind} cannot be written: gaussforge says {found['error']}.")
+    return found["data"]
 
 
 def _transpose(table: np.ndarray, sh_degree: int) -> None:

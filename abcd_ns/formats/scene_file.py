@@ -4,13 +4,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
 from abcd_ns.formats.glb import write_glb
-from abcd_ns.formats.packed import check_installed, write_packed
+from abcd_ns.formats.packed import check_installed, packed
 from abcd_ns.formats.ply import write_ply
 
 PACKED = (".compressed.ply", ".spz", ".sog")
@@ -18,6 +19,11 @@ SUFFIXES = (*PACKED, ".ply", ".glb")
 """The longer of two that fit comes first."""
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
 """What .spz rounds positions to, and how far from the origin they may be: 24 bits, 12 of them below one."""
+
+
+def shows(opacities: Float[Tensor, "n 1"]) -> Bool[Tensor, "n"]:
+    """By the logits of opacities, which Gaussians some rasterizer would show; files leave out the others."""
+    return torch.sigmoid(opacities[:, 0]) >= MIN_ALPHA
 
 
 def suffix_of(path: Path, missing: str | None = None) -> str:
@@ -72,7 +78,7 @@ def write_scene(
     elif suffix == ".glb":
         write_glb(path, count, sh_degree, up, parts)
     else:
-        write_packed(path, count, sh_degree, suffix[1:], parts)
+        path.write_bytes(packed(count, sh_degree, suffix[1:], parts))
 
 
 def _counted(parts: Iterable[Gaussians], count: int) -> Iterator[Gaussians]:

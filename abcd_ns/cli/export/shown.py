@@ -9,13 +9,13 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.frames import Frame
 from abcd_ns.engine.gaussians.packed import DRAWN, WAITS, Packed
-from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.special_blocks import INBOX, BlockName
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
+from abcd_ns.formats.scene_file import shows
 
 Box = tuple[float, float, float, float, float, float]
 """x, y and z of its lower and then of its upper corner."""
@@ -103,7 +103,7 @@ class Shown:
         return means.double() if self.to is None else self.to.points(means)
 
     def _kept(self, means: Tensor, opacities: Tensor) -> Bool[Tensor, "n"]:
-        kept = torch.sigmoid(opacities[:, 0]) >= MIN_ALPHA
+        kept = shows(opacities)
         if self.box is not None:
             low, high = means.new_tensor(self.box[:3]), means.new_tensor(self.box[3:])
             kept &= ((means >= low) & (means < high)).all(dim=1)

@@ -201,7 +201,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     rows = {
         "blocks": f"{fit.blocks}{at_the_end}",
         "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
-        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views}",
+        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views} at most",
     }
     for place, shares in found.shares.items():
         needed, free = sum(shares.values()), found.free[place]

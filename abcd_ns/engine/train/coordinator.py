@@ -63,7 +63,7 @@ class Coordinator(Trainer):
 
     @property
     def batch(self) -> int:
-        """Views in a step of the visit that is under way."""
+        """Views in a step of the visit that is under way; the most that one draws where none is."""
         return self.visit.batch
 
     def next_batch(self) -> Batch:

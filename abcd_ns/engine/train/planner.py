@@ -167,7 +167,7 @@ class Planner(Visits):
             sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
             steps=plan.steps,
             views=(*chosen, *looked_at),
-            batch=self._batch(block),
+            batch=plan.batch,
             looked_at=looked_at,
             showing=showing,
         )

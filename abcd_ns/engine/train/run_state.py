@@ -163,11 +163,11 @@ class RunState:
             self.health[new] = BlockHealth(visits=record.visits, damping=record.damping)
         places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
         for place in reversed(places):
-            self.queue.insert(place + 1, VisitPlan(new, self.queue[place].steps))
+            self.queue.insert(place + 1, self.queue[place]._replace(block=new))
 
     def to_json(self) -> dict[str, Any]:
         """As JSON, which shares nothing with this state; `from_json` gives an equal one."""
-        lent = [VisitPlan(visit.geometry.block, visit.steps) for visit in self.in_flight]
+        lent = [VisitPlan(v.geometry.block, v.steps, v.batch) for v in self.in_flight]
         return msgspec.to_builtins(replace(self, queue=lent + self.queue, in_flight=[]), str_keys=True)
 
     @staticmethod

@@ -1,8 +1,8 @@
 """Which block next, for how many steps, on which views: pure functions of integers.
 
-There is one step budget for the whole scene. A sweep visits every block that some view sees; a block's
-steps are proportional to the number of those views, as in joint training (docs/design.md: blocks that
-few views see overfit otherwise). Visits are short at first, while the neighbours are still blobs, and
+There is one step budget for the whole scene. A sweep visits every block that some view sees; what its steps
+draw is proportional to the number of those views, as in joint training (docs/design.md: blocks that few
+views see overfit otherwise). Visits are short at first, while the neighbours are still blobs, and
 grow longer, so that drawing the frozen layers is paid for by more steps.
 """
 
@@ -17,9 +17,9 @@ T = TypeVar("T")
 DEFAULT_BATCH = 4
 """Views in a step where there are several blocks, of one that was trained on many views."""
 YOUNG = 500
-"""Views that a block was trained on, the warm-up's included, up to which a step draws one; two up to twice as
-many, and so on. A young block's steps are as large whatever they draw, see `rates_of_young`: so there are
-more of them."""
+"""Views that a block was trained on when a visit is planned, the warm-up's included, below which its steps
+draw one; two below twice as many, and so on. A young block's steps are as large whatever they draw, see
+`rates_of_young`: so there are more of them."""
 SCAFFOLD_PASSES = 24
 """Uses of each view in the warm-up: at most, where it has no room for all Gaussians that there are, as so few
 soon are as good as they can be. Elsewhere it goes on until then, for ..."""
@@ -49,6 +49,8 @@ class VisitPlan(NamedTuple):
 
     block: int
     steps: int
+    batch: int = 0
+    """Views in each step; 0 for as many as steps have at most."""
 
 
 def warm_up_is_over(progress: float, uses: float, share: float, waiting: int) -> bool:
@@ -132,17 +134,15 @@ def plan_sweep(
     seen = {block: count for block, count in sorted(views.items()) if count > 0}
     order = list(seen)
     random.Random(f"sweep {seed} {sweep}").shuffle(order)
-    if each > 0:
-        seen, passes, batches = dict.fromkeys(seen, 1), each, {}
-    steps = {block: math.ceil(passes * count / batches.get(block, 1)) for block, count in seen.items()}
+    most = max(batches.values(), default=1)
+    weights = {block: 1 if each else count * most // batches.get(block, 1) for block, count in seen.items()}
+    steps = {b: each or math.ceil(passes * count / batches.get(b, 1)) for b, count in seen.items()}
     full = sum(steps.values())
-    if remaining is None or remaining >= full + full // 2:
-        return tuple(VisitPlan(block, steps[block]) for block in order)
     if not seen:
         return ()
-    most = max(batches.values(), default=1)
-    shares = _apportion(remaining, [seen[block] * most // batches.get(block, 1) for block in order])
-    return tuple(VisitPlan(block, share) for block, share in zip(order, shares, strict=True) if share > 0)
+    if remaining is not None and remaining < full + full // 2:
+        steps = dict(zip(order, _apportion(remaining, [weights[block] for block in order]), strict=True))
+    return tuple(VisitPlan(b, steps[b], batches.get(b, 0)) for b in order if steps[b] > 0)
 
 
 def views_per_step(batch: int, blocks: int, limit: int = 0, trained: int | None = None) -> int:
@@ -167,8 +167,9 @@ def evenly(values: Sequence[T], wanted: int) -> list[T]:
 def views_per_visit(seen: int, most_seen: int, limit: int) -> int:
     """How many of the `seen` views of a block a visit uses.
 
-    The same share of every block's views, so that steps stay in proportion, and `limit` for the block that
-    `most_seen` views see: a visit draws F and B for each view it uses, and stays short where there are many.
+    The same share of every block's views, so that what steps draw stays in proportion, and `limit` for the
+    block that `most_seen` views see: a visit draws F and B for each view it uses, and stays short where there
+    are many.
     """
     return -(-seen * min(limit, most_seen) // most_seen)  # rounded up
 

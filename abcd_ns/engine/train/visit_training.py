@@ -72,7 +72,8 @@ class VisitTraining:
         config = self.run.config
         most = views_per_step(config.batch, self.run.blocks, config.limits.batch_limit)
         active = self.run.state.active
-        return most if active is None else active.batch or most
+        # A run may go on with less memory than its visit began with.
+        return most if active is None else min(active.batch or most, most)
 
     def attach(self, active: ActiveVisit) -> None:
         """Make the block of the run's active visit live and draw its layers, at its beginning or where a save

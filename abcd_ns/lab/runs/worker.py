@@ -72,7 +72,7 @@ def run(job: Job, folder: Path) -> Run:
 
 
 def file_bytes(training: Training) -> dict[str, int | None]:
-    """Of the scene as files; nothing where RAM should not hold it at once."""
+    """Of the scene as files; nothing where RAM should not hold it twice."""
     if training.gaussians > MOST_AT_ONCE:
         return {}
     scene = everything(training.pipeline.model)

@@ -6,7 +6,8 @@ from abcd_ns.engine.events import PhotosWanted, SweepEnded, VisitBegan
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import LOOK_AGAIN
-from abcd_ns.engine.train.schedule import views_per_step
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.schedule import VisitPlan, views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import listen, make_coordinator
@@ -56,7 +57,7 @@ def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(
 ):
     monkeypatch.setattr("abcd_ns.engine.train.schedule.YOUNG", 20)  # these see a few dozen
     options = {"blocks": 3, "steps": 150, "fast_start": True, "density": DensityConfig(strategy="off")}
-    coordinator, drawn, expected = make_coordinator(tmp_path, start, views, **options), set(), 0
+    coordinator, drawn, expected, stops = make_coordinator(tmp_path, start, views, **options), set(), 0, 0
     while not coordinator.finished:
         batch = coordinator.next_batch()
         active = coordinator.run.active
@@ -68,8 +69,28 @@ def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(
         if active.done == 1 and expected == 2:  # in the midst of a visit
             coordinator.save()
             coordinator.scene.store.close()
-            coordinator = make_coordinator(tmp_path, start, views, resume=True, **options)
+            coordinator, stops = make_coordinator(tmp_path, start, views, resume=True, **options), stops + 1
     assert drawn == {1, 2, 4}
+    assert stops > 0
+
+
+def test_a_visit_that_goes_on_with_less_memory_draws_no_more_views_than_fit(tmp_path, views, start):
+    options = {"blocks": 3, "steps": 150, "density": DensityConfig(strategy="off")}
+    coordinator = make_coordinator(tmp_path, start, views, **options)
+    coordinator.after_step(coordinator.render(coordinator.next_batch()))
+    assert coordinator.batch == 4
+    coordinator.save()
+    coordinator.scene.store.close()
+    went_on = make_coordinator(tmp_path, start, views, resume=True, batch_limit=2, **options)
+    assert went_on.run.active.done == 1
+    assert len(went_on.next_batch().samples) == went_on.batch == 2
+
+
+def test_a_queue_of_before_visits_knew_their_batch_is_read():
+    state = RunState(queue=[VisitPlan(3, 10, 2)]).to_json()
+    assert RunState.from_json(state).queue == [VisitPlan(3, 10, 2)]
+    state["queue"] = [[3, 10]]
+    assert RunState.from_json(state).queue == [VisitPlan(3, 10)]
 
 
 def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(

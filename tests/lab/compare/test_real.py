@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from abcd_ns.cli.export.command import export
 from abcd_ns.lab.compare.command import Options, carry_out, make_plan
 from tests.lab.compare.records import read_results
 from tests.lab.in_process import jobs_in_this_process
@@ -36,6 +37,16 @@ def compared(tmp_path_factory):
         code = carry_out(plan, Console(file=stream, width=100))
     assert code == 0, stream.getvalue()
     return read_results(plan.out / "results.json"), plan, stream.getvalue()
+
+
+@pytest.mark.cli
+def test_a_scene_is_as_large_as_its_export(compared, tmp_path):
+    results, plan, _ = compared
+    for run in results.runs:
+        for suffix, size in {".ply": run.ply_bytes, ".spz": run.spz_bytes}.items():
+            out = tmp_path / f"{run.method}{suffix}"
+            export(plan.out / "runs" / run.method / "seed-0", out=out, frame="nerfstudio")
+            assert size == out.stat().st_size
 
 
 @pytest.mark.cli

@@ -11,7 +11,7 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
-from abcd_ns.engine.train.schedule import DEFAULT_BATCH, passes_of_sweep, views_per_visit
+from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_step, views_per_visit
 from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.scenarios.freshness import objectives
@@ -98,10 +98,10 @@ def steps_that_left_all_faint(coordinator: Coordinator) -> list[int]:
 
 def refinements(cameras: int, sweep: int) -> int:
     """How often a block that `cameras` see is refined in one visit, once it is warm."""
-    control, batch = DensityControl(DensityConfig()), DEFAULT_BATCH
-    used = views_per_visit(cameras, cameras, VIEWS)
+    control, done = DensityControl(DensityConfig()), 10 * max(cameras, 1)
+    batch, used = views_per_step(0, 2, trained=done), views_per_visit(cameras, cameras, VIEWS)
     steps = -(-passes_of_sweep(sweep, PASSES, PASSES, used) * used // batch)
-    drawn, done = steps * batch, 10 * max(cameras, 1)
+    drawn = steps * batch
     clocks = [  # see LiveBlock.density_clock
         DensityClock(0.2, done + batch * (k + 1), batch, cameras, None, 0, visit=drawn) for k in range(steps)
     ]
