@@ -81,7 +81,7 @@ def _of_training(stage: Stage, one_block: Train) -> tuple[Study, ...]:
         Study(
             "visit-steps",
             "length of a visit",
-            "steps a visit (4 views each)",
+            "steps a visit",
             tuple(visits),
             all_views,
             one_block,
