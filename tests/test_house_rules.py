@@ -217,6 +217,7 @@ def test_the_contracts_notice_every_offence(tmp_path):
             "lab/__init__.py",
             "data/__init__.py",
             "peers/exact.py",
+            "formats/ply.py",
         ),
         "",
     )
