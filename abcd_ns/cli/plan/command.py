@@ -197,11 +197,12 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     """A few lines and a table for people; `verbose` says where the figures come from."""
     fit = found.fit
     at_the_end = f", {fit.blocks_at_the_end} in the end" if fit.blocks_at_the_end > fit.blocks else ""
-    (low, high), views = found.hours, many(found.batch, "view", "views")
+    (low, high), most = found.hours, many(found.batch, "view", "views")
+    views = f"up to {most}" if found.batch > 1 else most
     rows = {
         "blocks": f"{fit.blocks}{at_the_end}",
         "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
-        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views} at most",
+        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views}",
     }
     for place, shares in found.shares.items():
         needed, free = sum(shares.values()), found.free[place]

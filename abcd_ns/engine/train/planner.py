@@ -11,6 +11,7 @@ from abcd_ns.engine.space.culling import Frusta, Optics
 from abcd_ns.engine.space.influence import overlap, worth_training
 from abcd_ns.engine.store.settle import has_scaffold
 from abcd_ns.engine.store.special_blocks import RESERVE, WHOLE
+from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
@@ -72,6 +73,13 @@ class Visits(Protocol):
     ) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
         """What the loss compares, pictures and photos as far as they say something about the block: all."""
         return pictures, photos
+
+
+def views_of_step(config: TrainingConfig, blocks: int, trained: int) -> int:
+    """Views in a step of a block that was trained on so many, one of several: fewer while it is young, where
+    its steps are larger for that."""
+    known = trained if config.recipe.fast_start else None
+    return views_per_step(config.batch, blocks, config.limits.batch_limit, known)
 
 
 class Planner(Visits):
@@ -220,14 +228,9 @@ class Planner(Visits):
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
         steps = (passes, remaining, config.seed, config.recipe.visit_steps)
-        batches = {block: self._batch(block) for block in used}
+        clocks = self._scene.clocks
+        batches = {block: views_of_step(config, blocks, clocks(block).adam_views) for block in used}
         state.queue = list(plan_sweep(state.sweep, used, *steps, batches))
-
-    def _batch(self, block: int) -> int:
-        """Views in a step of the block: fewer while it is young, where its steps are larger for that."""
-        config, blocks = self._config, self._scene.tree.num_blocks
-        trained = self._scene.clocks(block).adam_views if config.recipe.fast_start else None
-        return views_per_step(config.batch, blocks, config.limits.batch_limit, trained)
 
     def _look_at_arrivals(self, state: RunState) -> None:
         """A block that no view saw may be seen once others have come into it."""

@@ -27,6 +27,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import scaffold_size
+from abcd_ns.engine.train.planner import views_of_step
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
@@ -289,9 +290,9 @@ def drawn_by_blocks(steps: int, config: TrainingConfig, blocks: int, trained: in
     Args:
         trained: views that each of them was trained on before.
     """
-    drawn, known = 0, config.recipe.fast_start
+    drawn = 0
     for taken in range(0, steps, blocks):
-        batch = views_per_step(config.batch, blocks, trained=trained if known else None)
+        batch = views_of_step(config, blocks, trained)
         drawn += batch * min(steps - taken, blocks)
         trained += batch
     return drawn
