@@ -22,7 +22,6 @@ PAPER = TrainingConfig(
         migrate=False,
         pixel_loss="l2",
         fast_start=False,
-        split_wide=False,
     ),
     warmup=0.0,
     batch=1,

@@ -67,7 +67,7 @@ UNUSED_OF_MODEL = {
     "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",
     **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),
     **dict.fromkeys(("cull_screen_size", "stop_screen_size_at"), _GIANTS),
-    "split_screen_size": "what is over a twentieth of a picture wide is split, whenever a block grows",
+    "split_screen_size": "nothing is split for its size",
     **dict.fromkeys(("cull_scale_thresh", "use_scale_regularization", "max_gauss_ratio"), _GIANTS),
     "grid_shape": _GRIDS,
     "camera_optimizer": "set --pipeline.training.poses SO3xR3 instead",

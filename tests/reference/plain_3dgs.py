@@ -10,7 +10,6 @@ from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityControl
-from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, settling, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.scenes import Photos
@@ -55,8 +54,7 @@ def train_plain(
             optimizer.step()
         seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
         clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed)
-        wide = wider_than(WIDE_ANGLE, params["scales"], params["means"], views)[0].any(dim=1)
-        growth = density.after_step(params, adam, growth, (raster.info,), clock, wide)
+        growth = density.after_step(params, adam, growth, (raster.info,), clock)
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 
 

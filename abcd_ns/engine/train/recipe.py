@@ -42,8 +42,6 @@ class Recipe:
     batch_power: float = 1.0
     """Learning rates grow with this power of the views in a step: 0.5 suits gradients that are noise, 1 such
     as agree. A scene's views show different Gaussians, but a block's all show the same ones."""
-    split_wide: bool = True
-    """Gaussians over a twentieth of a picture wide are split when their block grows, see `WIDE_ANGLE`."""
     fast_start: bool = True
     """Learning rates are larger while a block was trained on few views, see `param_swap.rates_of_young`, and
     fall at the end of the run, see `schedule.settling`."""

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import torch
 from gsplat.strategy import MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
-from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
@@ -45,6 +44,8 @@ WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
 """A warm-up is refined whenever this share has been drawn of the views that the run would draw at its pace,
 or so many views if these are more, or all of the scene's: also a short one is to fill its room, but by what
 every view asks for."""
+MOST_NEW, LEAST_NEW = 0.1, 16
+"""Gaussians that one refinement may add: this share of the block's, or this many if that is more."""
 PLAIN_GRADIENT = 0.25
 """Thresholds of gradients, as a share of those of absolute ones: 0.0002 (3DGS, 2DGS) of 0.0008 (AbsGS)."""
 MCMC_MIN_OPACITY = 0.005
@@ -209,14 +210,12 @@ class DensityControl:
         growth: dict[str, Tensor],
         infos: Infos,
         clock: DensityClock,
-        wide: Bool[Tensor, "n"] | None = None,
     ) -> dict[str, Tensor]:
         """Gather statistics and, when it is time, refine. Call after Adam's step.
 
         Args:
             growth: the block's statistics so far, each [n].
             infos: of the step's drawings, after backward.
-            wide: which are to become two whatever their gradients say (`default` strategy).
 
         Returns:
             The block's statistics from now on. The global random generator is left as it was.
@@ -235,7 +234,7 @@ class DensityControl:
             if self.config.strategy == "mcmc":
                 self._step_mcmc(params, optimizers, clock)
                 return {}
-            return self._step_default(params, optimizers, growth, infos, clock, wide)
+            return self._step_default(params, optimizers, growth, infos, clock)
 
     def shed(
         self,
@@ -267,15 +266,14 @@ class DensityControl:
         growth: dict[str, Tensor],
         infos: Infos,
         clock: DensityClock,
-        wide: Bool[Tensor, "n"] | None,
     ) -> dict[str, Tensor]:
         config = self.config
         if self.refines(clock, infos):
             gradients = growth["grad2d"] / growth["count"].clamp_min(1)
             wanted = torch.where(gradients > config.densify_grad_thresh, gradients, 0.0)
-            if wide is not None:
-                wanted = torch.where(wide, torch.inf, wanted)
-            which = chosen(torch.where(may_grow(growth, config.price), wanted, 0.0), clock.room)
+            most = max(int(MOST_NEW * len(wanted)), LEAST_NEW)
+            room = most if clock.room is None else min(most, clock.room)
+            which = chosen(torch.where(may_grow(growth, config.price), wanted, 0.0), room)
             growth = halve(params, optimizers, growth, which, self._axes)
             growth |= {name: torch.zeros_like(growth[name]) for name in GRADIENTS}
             faint = torch.sigmoid(params["opacities"][:, 0]) < config.cull_alpha_thresh

@@ -17,9 +17,6 @@ LARGEST_LOG_SCALE = 40.0
 GIANT_ANGLE = 0.3
 """A giant's standard deviation is over this share of its distance to the nearest camera: 3 sigma cover 45
 degrees to either side. What is far away, sky for instance, may be large."""
-WIDE_ANGLE = 0.05
-"""Gaussians that are wider in this measure, a twentieth of a picture say, are split when their block grows,
-whatever their gradients: what lies before and behind such a one cannot be sorted from everywhere."""
 HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
 DISTANCES_AT_ONCE = 1 << 22

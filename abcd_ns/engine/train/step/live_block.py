@@ -14,7 +14,6 @@ from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import faded
 from abcd_ns.engine.train.density.splitting import is_full
-from abcd_ns.engine.train.health.health_rules import WIDE_ANGLE, wider_than
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -90,11 +89,8 @@ class LiveBlock:
             infos: of the step's drawings; none where its gradients were no numbers.
         """
         run = self._run
-        wide, refines = None, run.density.refines(clock, infos)
-        if run.config.recipe.split_wide and refines:
-            scales, means = run.params["scales"], run.params["means"]
-            wide = wider_than(WIDE_ANGLE, scales, means, run.views.values())[0].any(dim=1)
-        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock, wide)
+        refines = run.density.refines(clock, infos)
+        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock)
         if refines:
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.hold_back_giants()
