@@ -43,14 +43,25 @@ class Versions:
     """Of the abcd_ns checkout, with "+changes" where files differ from it; None outside a checkout."""
 
 
+def usable_cores() -> int:
+    """Those that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads_wanted() -> int:
+    """Threads to compute on: OMP_NUM_THREADS where it is set, else one for each usable core."""
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    return int(asked) if asked.isdigit() and int(asked) > 0 else usable_cores()
+
+
 def describe_machine() -> Machine:
     """This machine."""
     import torch
 
     return Machine(
         cpu=_cpu_model(),
-        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        torch_threads=torch.get_num_threads(),
+        cores=usable_cores(),
+        torch_threads=threads_wanted(),
         ram_bytes=psutil.virtual_memory().total,
         gpu=torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         os=f"{platform.system()} {platform.machine()}",

@@ -14,12 +14,12 @@ from itertools import product
 from pathlib import Path
 from statistics import fmean
 
-import torch
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.visit_worker import RunSetup
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded
+from abcd_ns.engine.kernels import share_cores
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio import pipeline
@@ -83,7 +83,7 @@ def run(args: Args, at_once: int, seed: int) -> Row:
             out -= 1
             row.visits += 1
 
-    torch.set_num_threads(1)
+    share_cores(1)
     with tempfile.TemporaryDirectory() as folder:
         options = {"seed": seed, "workers": 2}  # any number but 1 dispatches
         config = config_of(args.data, Path(folder), **shared(args), **options)

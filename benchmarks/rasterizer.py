@@ -1,4 +1,4 @@
-"""How long the torch rasterizer takes to draw a whole picture, and to differentiate it, built and eager.
+"""How long the CPU rasterizer takes to draw a whole picture, and to differentiate it.
 
     python -m benchmarks.rasterizer
 
@@ -37,6 +37,8 @@ class Args:
     """Timed rounds per figure; the median is reported."""
     seed: int = 0
     """Seed of the synthetic scene."""
+    torch: bool = False
+    """Measure the reference in torch, too: seconds a picture."""
 
 
 def synthetic_scene(n: int, seed: int) -> Gaussians:
@@ -89,12 +91,12 @@ def sides_of(name: str, rasterizer: TorchRasterizer, gaussians: Gaussians, view:
 def main(args: Args) -> None:
     """Print a table."""
     print_machine(f"seed {args.seed}, {args.gaussians:,} Gaussians; ms a picture\n")
-    gaussians, built = synthetic_scene(args.gaussians, args.seed), TorchRasterizer()
-    built.warm_up()
+    gaussians, native = synthetic_scene(args.gaussians, args.seed), TorchRasterizer()
+    native.warm_up()
     columns = []
     for view in map(camera, args.widths):
-        sides = sides_of("eager", TorchRasterizer("never"), gaussians, view)
-        sides |= sides_of("built", built, gaussians, view) if built.kernels.built else {}
+        sides = sides_of("native", native, gaussians, view)
+        sides |= sides_of("torch", TorchRasterizer(use_native=False), gaussians, view) if args.torch else {}
         columns.append(take_turns(sides, args.rounds))
     names = [f"{width}x{2 * width // 3}" for width in args.widths]
     rows = [[side, *(f"{column[side]:.1f}" for column in columns)] for side in columns[0]]

@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from abcd_ns.lab.job import Job, Settings
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.machine import describe_machine, describe_versions
+from abcd_ns.machine import describe_machine, describe_versions, threads_wanted
 
 
 def write_runs(out: Path | None, asked: Mapping[str, Any], runs: Sequence[Any]) -> None:
@@ -89,5 +89,5 @@ class StageClock:
 
 def print_machine(*more: str) -> None:
     """A line that says where this was measured, and `more`."""
-    machine = f"{describe_machine().cpu}, {os.cpu_count()} cores, {torch.get_num_threads()} threads"
+    machine = f"{describe_machine().cpu}, {os.cpu_count()} cores, {threads_wanted()} threads"
     print(", ".join([machine, f"torch {torch.__version__}", *more]))

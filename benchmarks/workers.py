@@ -20,13 +20,13 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import torch
 import tyro
 
 from abcd_ns.cluster.dispatcher import Dispatcher
 from abcd_ns.cluster.lease import Lease, Report, Workers
 from abcd_ns.engine.events import Event, VisitBegan, VisitEnded, WorkerLost, WorkersSeen
 from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.kernels import share_cores
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.runs.evaluate import mean_psnr
 from abcd_ns.nerfstudio.run import STATE
@@ -154,9 +154,9 @@ def measure(args: Args, workers: int, kills: int, out: Path) -> Row:
     options = {name: getattr(args, name) for name in ("downscale", "blocks", "seed", "steps", "seconds")}
     config = config_of(args.data, out, workers=max(workers, 1), **options)
     if workers == 1:
-        torch.set_num_threads(1)
+        share_cores(1)
     else:
-        torch.set_num_threads(os.cpu_count() or 1)
+        share_cores(os.cpu_count() or 1)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     row, coordinator = Row(workers), trainer.pipeline.coordinator

@@ -107,14 +107,10 @@ check_open3d() {
   fi
 }
 
-# The torch rasterizer's kernels for this processor; without a compiler it stays slow and says so itself.
-build_kernels() {
-  say "building the CPU kernels: two or three minutes, once per machine"
-  "$VENV_PYTHON" -c '
-from abcd_ns.engine.build_kernels import all_kernels
-from abcd_ns.engine.kernels.build import build_kernels
-from abcd_ns.engine.render.cpu.backend import CHUNK, TILE_SIDE
-build_kernels(all_kernels(TILE_SIDE, CHUNK), TILE_SIDE, CHUNK)'
+# The CPU rasterizer, for this processor; without a compiler it stays slow and says so itself.
+compile_library() {
+  say "compiling the CPU rasterizer: some 15 seconds, once per machine"
+  "$VENV_PYTHON" -c 'from abcd_ns.engine.kernels import library; library()'
 }
 
 [[ $(uname -sm) == "Linux x86_64" ]] ||
@@ -122,5 +118,5 @@ build_kernels(all_kernels(TILE_SIDE, CHUNK), TILE_SIDE, CHUNK)'
 make_venv
 install_packages
 check_open3d
-build_kernels
+compile_library
 say "done: $VENV is ready"

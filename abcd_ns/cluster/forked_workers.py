@@ -26,6 +26,7 @@ from abcd_ns.cluster.members import Member, Members, RecentMean
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.kernels import share_cores
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, is_out_of_memory
 
@@ -202,7 +203,7 @@ def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> 
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the training process decides
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         pipe.send(None)
-        torch.set_num_threads(1)
+        share_cores(1)
         pipe.send(Parcel.of(visit(_Telling(pipe))))
         status = 0
     except Exception as error:

@@ -37,6 +37,7 @@ from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.packed import Packed
+from abcd_ns.engine.kernels import share_cores
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, first_line, is_out_of_memory
 
@@ -87,7 +88,7 @@ class Actor:
 
     def prepare(self, make: Callable[[], VisitWorker]) -> int:
         """Read what the run needs; gives the process' identifier."""
-        torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+        share_cores(int(os.environ.get("OMP_NUM_THREADS", "1")))
         self._worker = make()
         return os.getpid()
 

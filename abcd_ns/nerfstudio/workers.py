@@ -21,6 +21,7 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.errors import UserError
+from abcd_ns.machine import threads_wanted
 from abcd_ns.nerfstudio.fit import Fit
 from abcd_ns.units import bytes_in_words
 
@@ -90,7 +91,7 @@ def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device:
     learns = training.light != "none" or training.poses != "off"
     if learns or not _works_at_once(training.recipe) or not can_fork(torch.device(device)):
         return 1
-    return max(min(torch.get_num_threads(), blocks // BLOCKS_EACH), 1)
+    return max(min(threads_wanted(), blocks // BLOCKS_EACH), 1)
 
 
 def dispatcher_for(
@@ -125,7 +126,7 @@ def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int
     pipeline, on_gpu = config.pipeline, config.machine.device_type == "cuda"
     config = copy.deepcopy(config)
     config.pipeline.datamanager.photo_cache_gb = pipeline.datamanager.photo_cache_gb / count
-    threads = 1 if on_gpu else max(torch.get_num_threads() // count, 1)  # of machines that may be smaller
+    threads = 1 if on_gpu else max(threads_wanted() // count, 1)  # of machines that may be smaller
     if on_gpu and pipeline.cluster is None and torch.cuda.device_count() < count:
         raise WorkersError(
             f"{count} workers need {count} GPUs, one each, and this machine has {torch.cuda.device_count()}: "

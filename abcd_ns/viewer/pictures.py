@@ -15,7 +15,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from abcd_ns.engine.layers.compositing import empty_layer, over
 from abcd_ns.engine.layers.painter import FrozenLayers, Painter, PaintSettings, Seen
 from abcd_ns.engine.render import Raster, Shot, ZWindow
-from abcd_ns.engine.render.cpu.torch_kernels import MIN_TRANSMITTANCE
+from abcd_ns.engine.render.cpu.reference import MIN_TRANSMITTANCE
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.space.influence import coarser
 from abcd_ns.engine.types import Gaussians, Layer, View

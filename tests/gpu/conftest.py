@@ -27,7 +27,7 @@ def rasterizers(device) -> dict[str, Rasterizer]:
     """Those under test, by primitive; gsplat's are checked against the torch backend as they are made."""
     if device.type == "cuda":
         return {name: make_rasterizer("gsplat", device, primitive=name) for name in PRIMITIVES}
-    return {name: TorchRasterizer("never", tile_side=16, primitive=name) for name in PRIMITIVES}
+    return {name: TorchRasterizer(use_native=False, tile_side=16, primitive=name) for name in PRIMITIVES}
 
 
 @pytest.fixture(scope="session")

@@ -51,7 +51,7 @@ def test_equals_the_torch_backend(rasterizers, scene, crop, primitive, antialias
     frozen = scene(100, seed=3) if with_frozen else None
     options = {"sh_degree": 3, "crop": crop, "antialiased": antialiased, "frozen": frozen}
     image, grads = gradients(lambda g: rasterizer(g, view(), **options), scene(300))
-    torch_rasterizer = TorchRasterizer("never", primitive=primitive)
+    torch_rasterizer = TorchRasterizer(use_native=False, primitive=primitive)
     expected, expected_grads = gradients(lambda g: torch_rasterizer(g, view(), **options), scene(300))
     # A fragment at the 1/255 threshold may fall on either side: rounding differs, so a few pixels may too.
     difference = (image - expected).abs() / expected.abs().amax()
@@ -72,7 +72,7 @@ def test_crop_is_the_crop_of_the_full_image(rasterizer, scene, crop):
 @pytest.mark.parametrize("crop", CROPS)
 def test_absgrad_and_means2d_gradient(rasterizer, scene, crop):
     infos = []
-    for backend in (rasterizer, TorchRasterizer("never")):
+    for backend in (rasterizer, TorchRasterizer(use_native=False)):
         raster = backend(
             as_leaves(scene(200)), view(), sh_degree=1, crop=crop, frozen=scene(50, seed=3), absgrad=True
         )
@@ -93,7 +93,7 @@ def test_shots_that_are_drawn_together_are_the_torch_backends(rasterizer, scene,
         each.viewmat[0, 3] += 0.1 * k
     crops = [CROPS[1], CROPS[2], Crop(133, 80, 17, 20), Crop(0, 0, 40, 100)]
     found = []
-    for backend in (rasterizer, TorchRasterizer("never", tile_side=16)):
+    for backend in (rasterizer, TorchRasterizer(use_native=False, tile_side=16)):
         leaves, shots = as_leaves(scene(300)), []
         for k, (each, crop) in enumerate(zip(views, crops, strict=True)):
             grid = rasterizer.window_grid(crop)
@@ -114,7 +114,9 @@ def test_shots_that_are_drawn_together_are_the_torch_backends(rasterizer, scene,
 def test_extents_are_the_torch_backends(rasterizer, scene):
     gaussians = scene(200)
     views = [view(), replace(view(), width=120), replace(view(), near=5.0)]
-    found, expected = (draw.extents(gaussians, views) for draw in (rasterizer, TorchRasterizer("never")))
+    found, expected = (
+        draw.extents(gaussians, views) for draw in (rasterizer, TorchRasterizer(use_native=False))
+    )
     assert found.device.type == "cpu"
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1.1)  # a radius may be rounded up elsewhere
 
@@ -175,7 +177,7 @@ def test_the_cells_layers_fold_to_the_merged_picture(rasterizer, scene, crop, de
 def test_a_depth_window_is_the_torch_backends(rasterizer, scene, crop):
     gaussians, options = scene(100), {"crop": crop or view().full, "visible": 0.02}
     found = rasterizer.depth_window(gaussians, view(), **options)
-    expected = TorchRasterizer("never", tile_side=16).depth_window(gaussians, view(), **options)
+    expected = TorchRasterizer(use_native=False, tile_side=16).depth_window(gaussians, view(), **options)
     assert found.grid == expected.grid
     for side in ("near", "far"):
         alike = torch.isclose(getattr(found, side), getattr(expected, side), rtol=1e-3)
@@ -191,7 +193,7 @@ def test_front_inside_and_back_are_the_torch_backends_and_the_merged_picture(ras
     every = ZWindow.everything(window.grid, device, torch.float32)
     shot = CutShot(view(), crop, every.before(window), window, every.behind(window))
     cuts = []
-    for backend in (rasterizer, TorchRasterizer("never", tile_side=16)):
+    for backend in (rasterizer, TorchRasterizer(use_native=False, tile_side=16)):
         (cut,) = backend.cuts(frozen, [shot], sh_degree=3)
         (middle,) = backend.draw(active, [Shot(view(), crop, cut.inside, window)], sh_degree=3)
         found = sandwich(cut.front, middle.layer, cut.back, torch.zeros(3, device=device))

@@ -56,7 +56,8 @@ def pictures(coordinator, views):
     scene = whole_scene(coordinator)
     with torch.no_grad():
         return [
-            TorchRasterizer("never")(scene, v, sh_degree=scene.sh_degree).color.clamp(0, 1) for v in views
+            TorchRasterizer(use_native=False)(scene, v, sh_degree=scene.sh_degree).color.clamp(0, 1)
+            for v in views
         ]
 
 

@@ -3,13 +3,9 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
-from abcd_ns.engine.render.cpu.binning import TileLists, find_candidates
-from abcd_ns.engine.render.projection import Splats, pack, project_packed
-from abcd_ns.engine.render.tile_grid import TileGrid, TileSheet
-from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.render.projection import Splats, camera_numbers, project_in_torch
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 
 
@@ -41,9 +37,10 @@ def small_view(width: int = 37, height: int = 21, dtype: torch.dtype = torch.flo
     return View(viewmat, K, width, height).to(dtype)
 
 
-def project(gaussians: Gaussians, view: View, **options) -> Splats:
+def project(gaussians: Gaussians, view: View, sh_degree: int = 0, antialiased: bool = False) -> Splats:
     """As the torch rasterizer does, with gradients."""
-    return project_packed(pack(gaussians), view, **options)
+    camera = camera_numbers(view, gaussians.means, sh_degree, antialiased)
+    return Splats(project_in_torch(gaussians, [camera])[0])
 
 
 def as_leaves(gaussians: Gaussians) -> Gaussians:
@@ -79,22 +76,3 @@ def relative_error(value: Tensor, reference: Tensor) -> float:
     if reference.numel() == 0:
         return 0.0
     return float((value - reference).abs().max() / reference.abs().max().clamp_min(1e-300))
-
-
-def bin_splats(
-    splats: Splats,
-    grid: TileGrid,
-    chunk: int,
-    *,
-    masked: Bool[Tensor, "n"] | None = None,
-    window: ZWindow | None = None,
-) -> TileLists:
-    """The lists of a single view: see Candidates.lists and Candidates.within."""
-    grid_of = torch.zeros(len(splats), dtype=torch.long, device=splats.planes.device)
-    candidates = find_candidates(splats, grid_of, TileSheet((grid,)))
-    return (candidates if window is None else candidates.within([window], masked)).lists(chunk)
-
-
-def fragments_in(lists: TileLists) -> int:
-    """Pixel-Gaussian pairs that lists hold: an upper bound of what is computed."""
-    return lists.slots.numel() * lists.sheet.pixels_per_tile

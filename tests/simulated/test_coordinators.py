@@ -31,12 +31,12 @@ pytestmark = pytest.mark.usefixtures("simulated_gsplat")
 
 def on_device(folder, start, views, rasterizer="gsplat", **options):
     """A coordinator on the simulated device, with gsplat (without its check) unless told otherwise."""
-    draws = TorchRasterizer("never") if rasterizer == "torch" else GsplatRasterizer()
+    draws = TorchRasterizer(use_native=False) if rasterizer == "torch" else GsplatRasterizer()
     return make_coordinator(folder, start, views, device=DEVICE, rasterizer=draws, **options)
 
 
 def losses_of(scene: Gaussians, views, photos) -> float:
-    draw = TorchRasterizer("never")
+    draw = TorchRasterizer(use_native=False)
     with torch.no_grad():
         pictures = [draw(scene, v, sh_degree=scene.sh_degree).color.clamp(0, 1) for v in views]
     return sum(
@@ -234,5 +234,5 @@ def test_a_picture_is_composited(tmp_path, start, views, ownership, rasterizer):
     layer = painter.picture(views[0], PaintSettings(1, False))
     assert layer.color.device == DEVICE
     if ownership == "fragments":
-        merged = TorchRasterizer("never")(whole_scene(coordinator), views[0], sh_degree=1)
+        merged = TorchRasterizer(use_native=False)(whole_scene(coordinator), views[0], sh_degree=1)
         assert float((layer.color.cpu() - merged.color).abs().max()) < 5e-4

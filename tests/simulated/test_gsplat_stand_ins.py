@@ -143,7 +143,9 @@ def test_each_is_one_launch_and_lists_wait_once():
         assert counts.waited == counts.waits["isect_tiles"] + counts.waits["copy to device"]
         (raster.color.sum() + raster.depth.sum()).backward()
         assert raster.info["means2d"].absgrad.device == DEVICE
-        expected = TorchRasterizer("never")(random_gaussians(40, dtype=torch.float32), view, sh_degree=1)
+        expected = TorchRasterizer(use_native=False)(
+            random_gaussians(40, dtype=torch.float32), view, sh_degree=1
+        )
         torch.testing.assert_close(raster.color.detach().cpu(), expected.color, rtol=1e-4, atol=1e-5)
 
 

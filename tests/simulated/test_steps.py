@@ -176,7 +176,7 @@ def test_the_torch_rasterizer_is_what_it_is_on_the_cpu(tmp_path, start, views, p
     for device in ("cpu", DEVICE):
         folder = tmp_path / str(device).replace(":", "")
         folder.mkdir()
-        options = {"rasterizer": TorchRasterizer("never"), "density": GATHERING, "device": device}
+        options = {"rasterizer": TorchRasterizer(use_native=False), "density": GATHERING, "device": device}
         coordinator = make_coordinator(folder, start, views, blocks=1, steps=4, **options)
         train(coordinator, photos, steps=3)
         grown[str(device)] = {name: value.cpu() for name, value in coordinator.visit.live.growth.items()}

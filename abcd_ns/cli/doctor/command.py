@@ -127,10 +127,10 @@ def _kernels(kernels: Kernels, on_gpu: bool, verbose: bool) -> dict[str, str]:
     )
     checks = [f"{name} differs by {error:.0e}" for name, error in kernels.self_check.items()]
     checks += [f"{name} FAILED" for name in kernels.failed]
-    built = f"{kernels.built} of {kernels.wanted} built"
-    if kernels.built < kernels.wanted and not on_gpu:
-        built += "; the first training or `abcd plan` builds the others, in two or three minutes"
-    rows = {"CPU kernels": f"{built}, in {kernels.folder}" if verbose else built}
+    built = "compiled" if kernels.built else "not compiled"
+    if not kernels.built and not on_gpu:
+        built += ": the first use compiles it, in some 15 seconds"
+    rows = {"CPU rasterizer": f"{built}, in {kernels.folder}" if verbose else built}
     if on_gpu:
         rows["gsplat's"] = kernels.gsplat or "not built: the first training or `abcd plan` compiles them"
     rows["self-check"] = ", ".join(checks)

@@ -149,22 +149,20 @@ def gpu(facts: Facts) -> Iterator[Finding]:
         )
 
 
-def cpu_kernels(facts: Facts) -> Iterator[Finding]:
-    """CPU kernels that are not built."""
+def cpu_library(facts: Facts) -> Iterator[Finding]:
+    """A CPU rasterizer that has to be compiled, or cannot be."""
     kernels, hardware = facts.kernels, facts.hardware
-    if kernels is None or hardware.gpu is not None or kernels.built == kernels.wanted:
+    if kernels is None or hardware.gpu is not None or kernels.built:
         return
     if kernels.compiler:
         yield note(
-            "kernels-not-built",
-            f"{kernels.built} of {kernels.wanted} CPU kernels are built; the first training or `abcd plan` "
-            "on this machine builds them, in two or three minutes.",
+            "library-not-compiled",
+            "The CPU rasterizer is not compiled yet; first use does it, in some 15 seconds.",
         )
     else:
         yield warning(
             "no-compiler",
-            "There is no C++ compiler, so the CPU kernels cannot be built: training works, some four times "
-            "slower.",
+            "There is no C++ compiler for the CPU rasterizer: training on a CPU works, some 20 times slower.",
             "Install one: sudo apt-get install g++",
         )
 
@@ -204,7 +202,7 @@ def self_check(facts: Facts) -> Iterator[Finding]:
     """Rasterizers that compute something else than the reference."""
     for name, why in facts.kernels.failed.items() if facts.kernels else ():
         if name.startswith("torch"):
-            fix = f"Delete {facts.kernels.folder}, so that its kernels are built anew."
+            fix = f"Delete {facts.kernels.folder}, so that its library is compiled anew."
         else:
             fix = f"Train with --pipeline.model.rasterizer torch; or delete {facts.kernels.gsplat}: it is "
             fix += "built anew when training begins."
@@ -222,7 +220,7 @@ def lpips(facts: Facts) -> Iterator[Finding]:
 
 
 ALL = (missing_packages, broken_packages, not_registered, self_check, gsplat_extension, gpu, disk, ram)
-ALL += (untested_versions, viewer, cpu_kernels, lpips)
+ALL += (untested_versions, viewer, cpu_library, lpips)
 
 
 def _numbers(version: str) -> tuple[int, ...]:

@@ -21,13 +21,12 @@ EXTENSION = "gsplat_cuda"
 
 @dataclass(frozen=True)
 class Kernels:
-    """CPU kernels of the torch rasterizer, and gsplat's for CUDA."""
+    """The native library of the CPU rasterizer, and gsplat's kernels for CUDA."""
 
-    built: int
-    wanted: int
-    """How many CPU kernels there could be."""
+    built: bool
+    """Whether the native library is there."""
     folder: str
-    """Of the CPU kernels."""
+    """Of the native library."""
     compiler: str | None
     """C++, for either kind."""
     gsplat: str | None
@@ -50,16 +49,14 @@ def look_at_kernels(on_gpu: bool) -> Kernels:
     Args:
         on_gpu: whether there is a CUDA device to check gsplat's kernels on.
     """
-    from abcd_ns.engine.build_kernels import all_kernels
     from abcd_ns.engine.kernels import find_compiler, kernels_folder
-    from abcd_ns.engine.render.cpu.backend import CHUNK, TILE_SIDE
+    from abcd_ns.engine.kernels.native import library_path
     from abcd_ns.nerfstudio.metrics import lpips_missing
 
-    kernels, extension = all_kernels(TILE_SIDE, CHUNK), find_extension()
-    agree, failed = _self_checks(extension if on_gpu else None)
+    extension, built = find_extension(), library_path().is_file()
+    agree, failed = _self_checks(built, extension if on_gpu else None)
     return Kernels(
-        built=sum(kernel.path.is_file() for kernel in kernels),
-        wanted=len(kernels),
+        built=built,
         folder=str(kernels_folder()),
         compiler=find_compiler(),
         gsplat=None if extension is None else str(extension),
@@ -97,11 +94,11 @@ def build_folder() -> Path:
     return Path(get_default_build_root()) / f"{python}_{kind}" / EXTENSION
 
 
-def _self_checks(extension: Path | None) -> tuple[dict[str, float], dict[str, str]]:
-    """Differences and faults by rasterizer: torch's on the CPU, and gsplat's where its kernels are built."""
+def _self_checks(built: bool, extension: Path | None) -> tuple[dict[str, float], dict[str, str]]:
+    """Differences and faults by rasterizer: the CPU's, and gsplat's where its kernels are built."""
     from abcd_ns.engine.render import TorchRasterizer, self_check
 
-    checks = {"torch on cpu": lambda: self_check(TorchRasterizer("auto"), "cpu")}
+    checks = {"torch on cpu": lambda: self_check(TorchRasterizer(use_native=built), "cpu")}
     if extension is not None:
         checks["gsplat on cuda"] = lambda: _check_gsplat(extension)
     agree, failed = {}, {}

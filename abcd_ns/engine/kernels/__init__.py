@@ -1,5 +1,5 @@
-"""Inner loops: plain torch functions that also run as machine code, built once per machine."""
+"""What is hot on a CPU, in C++ (`cpp/`): compiled once a machine, loaded by ctypes. Torch's the reference."""
 
-from abcd_ns.engine.kernels.kernel import Kernel, find_compiler, kernels_folder
+from abcd_ns.engine.kernels.native import find_compiler, kernels_folder, library, share_cores
 
-__all__ = ["Kernel", "find_compiler", "kernels_folder"]
+__all__ = ["find_compiler", "kernels_folder", "library", "share_cores"]

@@ -92,4 +92,6 @@ def median_depth(painter: Painter, view: View, settings: PaintSettings) -> Float
 def _torch(rasterizer: Rasterizer) -> TorchRasterizer:
     if isinstance(rasterizer, TorchRasterizer):
         return rasterizer
-    return TorchRasterizer("never", tile_side=16, primitive=rasterizer.primitive.name)  # gsplat's tiles
+    return TorchRasterizer(
+        use_native=False, tile_side=16, primitive=rasterizer.primitive.name
+    )  # gsplat's tiles

@@ -1,6 +1,5 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
-import functools
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -55,10 +54,8 @@ class _Photometric(torch.autograd.Function):
     ) -> Float[Tensor, ""]:
         found = fused(rendered, photo, by_pixel, by_window)
         if found is None:
-            weights = _pair(by_pixel, by_window, rendered.dtype, rendered.device)
-            planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
-            sums, gradient = photometric_sums(*planes, weights)
-            found = (sums * weights).sum(), gradient.permute(1, 2, 0)
+            sums, gradient = photometric_sums(rendered, photo, (by_pixel, by_window))
+            found = by_pixel * sums[0] + by_window * sums[1], gradient
         loss, gradient = found
         ctx.save_for_backward(gradient)
         return loss
@@ -105,13 +102,6 @@ def warm_up(device: torch.device | str) -> None:
         picture = torch.zeros(2 * SSIM_WINDOW, 3 * SSIM_WINDOW, 3, device=device, requires_grad=True)
         options = {"full_pixels": 6 * SSIM_WINDOW**2, "full_windows": ssim_windows(*picture.shape[:2])}
         photometric_loss(picture, torch.ones_like(picture), **options).backward()
-
-
-@functools.lru_cache(maxsize=1024)
-def _pair(first: float, second: float, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2"]:
-    """Two numbers on the device, without a copy."""
-    with torch.inference_mode(False):  # they outlive this call
-        return torch.stack([torch.full((), x, dtype=dtype, device=device) for x in (first, second)])
 
 
 def _by_pixels(

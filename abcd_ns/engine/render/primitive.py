@@ -1,10 +1,12 @@
 """What a Gaussian may be: 3DGS's ellipsoid or 2DGS's disc, with the same parameters."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from abcd_ns.engine.kernels import Kernel
+from torch import Tensor
+
 from abcd_ns.engine.render import splat_kernels, surfel_kernels
 
 PrimitiveName = Literal["3dgs", "2dgs"]
@@ -23,11 +25,8 @@ class Primitive:
     name: PrimitiveName
     prefix: str
     """Of names that tell primitives apart."""
-    project: Kernel
-    """Parameters and camera to rows, see Splats; then the gradient."""
-    project_backward: Kernel
-    tile_rows: Kernel
-    """These rows to bounds by rows of tiles; see splat_kernels.tile_rows."""
+    project: Callable[[Tensor, Tensor], Tensor]
+    """Parameters [p, n] and a camera [c] to rows [r, n], in torch; see Splats."""
     graded: int
     """Rows that take gradients: all but the last four."""
     center: int
@@ -44,18 +43,11 @@ class Primitive:
         """Of a Gaussian in one view, see Splats."""
         return self.graded + 4
 
-    @property
-    def kernels(self) -> tuple[Kernel, ...]:
-        """Those that go by rows."""
-        return (self.project, self.project_backward, self.tile_rows, splat_kernels.TILE_COLUMNS)
-
 
 SPLATS = Primitive(
     name="3dgs",
     prefix="",
-    project=splat_kernels.SPLAT,
-    project_backward=splat_kernels.SPLAT_BACKWARD,
-    tile_rows=splat_kernels.TILE_ROWS,
+    project=splat_kernels.splat,
     graded=splat_kernels.GRADED,
     center=splat_kernels.X,
     has_absgrad=True,
@@ -65,9 +57,7 @@ SPLATS = Primitive(
 SURFELS = Primitive(
     name="2dgs",
     prefix="surfel-",
-    project=surfel_kernels.SURFEL,
-    project_backward=surfel_kernels.SURFEL_BACKWARD,
-    tile_rows=surfel_kernels.SURFEL_TILE_ROWS,
+    project=surfel_kernels.surfel,
     graded=surfel_kernels.GRADED,
     center=surfel_kernels.U,
     has_absgrad=False,

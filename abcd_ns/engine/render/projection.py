@@ -1,13 +1,12 @@
 """Gaussians as one camera sees them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.gaussians.spherical_harmonics import BASES, MAX_SH_DEGREE
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
@@ -72,35 +71,18 @@ class Splats:
         return Splats(self.planes.index_select(1, index))
 
 
-class _Splat(torch.autograd.Function):
-    """`Primitive.project` and its gradient by the Gaussians; nothing but the inputs is kept in between."""
+def project_in_torch(
+    gaussians: Gaussians, cameras: Sequence[Float[Tensor, "c"]], primitive: Primitive = SPLATS
+) -> Float[Tensor, "v r n"]:
+    """Planes of each camera, see Splats; differentiable in the Gaussians and in the cameras.
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        parameters: Float[Tensor, "p n"],
-        camera: Float[Tensor, "c"],
-        primitive: Primitive,
-        built: bool,
-    ) -> Float[Tensor, "r n"]:
-        ctx.save_for_backward(parameters, camera)
-        ctx.primitive, ctx.built = primitive, built
-        return primitive.project(parameters, camera, built=built)[0]
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Float[Tensor, "r n"]) -> tuple[Float[Tensor, "p n"], None, None, None]:
-        graded = grad[: ctx.primitive.graded].contiguous()
-        back = ctx.primitive.project_backward(*ctx.saved_tensors, graded, built=ctx.built)
-        return back[0], None, None, None
-
-
-def pack(gaussians: Gaussians) -> Float[Tensor, "p n"]:
-    """Gaussians as `splat` takes them; worth keeping where many views look at the same ones."""
+    Args:
+        cameras: see `camera_numbers`.
+    """
     parts = [gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.features_dc]
     rest = gaussians.features_rest.flatten(1)
-    missing = 3 * BASES - rest.shape[1]
-    return torch.cat((*parts, F.pad(rest, (0, missing)) if missing else rest), dim=1).T.contiguous()
+    parameters = torch.cat((*parts, F.pad(rest, (0, 3 * BASES - rest.shape[1]))), dim=1).T
+    return torch.stack([primitive.project(parameters, camera) for camera in cameras])
 
 
 def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) -> Float[Tensor, "c"]:
@@ -112,30 +94,6 @@ def camera_numbers(view: View, like: Tensor, sh_degree: int, antialiased: bool) 
     pose = (viewmat[:3, :3].reshape(-1), viewmat[:3, 3])
     rest = (options, view.center, viewmat.new_tensor([view.near, *degrees]))
     return torch.cat((*pose, *pinhole, *rest)).to(like)
-
-
-def project_packed(
-    parameters: Float[Tensor, "p n"],
-    view: View,
-    *,
-    sh_degree: int = 0,
-    antialiased: bool = False,
-    built: bool = True,
-    primitive: Primitive = SPLATS,
-) -> Splats:
-    """Project Gaussians into a view; differentiable in the Gaussians, and in the pose if it takes gradients.
-
-    Args:
-        parameters: see `pack`.
-        sh_degree: the degree of spherical harmonics in use.
-        antialiased: multiply opacities by sqrt(det(cov) / det(cov + blur)), as in Mip-Splatting.
-        built: use machine code where it is there.
-        primitive: what a Gaussian is.
-    """
-    camera = camera_numbers(view, parameters, sh_degree, antialiased)
-    if camera.requires_grad and torch.is_grad_enabled():
-        return Splats(primitive.project.function(parameters, camera)[0])
-    return Splats(_Splat.apply(parameters, camera, primitive, built))
 
 
 def check_degree(gaussians: Gaussians, sh_degree: int) -> None:

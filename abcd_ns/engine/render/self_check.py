@@ -140,7 +140,7 @@ def self_check(rasterizer: Rasterizer, device: torch.device | str) -> float:
         RuntimeError: a value or gradient differs by more than rounding.
     """
     options = {"window_side": rasterizer.window_side, "primitive": rasterizer.primitive.name}
-    largest, reference = 0.0, TorchRasterizer("never", **options)
+    largest, reference = 0.0, TorchRasterizer(use_native=False, **options)
     for case in CASES:
         expected = values_and_gradients(reference, "cpu", case)
         for name, error in errors(values_and_gradients(rasterizer, device, case), expected).items():

@@ -1,7 +1,6 @@
-"""What the torch rasterizer computes for each Gaussian, and for each row of tiles that it touches.
+"""Gaussians as a camera sees them, in torch: rows are quantities, columns are Gaussians.
 
-Every function is elementwise along its last dimension, so that a compiler fuses it into one loop: rows are
-quantities, columns are Gaussians (or bands). See `kernels.Kernel`.
+The reference of kernels/cpp/projection.h.
 """
 
 from collections.abc import Sequence
@@ -10,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.gaussians import spherical_harmonics
 from abcd_ns.engine.gaussians.spherical_harmonics import (
     BASES,
     MAX_SH_DEGREE,
@@ -18,7 +16,6 @@ from abcd_ns.engine.gaussians.spherical_harmonics import (
     sh_basis_rows,
     sh_degree_of,
 )
-from abcd_ns.engine.kernels import Kernel
 
 FAR_PLANE = 1e10
 """Gaussians with a larger camera z are not drawn; world units."""
@@ -50,28 +47,13 @@ COV_XX, COV_XY, COV_YY, RADIUS = range(GRADED, GRADED + 4)
 SPLAT_ROWS = RADIUS + 1
 
 
-def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> tuple[Float[Tensor, "r n"]]:
+def splat(parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"]) -> Float[Tensor, "r n"]:
     """Project and colour Gaussians: gsplat's `fully_fused_projection` with its defaults, and 3DGS's colours.
 
     Colours are max(0, SH(direction) + 0.5), linear, not clamped from above. Covariances come as dot products
     of projected axes: never indefinite, and cheaper. Columns with radius 0 are finite and without meaning.
     """
-    return (torch.stack(_graded_rows(parameters.unbind(0), camera, bounds=True)),)
-
-
-def splat_backward(
-    parameters: Float[Tensor, "p n"], camera: Float[Tensor, "c"], grad: Float[Tensor, "g n"]
-) -> tuple[Float[Tensor, "p n"]]:
-    """Gradient of `parameters` from that of the GRADED rows; everything else is computed again.
-
-    Row by row: the gradient of a slice of a matrix is as large as the matrix, and there are a hundred slices.
-    """
-    _, pull = torch.func.vjp(lambda *rows: _graded_rows(rows, camera, bounds=False), *parameters.unbind(0))
-    return (torch.stack(pull(list(grad.unbind(0)))),)
-
-
-def _graded_rows(parameters: Sequence[Tensor], camera: Tensor, bounds: bool) -> list[Tensor]:
-    x, y, z, *scales, qw, qx, qy, qz, logit = parameters[:11]
+    x, y, z, *scales, qw, qx, qy, qz, logit = parameters[:11].unbind(0)
     number = camera.unbind(0)
     rotation, (tx, ty, tz) = number[:9], number[9:12]
     fx, fy, cx, cy, width, height, antialiased = number[12:19]
@@ -103,9 +85,10 @@ def _graded_rows(parameters: Sequence[Tensor], camera: Tensor, bounds: bool) -> 
     opacity = opacity * torch.where(antialiased > 0, _safe_sqrt(det_sharp / det), 1.0)
     away = [x - number[19], y - number[20], z - number[21]]
     per_length = torch.rsqrt(dot(away, away).clamp_min(TINY))
-    colors = sh_color(parameters[11:], [value * per_length for value in away], number[23:])
+    colors = sh_color(parameters[11:].unbind(0), [value * per_length for value in away], number[23:])
     rows = [u, v, depth, yy / det, -xy / det, xx / det, opacity, *colors]
-    return [*rows, xx, xy, yy, _radius(u, v, depth, xx, yy, det, width, height, near)] if bounds else rows
+    bounds = [value.detach() for value in (u, v, depth, xx, xy, yy, det)]
+    return torch.stack([*rows, *bounds[3:6], _radius(*bounds, width, height, near)])
 
 
 def camera_axes(
@@ -152,87 +135,10 @@ def _safe_sqrt(x: Tensor) -> Tensor:
     return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)
 
 
-def _radius(u, v, depth, xx, yy, det, width, height, near) -> Tensor:
+def _radius(u, v, depth, xx, _, yy, det, width, height, near) -> Tensor:
     """3 sigma along the longer axis, rounded up; 0 for what no pixel sees."""
     mid = 0.5 * (xx + yy)
     radius = (3.0 * (mid + (mid * mid - det).clamp_min(0.01).sqrt()).sqrt()).ceil()
     drawn = (depth >= near) & (depth <= FAR_PLANE) & (det > 0)
     drawn = drawn & (u + radius > 0) & (u - radius < width) & (v + radius > 0) & (v - radius < height)
     return torch.where(drawn, radius.clamp_max(MAX_RADIUS), 0.0)
-
-
-# -- which tiles --------------------------------------------------------------------------------------------
-
-GRID = 5
-"""Numbers of a tile grid: the crop's x, y, width and height, and the side of a tile; pixels."""
-REACH, SLOPE, PRECISION, FLANK, LOW, HIGH, VARIANCE, LEFT, WIDTH, SIDE, BAND_ROWS = range(2, 13)
-"""Rows of a band, after x and y of the mean: the squared Mahalanobis radius at which alpha falls to 1/255;
-how the middle of the ellipse shifts with height; 1 over its variance at a given height; the height at which
-it is furthest to the right; the first and last column that gsplat would draw; the variance of the height;
-and of the grid the crop's first column, its width, and the side of a tile."""
-
-
-def tile_rows(
-    splats: Float[Tensor, "r n"], grid: Float[Tensor, "g n"]
-) -> tuple[Float[Tensor, "2 n"], Float[Tensor, "b n"]]:
-    """(first row of tiles, number of rows) that each Gaussian reaches, and its band's quantities.
-
-    The number is 0 for what leaves no fragment in the crop. Each Gaussian has its own grid, so that one call
-    serves several views.
-    """
-    left, top, width, height, side = grid.unbind(0)
-    x, y, radius = splats[X], splats[Y], splats[RADIUS]
-    xx, xy, yy = splats[COV_XX], splats[COV_XY], splats[COV_YY]
-    seen = (radius > 0) & (splats[OPACITY] >= MIN_ALPHA)
-    seen = seen & (x + radius + GSPLAT_TILE > left) & (x - radius - GSPLAT_TILE < left + width)
-    reach = 2.0 * (splats[OPACITY] / MIN_ALPHA).log().clamp_min(0) + REACH_MARGIN
-    half_height = (reach * yy).sqrt()
-    first, count = tile_span(y - half_height, y + half_height, *gsplat_bounds(y, radius), top, height, side)
-    flank = xy * (reach / xx).sqrt()
-    low, high = gsplat_bounds(x, radius)
-    band = (x, y, reach, xy / yy, splats[CONIC_XX], flank, low, high, yy, left, width, side)
-    return torch.stack((first, torch.where(seen, count, 0.0))), torch.stack(band)
-
-
-def tile_columns(bands: Float[Tensor, "b q"], rows: Float[Tensor, "q"]) -> tuple[Float[Tensor, "2 q"]]:
-    """(first tile, number of tiles) that the ellipse reaches in one row of tiles.
-
-    Within the row's pixel centres, at height v over the mean, the ellipse spans v xy / yy -+ half; its right
-    end is furthest out at v = the top of the right flank, its left end at minus that.
-    """
-    x, y, reach, variance, side = bands[X], bands[Y], bands[REACH], bands[VARIANCE], bands[SIDE]
-    first = rows * side + 0.5 - y
-    last = first + (side - 1)
-    right_v = bands[FLANK].maximum(first).minimum(last)
-    left_v = (-bands[FLANK]).maximum(first).minimum(last)
-    right_half = ((reach - right_v * right_v / variance).clamp_min(0) / bands[PRECISION]).sqrt()
-    left_half = ((reach - left_v * left_v / variance).clamp_min(0) / bands[PRECISION]).sqrt()
-    low, high = x + left_v * bands[SLOPE] - left_half, x + right_v * bands[SLOPE] + right_half
-    return (torch.stack(tile_span(low, high, bands[LOW], bands[HIGH], bands[LEFT], bands[WIDTH], side)),)
-
-
-def gsplat_bounds(mean: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
-    """First and last pixel, along one axis, of the 16 px tiles that the square of the radius touches."""
-    first = (mean / GSPLAT_TILE - radius / GSPLAT_TILE).floor() * GSPLAT_TILE
-    last = (mean / GSPLAT_TILE + radius / GSPLAT_TILE).ceil() * GSPLAT_TILE - 1
-    return first, last
-
-
-def tile_span(low, high, first_bound, last_bound, start, size, side) -> tuple[Tensor, Tensor]:
-    """The tiles along one axis with a pixel centre in [low, high], in the crop and within the bounds.
-
-    Returns (first tile, counted from the image's edge; number of tiles).
-    """
-    first = (low - 0.5).ceil().maximum(first_bound).maximum(start).minimum(start + size)
-    last = (high - 0.5).floor().minimum(last_bound).maximum(start - 1).minimum(start + size - 1)
-    first_tile, last_tile = (first / side).floor(), (last / side).floor()
-    return first_tile, torch.where(first <= last, last_tile - first_tile + 1, 0.0)
-
-
-_SH = (spherical_harmonics.__file__,)
-SPLAT = Kernel("splat", splat, (f"{PARAMETERS} n", f"{CAMERA}"), _SH)
-SPLAT_BACKWARD = Kernel(
-    "splat-backward", splat_backward, (f"{PARAMETERS} n", f"{CAMERA}", f"{GRADED} n"), _SH
-)
-TILE_ROWS = Kernel("tile-rows", tile_rows, (f"{SPLAT_ROWS} n", f"{GRID} n"), _SH)
-TILE_COLUMNS = Kernel("tile-columns", tile_columns, (f"{BAND_ROWS} q", "q"), _SH)

@@ -107,14 +107,23 @@ def showing(
     every = visible <= 0
     near = _extreme(ends, tile, torch.where((head >= visible) | every, z, math.inf), "amin")
     far = _extreme(ends, tile, torch.where((tail >= visible) | every, z, -math.inf), "amax")
-    near, far, empty = torch.minimum(near, far), torch.maximum(near, far), near.isinf()
-    # Half open: the next number after the last depth.
-    far = torch.nextafter(far, torch.full_like(far, math.inf))
-
     held, of_z = ((sums[ends] - sums[starts]).view(crops, tiles) for sums in (so_far, mass))
+    return window_between(near.view(crops, tiles), far.view(crops, tiles), held, of_z).to(z)
+
+
+def window_between(
+    near: Float[Tensor, "c t"],
+    far: Float[Tensor, "c t"],
+    held: Float[Tensor, "c t"],
+    of_z: Float[Tensor, "c t"],
+) -> Float[Tensor, "2 c t"]:
+    """What `showing` returns, from the least and the largest z that count in each tile, infinite where none
+    does, and from the sums of weights and of weights times z."""
+    first, last, empty = torch.minimum(near, far), torch.maximum(near, far), near.isinf()
+    # Half open: the next number after the last depth.
+    last = torch.nextafter(last, torch.full_like(last, math.inf))
     midst = torch.where(held > 0, of_z / held, of_z.sum(1, keepdim=True) / held.sum(1, keepdim=True))
-    midst = midst.nan_to_num(0.0).to(z).flatten()
-    return torch.where(empty, midst, torch.stack((near, far))).view(2, crops, tiles)
+    return torch.where(empty, midst.nan_to_num(0.0).to(near), torch.stack((first, last)))
 
 
 def _extreme(

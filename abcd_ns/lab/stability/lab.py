@@ -124,7 +124,7 @@ class Lab:
     """Where scenarios are carried out: a folder for stores, and a rasterizer.
 
     Args:
-        compile: of the rasterizer; "never" where last bits must not depend on the machine.
+        use_native: see TorchRasterizer; False where last bits must not depend on the machine.
         quick: a third of the work, to see that everything runs.
         seed: of every training that names none.
     """
@@ -133,7 +133,7 @@ class Lab:
         self,
         folder: Path,
         *,
-        compile: Literal["auto", "never"] = "auto",
+        use_native: bool = True,
         quick: bool = False,
         seed: int = 0,
     ) -> None:
@@ -141,7 +141,7 @@ class Lab:
         self.tick: Callable[[], object] = lambda: None
         """Called after every training step."""
         self._scores: dict[tuple[str, Method], float] = {}
-        self.rasterizer = TorchRasterizer(compile)
+        self.rasterizer = TorchRasterizer(use_native=use_native)
         self._folder = folder
 
     def views_drawn(self, usual: int) -> int:

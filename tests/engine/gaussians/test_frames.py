@@ -36,7 +36,7 @@ def test_a_moved_scene_looks_the_same_to_a_camera_that_moves_along(seed):
     moved = view.viewmat.clone()
     moved[:3, :3] = view.viewmat[:3, :3] @ frame.rotation.T
     moved[:3, 3] = frame.scale * (view.viewmat[:3, 3] - moved[:3, :3] @ frame.translation)
-    draw = TorchRasterizer("never")
+    draw = TorchRasterizer(use_native=False)
     before = draw(gaussians, view, sh_degree=3)
     after = draw(frame.gaussians(gaussians), replace(view, viewmat=moved), sh_degree=3)
     assert float(before.color.max()) > 0.05

@@ -12,7 +12,7 @@ from abcd_ns.engine.render import CutShot, Shot, TorchRasterizer, ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
 from tests.reference.scenes import random_gaussians, ring_of_views
 
-DRAW = TorchRasterizer(compile="never")
+DRAW = TorchRasterizer(use_native=False)
 SIDE = DRAW.tile_side
 STOP = 2e-4
 """Drawing stops at T <= 1e-4, so that weights may differ from those by hand by about that much."""
@@ -130,12 +130,12 @@ def test_at_0_front_inside_and_back_are_the_merged_picture(seed, crop):
     assert float((found - whole.color).abs().max()) < 1e-12
 
 
-@pytest.mark.parametrize("compile", ["never", "auto"])
+@pytest.mark.parametrize("use_native", [False, True])
 @pytest.mark.parametrize("at_once", [(1, 10**6), (600, 10**6), (10**6, 130), (10**6, 10**6)])
-def test_views_that_are_drawn_together_have_the_pictures_of_each_alone(monkeypatch, compile, at_once):
+def test_views_that_are_drawn_together_have_the_pictures_of_each_alone(monkeypatch, use_native, at_once):
     monkeypatch.setattr("abcd_ns.engine.render.cpu.backend.PIXELS_AT_ONCE", at_once[0])
     monkeypatch.setattr("abcd_ns.engine.render.cpu.backend.SPLATS_AT_ONCE", at_once[1])
-    draw = TorchRasterizer(compile)
+    draw = TorchRasterizer(use_native=use_native)
     views = ring_of_views(5, width=32, height=24)
     seen = [(view, Crop(k, 2 * k, 12 + 4 * k, 9 + 2 * k)) for k, view in enumerate(views)]
     active, frozen = random_gaussians(30, seed=1), random_gaussians(60, seed=2)

@@ -11,18 +11,14 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
-from abcd_ns.engine.render.cpu import binning
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.reference.naive_rasterizer import naive_rasterize
 from tests.reference.rasterizer_scenes import (
     as_leaves,
-    bin_splats,
-    fragments_in,
     gradients,
     probe,
-    project,
     random_gaussians,
     relative_error,
     small_view,
@@ -31,8 +27,8 @@ from tests.reference.rasterizer_scenes import (
 
 VIEW = small_view()
 CROP = Crop(5, 3, 22, 15)
-EAGER = TorchRasterizer("never")
-SURFELS = TorchRasterizer("never", primitive="2dgs")
+EAGER = TorchRasterizer(use_native=False)
+SURFELS = TorchRasterizer(use_native=False, primitive="2dgs")
 BOTH = pytest.mark.parametrize("draw", [EAGER, SURFELS], ids=["3dgs", "2dgs"])
 
 
@@ -48,22 +44,6 @@ def by_pixel(window: ZWindow) -> torch.Tensor:
     """(near, far) of each pixel, [2, h, w]."""
     planes = torch.stack((window.near, window.far))[:, None]
     return window.grid.to_image(planes.expand(-1, window.grid.pixels_per_tile, -1))
-
-
-@pytest.mark.parametrize("together", [1, 7, 53])
-def test_how_many_tiles_are_drawn_together_changes_nothing_but_rounding(together, monkeypatch):
-    """Early stops, narrowing and dropped tiles included: some Gaussians are all but opaque."""
-    gaussians = random_gaussians(60)
-    image, grads = gradients(lambda g: EAGER(g, VIEW, sh_degree=1), gaussians)
-    weights = EAGER.depth_window(gaussians, VIEW, crop=VIEW.full, visible=0.9)
-    monkeypatch.setattr(binning, "TILES_AT_ONCE", together)
-    lists = bin_splats(project(gaussians, VIEW), TileGrid(VIEW.full, 4), 8)
-    assert len(lists.groups) == math.ceil(lists.tiles.numel() / together) > 1
-    found, found_grads = gradients(lambda g: EAGER(g, VIEW, sh_degree=1), gaussians)
-    torch.testing.assert_close(found, image, rtol=1e-12, atol=1e-13)
-    assert all(relative_error(found_grads[name], grads[name]) < 1e-11 for name in PARAM_NAMES)
-    found = EAGER.depth_window(gaussians, VIEW, crop=VIEW.full, visible=0.9)
-    torch.testing.assert_close(torch.stack((found.near, found.far)), torch.stack((weights.near, weights.far)))
 
 
 @pytest.mark.parametrize(
@@ -111,11 +91,11 @@ def test_scene_has_what_the_tests_are_about():
     torch.testing.assert_close(stacked(expected), stacked(dense), rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize(("side", "chunk"), [(1, 2), (2, 16), (8, 3), (16, 1)])
-def test_tile_size_and_chunk_do_not_matter(side, chunk):
+@pytest.mark.parametrize("side", [1, 2, 8, 16])
+def test_tile_size_does_not_matter(side):
     gaussians = random_gaussians(40)
     image, grads = gradients(lambda g: EAGER(g, VIEW, sh_degree=2), gaussians)
-    other = TorchRasterizer("never", tile_side=side, chunk=chunk)
+    other = TorchRasterizer(use_native=False, tile_side=side)
     image2, grads2 = gradients(lambda g: other(g, VIEW, sh_degree=2), gaussians)
     torch.testing.assert_close(image2, image, rtol=1e-13, atol=1e-13)
     for name in PARAM_NAMES:
@@ -236,36 +216,6 @@ def test_fold_of_complementary_windows_is_the_whole_drawing(dtype, tolerance):
     torch.testing.assert_close(transmittance, whole.transmittance, rtol=0, atol=tolerance)
 
 
-def test_window_work_is_in_proportion_to_its_fragments():
-    gaussians = random_gaussians(300)
-    splats, grid = project(gaussians, VIEW), TileGrid(VIEW.full, 4)
-    everything = bin_splats(splats, grid, 16)
-    cut = float(splats.depths[splats.radii > 0].quantile(0.1))
-    everywhere = ZWindow.everything(grid, "cpu", torch.float64)
-    window = replace(everywhere, far=torch.full_like(everywhere.far, cut))
-    nothing_left = ZWindow(grid, everywhere.far, everywhere.near)
-    masked = torch.ones(300, dtype=torch.bool)
-    assert (
-        bin_splats(splats, grid, 16, masked=masked, window=window).slots.numel()
-        < 0.35 * everything.slots.numel()
-    )
-    assert bin_splats(splats, grid, 16, masked=masked, window=nothing_left).slots.numel() == 0
-    assert (
-        bin_splats(splats, grid, 16, masked=~masked, window=nothing_left).slots.numel()
-        == everything.slots.numel()
-    )
-
-
-def test_lists_hold_every_fragment_and_few_others():
-    gaussians = random_gaussians(60)
-    faint = Gaussians(
-        **{n: v for n, v in gaussians.items() if n != "opacities"}, opacities=gaussians.opacities - 4
-    )
-    drawn = naive_rasterize(faint, VIEW, sh_degree=0).fragments
-    lists = bin_splats(project(faint, VIEW), TileGrid(VIEW.full, 1), 4)
-    assert drawn <= fragments_in(lists) <= 1.05 * drawn + 10  # with tiles of one pixel, lists are fragments
-
-
 @pytest.mark.parametrize("with_frozen", [False, True])
 def test_no_gaussians(with_frozen):
     nothing = as_leaves(Gaussians.empty(dtype=torch.float64))
@@ -321,19 +271,6 @@ def test_equal_depths_are_drawn_in_the_order_of_their_index():
     assert swapped[10, 18, 1] > swapped[10, 18, 0]
 
 
-def test_backward_keeps_little():
-    """Saved values per fragment: five planes per chunk of 8, not the dozens that autograd would keep."""
-    gaussians = random_gaussians(300, sh_degree=0)
-    changed = {"scales": gaussians.scales + 2, "opacities": torch.full_like(gaussians.opacities, -4.5)}
-    wide = Gaussians(**{**dict(gaussians.items()), **changed})
-    fragments = fragments_in(bin_splats(project(wide, VIEW), TileGrid(VIEW.full, 4), 8))
-    saved = []
-    with torch.autograd.graph.saved_tensors_hooks(lambda x: (saved.append(x.numel()), x)[1], lambda x: x):
-        EAGER(as_leaves(wide), VIEW, sh_degree=0)
-    assert fragments > 60_000
-    assert sum(saved) < 0.75 * fragments + 150 * 300  # 150 values per Gaussian: projection and colours
-
-
 def test_nothing_is_saved_without_gradients():
     with torch.autograd.graph.saved_tensors_hooks(lambda _: pytest.fail("saved a tensor"), lambda x: x):
         raster = EAGER(random_gaussians(20), VIEW, sh_degree=3)
@@ -374,11 +311,3 @@ def test_each_view_of_a_batch_counts_by_its_own_size():
     for name, value in together.items():
         torch.testing.assert_close(value, sum(each[name] for each in one_by_one), rtol=1e-4, atol=1e-4)
     assert float(together["grad2d"].abs().max()) > 0
-
-
-def test_nothing_is_kept_of_gaussians_that_are_gone():
-    draw, gaussians = TorchRasterizer("never"), random_gaussians(5)
-    draw.project(gaussians, VIEW)
-    assert draw._packed is not None
-    del gaussians
-    assert draw._packed is None

@@ -106,7 +106,7 @@ def test_default_strategy_runs_unchanged(absgrad):
     )
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state()
-    rasterizer, view = TorchRasterizer("never"), small_view(dtype=torch.float32)
+    rasterizer, view = TorchRasterizer(use_native=False), small_view(dtype=torch.float32)
     torch.manual_seed(0)
     counts = [30]
     for step in range(1, 9):

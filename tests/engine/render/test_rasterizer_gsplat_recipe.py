@@ -38,7 +38,7 @@ def backend(request):
 
 def torch_twin(backend: GsplatRasterizer, side: int = 4) -> TorchRasterizer:
     """Windows are given by tiles, so that only those of tiles of one size can be compared."""
-    return TorchRasterizer("never", tile_side=side, primitive=backend.primitive.name)
+    return TorchRasterizer(use_native=False, tile_side=side, primitive=backend.primitive.name)
 
 
 @pytest.mark.parametrize(

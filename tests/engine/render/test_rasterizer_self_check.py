@@ -70,9 +70,9 @@ class Broken(TorchRasterizer):
 
 
 def test_a_sound_backend_passes():
-    assert self_check(TorchRasterizer("never"), "cpu") == 0.0
+    assert self_check(TorchRasterizer(use_native=False), "cpu") == 0.0
     # Other tiles add up in another order: close, and not the very same computation.
-    assert 0 < self_check(TorchRasterizer("never", tile_side=8, chunk=5), "cpu") < 1e-4
+    assert 0 < self_check(TorchRasterizer(use_native=False, tile_side=8), "cpu") < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_fault_is_refused(fault, what, case):
 
 def test_the_scene_would_show_faults():
     gaussians, view = check_scene("cpu")
-    raster = TorchRasterizer("never")(gaussians, view, sh_degree=3)
+    raster = TorchRasterizer(use_native=False)(gaussians, view, sh_degree=3)
     assert int((raster.info["radii"] > 0).sum()) > 20
     assert raster.transmittance.min() < 0.2
     assert raster.transmittance.max() > 0.9
@@ -115,11 +115,11 @@ def test_the_scene_would_show_faults():
 @pytest.mark.parametrize("window_side", [4, 16])
 def test_no_case_hangs_on_rounding(case, shift, window_side):
     """No fragment is so near to a threshold of drawing that other kernels' rounding would change sides."""
-    draw = TorchRasterizer("never", window_side=window_side)
+    draw = TorchRasterizer(use_native=False, window_side=window_side)
     found, expected = (values_and_gradients(draw, "cpu", case, s) for s in (shift, 0.0))
     assert max(errors(found, expected).values()) < TOLERANCE / 4
 
 
 def test_gradients_are_checked_where_they_are_switched_off():
     with torch.no_grad():
-        assert self_check(TorchRasterizer("never"), "cpu") < 1e-6
+        assert self_check(TorchRasterizer(use_native=False), "cpu") < 1e-6

@@ -24,7 +24,7 @@ SH_0 = 0.28209479177387814
 
 @pytest.fixture
 def rasterizer():
-    return TorchRasterizer("never")
+    return TorchRasterizer(use_native=False)
 
 
 def painted(gaussians, chosen):
@@ -57,7 +57,9 @@ def test_large_views_are_looked_at_in_small_pictures():
         random_gaussians(20, size=0.2), torch.zeros(20, dtype=torch.int64), views, Watching("never")
     )
     assert set(sizes) == {(80, 60)}
-    full = weights(random_gaussians(20, size=0.2), TorchRasterizer("never"), [Shot(views[0], views[0].full)])
+    full = weights(
+        random_gaussians(20, size=0.2), TorchRasterizer(use_native=False), [Shot(views[0], views[0].full)]
+    )
     assert found[0][0] == pytest.approx(float(full.sum()) / views[0].full.pixels, rel=0.02)
 
 

@@ -51,7 +51,7 @@ def test_a_gaussian_before_the_camera_spoils_no_picture():
     scene = random_gaussians(30, seed=3, size=0.2)
     blinder = replace(scene[:1], means=ahead(view, 0.1).clone(), opacities=torch.full((1, 1), 5.0))
     both = type(scene).cat([scene, blinder])
-    draw = TorchRasterizer("never")
+    draw = TorchRasterizer(use_native=False)
     clear = draw(scene, view, sh_degree=0).color
     assert float((draw(both, view, sh_degree=0).color - clear).abs().max()) > 0.1
     assert torch.equal(draw(both, replace(view, near=0.2), sh_degree=0).color, clear)

@@ -10,7 +10,7 @@ from abcd_ns.lab.stability.scenarios.stale import stale_coordinator
 
 def means_after_a_visit(folder, damping):
     """(before, after) of the block that is trained first."""
-    stage, lab = make_stage(points=100), Lab(folder, compile="never")
+    stage, lab = make_stage(points=100), Lab(folder, use_native=False)
     kind = partial(stale_coordinator, every=1, damping=damping)
     options = {"blocks": 2, "warmup": 0.0, "density": STILL, "kind": kind}
     coordinator = lab.coordinator(stage.start(), stage.views, budget=48, **options)

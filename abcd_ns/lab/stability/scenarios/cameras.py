@@ -7,6 +7,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from abcd_ns.engine.kernels import share_cores
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.self_check import self_check
 from abcd_ns.engine.space.ordering import front_to_back
@@ -17,6 +18,7 @@ from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.scenarios.emptiness import equal
 from abcd_ns.lab.world.world import TABLE, camera, ring
+from abcd_ns.machine import threads_wanted
 
 SIZES = ((1, 1), (7, 5), (33, 17), (101, 67), (48, 36), (16, 64))
 RAYS = 300
@@ -118,16 +120,16 @@ def lenses() -> tuple[bool, bool]:
 )
 def repeated(lab: Lab) -> Finding:
     """A20: the same run twice, and with another number of threads."""
-    stage, threads, same = make_stage(views=ring(8), points=300), torch.get_num_threads(), {}
+    stage, same = make_stage(views=ring(8), points=300), {}
     options = {"budget": lab.views_drawn(90), "blocks": 4, "density": DensityConfig(refine_start=0.0)}
     for method in PAIR:
         results = []
         try:
             for count in (1, 1, 2, 3):
-                torch.set_num_threads(count)
+                share_cores(count)
                 results.append(lab.train(stage, method, **options).gaussians)
         finally:
-            torch.set_num_threads(threads)
+            share_cores(threads_wanted())
         same[method] = [equal(results[0], other) for other in results[1:]]
     said = {m: f"again: {_yes(s[0])}; 2 and 3 threads: {_yes(all(s[1:]))}" for m, s in same.items()}
     numbers = {f"equal runs {method}": sum(found) for method, found in same.items()}
@@ -156,7 +158,7 @@ class WrongGradient(TorchRasterizer):
 )
 def wrong_gradient(lab: Lab) -> Finding:  # noqa: ARG001 - nothing is trained
     """A21: the check at the start, of a sound backend and of one with a wrong gradient."""
-    sound = self_check(TorchRasterizer("never"), "cpu")
+    sound = self_check(TorchRasterizer(use_native=False), "cpu")
     try:
         self_check(WrongGradient("never"), "cpu")
     except RuntimeError as error:

@@ -1,0 +1,252 @@
+"""The native library's projection and compositing, as differentiable functions of tensors."""
+
+import ctypes
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from abcd_ns.engine.kernels.native import address, library
+from abcd_ns.engine.render.primitive import Primitive
+from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.render.z_window import ZWindow
+from abcd_ns.engine.types import Crop, Gaussians
+
+SIDE = 4
+"""Of its tiles, px: a tile is 16 lanes."""
+COEFFICIENTS = (0, 3, 8, 15)
+"""Of harmonics above degree 0, that it takes."""
+GROWTH = 10
+"""Sums for growth, of each Gaussian and view; see `Drawing.residuals`."""
+_POINTER = ctypes.c_void_p
+
+
+class _Parameters(ctypes.Structure):
+    _fields_ = (
+        *((name, _POINTER) for name in ("means", "scales", "quats", "dc", "rest", "opacities")),
+        *((name, ctypes.c_int64) for name in ("n", "coefficients")),
+    )
+
+
+class _Part(ctypes.Structure):
+    _fields_ = (
+        ("planes", _POINTER),
+        *((name, ctypes.c_int64) for name in ("row", "count")),
+        *((name, ctypes.c_int32) for name in ("picture", "masked")),
+    )
+
+
+class _Picture(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int32) for name in ("x", "y", "width", "height")),
+        *((name, _POINTER) for name in ("near", "far")),
+    )
+
+
+class _Image(ctypes.Structure):
+    _fields_ = tuple((name, _POINTER) for name in ("color", "transmittance", "depth", "residual"))
+
+
+def _parameters(tensors: Sequence[Tensor]) -> _Parameters:
+    return _Parameters(*map(address, tensors), len(tensors[0]), tensors[4].shape[1])
+
+
+class _Project(torch.autograd.Function):
+    """Parameters in the order of _Parameters, and cameras [v, c] without gradients -> planes [v, r, n]."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> Float[Tensor, "v r n"]:
+        *tensors, cameras, primitive = inputs
+        tensors = [tensor.contiguous() for tensor in tensors]
+        planes = cameras.new_empty((len(cameras), primitive.rows, len(tensors[0])))
+        views, given = ctypes.c_int64(len(cameras)), ctypes.byref(_parameters(tensors))
+        pointers = _POINTER(address(cameras)), views, _POINTER(address(planes))
+        library().abcd_project(int(primitive.name == "2dgs"), given, *pointers)
+        ctx.save_for_backward(*tensors, cameras)
+        ctx.primitive = primitive
+        return planes
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Float[Tensor, "v r n"]) -> tuple[Tensor | None, ...]:
+        *tensors, cameras = ctx.saved_tensors
+        found, grad = [torch.empty_like(tensor) for tensor in tensors], grad.contiguous()
+        both = [ctypes.byref(_parameters(each)) for each in (tensors, found)]
+        pointers = _POINTER(address(cameras)), ctypes.c_int64(len(cameras)), _POINTER(address(grad))
+        library().abcd_project_back(int(ctx.primitive.name == "2dgs"), both[0], *pointers, both[1])
+        return *found, None, None
+
+
+def project(
+    gaussians: Gaussians, cameras: Float[Tensor, "v c"], primitive: Primitive
+) -> Float[Tensor, "v r n"]:
+    """As project_in_torch, but cameras take no gradients."""
+    g = gaussians
+    tensors = (g.means, g.scales, g.quats, g.features_dc, g.features_rest, g.opacities)
+    return _Project.apply(*tensors, cameras, primitive)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Splats of one picture."""
+
+    planes: Float[Tensor, "r n"]
+    picture: int
+    masked: bool = False
+    """Whether the picture's window applies to them."""
+
+
+Windows = Sequence[ZWindow | None]
+"""Of each picture; None masks nothing."""
+
+
+class Lists:
+    """What each tile of some pictures has to draw, front to back.
+
+    Args:
+        windows: leave out of masked parts what lies outside.
+        weighs: depths are 0, see Rasterizer.draw.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        crops: Sequence[Crop],
+        primitive: Primitive,
+        windows: Windows = (),
+        weighs: bool = False,
+    ) -> None:
+        self.primitive, self.crops = primitive, tuple(crops)
+        self._parts = [part.planes.detach().contiguous() for part in parts]  # read when gradients are taken
+        self.columns = sum(planes.shape[1] for planes in self._parts)
+        rows = [
+            _Part(address(planes), planes.shape[1], planes.shape[1], part.picture, part.masked)
+            for planes, part in zip(self._parts, parts, strict=True)
+        ]
+        pictures, counts = self._pictures(windows), (ctypes.c_int64(len(each)) for each in (rows, crops))
+        given = ((_Part * len(rows))(*rows), next(counts), pictures.rows, next(counts))
+        self.handle = _POINTER(library().abcd_lists(int(primitive.name == "2dgs"), *given, int(weighs)))
+        weakref.finalize(self, library().abcd_free, self.handle)
+
+    def _pictures(self, windows: Windows) -> "_Pictures":
+        return _Pictures(self.crops, windows or [None] * len(self.crops))
+
+    def _images(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        shapes = [(crop.height, crop.width) for crop in self.crops]
+        return [(torch.empty((*s, 3)), torch.empty(s), torch.empty(s)) for s in shapes]
+
+    def draw(self, windows: Windows = (), keep: bool = False) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Colour [h, w, 3], transmittance and depth [h, w] of what lies in the windows, by picture.
+
+        Args:
+            keep: whether gradients will be asked for; without windows.
+        """
+        images = self._images()
+        pictures = self._pictures(windows)
+        library().abcd_draw(self.handle, pictures.rows, _as_images(images), int(keep))
+        return images
+
+    def members(self, windows: Windows) -> Bool[Tensor, "n"]:
+        """Which columns, numbered part by part, have a fragment in the windows."""
+        found: UInt8[Tensor, n] = torch.zeros(self.columns, dtype=torch.uint8)
+        pictures = self._pictures(windows)
+        library().abcd_members(self.handle, pictures.rows, _POINTER(found.data_ptr()))
+        return found.bool()
+
+    def shown(self, visible: float) -> list[tuple[Float[Tensor, "1 t"], ...]]:
+        """By picture the arguments of z_window.window_between."""
+        sizes = [TileGrid(crop, SIDE).tiles for crop in self.crops]
+        ends = torch.empty((2, sum(sizes)))
+        sums = torch.empty((2, sum(sizes)), dtype=torch.float64)
+        pointers = [_POINTER(row.data_ptr()) for row in (*ends, *sums)]
+        library().abcd_windows(self.handle, ctypes.c_float(visible), *pointers)
+        parts = (row[None].split(sizes, dim=1) for row in (*ends, *sums))
+        return list(zip(*parts, strict=True))
+
+    def deepen(self, windows: Windows, left: Tensor, depth: Tensor) -> None:
+        """Signed transmittance and median depth [h, w] of the one picture, in place; see cpp/drawing.h."""
+        pictures = self._pictures(windows)
+        library().abcd_deepen(self.handle, pictures.rows, _as_images([(None, left, depth)]))
+
+
+class _Pictures:
+    """Crops and windows as the library takes them, for one call; holds the tensors meanwhile."""
+
+    def __init__(self, crops: Sequence[Crop], windows: Windows) -> None:
+        on = [None if w is None else w.on(TileGrid(c, SIDE)) for c, w in zip(crops, windows, strict=True)]
+        self._ends = [(None, None) if w is None else (w.near.contiguous(), w.far.contiguous()) for w in on]
+        rows = [
+            _Picture(crop.x, crop.y, crop.width, crop.height, *map(address, ends))
+            for crop, ends in zip(crops, self._ends, strict=True)
+        ]
+        self.rows = (_Picture * len(rows))(*rows)
+
+
+def _as_images(images: Sequence[Sequence[Tensor | None]]) -> ctypes.Array:
+    return (_Image * len(images))(*(_Image(*map(address, image)) for image in images))
+
+
+@dataclass
+class Drawing:
+    """All that compositing needs besides tensors that take gradients."""
+
+    lists: Lists
+    absgrad_target: Tensor | None
+    """Gets an attribute `absgrad` in the backward pass; None where the primitive has no such sums."""
+    residuals: list[Tensor] | None = None
+    """Of each picture, [h, w, 3], put there before the backward pass, which then leaves `growth` [v, n, 10]:
+    sums over pixels of w, w r, w r x and w r y, with the weight w = alpha T, the residual r by channel, and
+    (x, y) the pixel less the Gaussian's middle."""
+    growth: Tensor | None = None
+
+
+class Composite(torch.autograd.Function):
+    """Planes [v, r, n] of what takes gradients -> colour, transmittance and depth of each picture.
+
+    `means2d` [v, n, 2] and `weights` [v, n] or None do not change what is drawn: they get gradients, of the
+    middles and of the depths.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, planes: Tensor, _: Tensor, weights: Tensor | None, drawing: Drawing
+    ) -> tuple[Tensor, ...]:
+        keep = any(ctx.needs_input_grad)
+        images = drawing.lists.draw(keep=keep)
+        outputs = tuple(tensor for image in images for tensor in image)
+        ctx.save_for_backward(*outputs)
+        ctx.shape, ctx.drawing, ctx.weighs = planes.shape, drawing, weights is not None
+        ctx.set_materialize_grads(False)
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        drawing, (views, _, n) = ctx.drawing, ctx.shape
+        lists, center = drawing.lists, drawing.lists.primitive.center
+        rows, weights = torch.zeros(ctx.shape), torch.zeros((views, n)) if ctx.weighs else None
+        target, residuals = drawing.absgrad_target, drawing.residuals
+        absolute = None if target is None else torch.zeros((views, n, 2))
+        drawing.growth = torch.zeros((views, n, GROWTH)) if residuals else None
+        held = [None if grad is None else grad.contiguous() for grad in grads]
+        asked = [held[k : k + 3] for k in range(0, len(held), 3)]
+        if residuals:
+            asked = [
+                [*given, residual.contiguous()] for given, residual in zip(asked, residuals, strict=True)
+            ]
+        drawn = [ctx.saved_tensors[k : k + 3] for k in range(0, len(held), 3)]
+        library().abcd_draw_back(
+            lists.handle,
+            ctypes.c_int64(views * n),
+            _as_images(asked),
+            _as_images(drawn),
+            *(_POINTER(address(each)) for each in (rows, absolute, weights, drawing.growth)),
+        )
+        if target is not None:
+            target.absgrad = absolute
+        return rows, rows[:, center : center + 2].transpose(1, 2).contiguous(), weights, None
