@@ -12,6 +12,7 @@ from torch.nn import Parameter
 from abcd_ns.cluster.lease import VisitOutcome, VisitTask
 from abcd_ns.cluster.shared_residual import ROOM, SharedResidual
 from abcd_ns.engine.events import Event
+from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.render import Rasterizer
 from abcd_ns.engine.render.loss import psnrs
@@ -131,7 +132,7 @@ class VisitWorker:
         empty = Gaussians.empty(setup.config.sh_degree, self._device)
         params = {name: Parameter(value) for name, value in empty.items()}
         optimizers = {
-            name: torch.optim.Adam([params[name]], fused=True, **options)
+            name: Adam([params[name]], fused=True, **options)
             for name, options in setup.optimizers.items()
         }
         run = TrainingRun(

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
+from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState, Clocks
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
@@ -100,7 +101,7 @@ def nothing_live(
     empty = Gaussians.empty(sh_degree, device)
     params = {name: Parameter(value) for name, value in empty.items()}
     optimizers = {
-        name: torch.optim.Adam([value], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
+        name: Adam([value], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
         for name, value in params.items()
     }
     return params, optimizers

@@ -137,12 +137,11 @@ def project(
     """
     placed, eyes = place_on_screen(kind, gaussians, views, cameras, antialiased)
     radii, means2d, depths, shapes, centers, compensations = placed
-    opacities = gaussians.opacities[:, 0].sigmoid().expand(len(views), -1)
+    opacities = gaussians.opacities.flatten().sigmoid().expand(len(views), -1)
     if compensations is not None:
         opacities = opacities * compensations
-    used = (sh_degree + 1) ** 2
-    rest = gaussians.features_rest[:, : used - 1]
-    coefficients = torch.cat((gaussians.features_dc[:, None], rest), dim=1)
+    # All, whatever the degree: gsplat's kernels read those of it alone.
+    coefficients = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
     # Camera by camera: for all at once gsplat would copy the coefficients, most of a Gaussian, for each.
     directions = (gaussians.means - eyes[:, None]).unbind()
     seen = zip(directions, (radii > 0).unbind(), strict=True)

@@ -35,6 +35,8 @@ from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Gaussians, View
 
+LATE_AFTER = 16
+"""Steps without a fault after which an accelerator's gradients are looked at a step late, without a wait."""
 LEAST_DAMPING = 1 / 16
 """Of learning rates, however often a block's visits were undone."""
 
@@ -68,7 +70,7 @@ class Health:
         self._shares: list[Tensor] = []
         self._numbers = StepNumbers(params["means"].device)
         self._guard = StepGuard(optimizers) if self._numbers.are_late else None
-        self._skips, self._psnr = True, math.nan
+        self._clean, self._psnr = LATE_AFTER, math.nan
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
 
@@ -91,7 +93,7 @@ class Health:
         self._active, self._ledger = active, ledger
         self._attached, self._bad, self._shares = self._params["means"], None, []
         self._resumed = active.saved
-        self._skips, self._psnr = True, math.nan
+        self._clean, self._psnr = LATE_AFTER, math.nan
 
     def see(self, share: Float[Tensor, ""]) -> None:
         """Take note of how large a part of a picture the live block was, while none has shown it."""
@@ -114,9 +116,10 @@ class Health:
         self._send(psnrs)
         self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
+            self._clean += 1
             return True, self._psnr
         self.count("gradients", int(self._bad.sum()))
-        self._bad = None
+        self._bad, self._clean = None, 0
         self._mend()
         return False, self._psnr
 
@@ -184,9 +187,11 @@ class Health:
     # -- numbers -------------------------------------------------------------------------------------
 
     def _clean_gradients(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:  # noqa: ARG002
-        if self._guard is not None and self._skips and self._guard.works:
-            self._guard.tell(optimizer)
-            return
+        if self._guard is not None:
+            late = self._clean >= LATE_AFTER and self._guard.works
+            self._guard.tell(optimizer, late)
+            if late:
+                return
         for parameter in optimizer.param_groups[0]["params"]:
             if parameter.grad is None:
                 continue
@@ -258,9 +263,8 @@ class Health:
             psnrs = numbers["psnrs"]
             self._psnr = sum(psnrs) / len(psnrs) if psnrs else math.nan
             skipped = int(sum(numbers.get("bad", ())))
-            if skipped and self._skips:  # from now on row by row, so that the others are trained
-                self._skips = False
-                self._guard.stop()
+            if skipped and self._clean >= LATE_AFTER:  # now row by row, so that the others are trained
+                self._clean = 0
                 self._mend()
             self.count("gradients", skipped)
 
