@@ -22,6 +22,7 @@ from torch import Tensor
 from tests.reference.differentiable_kernel import Differentiable
 from tests.reference.gsplat_surfel_stand_ins import fully_fused_projection_2dgs, surfel_sigma  # noqa: F401 - lent
 from tests.reference.simulated_device import kernel
+from tests.reference.triton_stand_ins import lent_triton
 
 PAIRS_AT_ONCE = 4096
 """(Gaussian, tile) pairs that are composited together, unless a tile has more: bounds memory."""
@@ -364,10 +365,11 @@ def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
 
 @contextmanager
 def lent() -> Iterator[None]:
-    """Within, the package's modules call the stand-ins, where they call gsplat's functions by name."""
+    """Within, the package's modules call the stand-ins, where they call gsplat's functions by name; and those
+    of the package's own kernels."""
     import abcd_ns.engine.render.cuda.backend  # noqa: F401 - so that it is among the modules
 
-    with pytest.MonkeyPatch.context() as patch:
+    with lent_triton(), pytest.MonkeyPatch.context() as patch:
         for module in [m for n, m in sys.modules.items() if n.startswith("abcd_ns.engine.render")]:
             for name in NAMES:
                 if hasattr(module, name):

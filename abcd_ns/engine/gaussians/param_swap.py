@@ -101,8 +101,7 @@ def nothing_live(
     empty = Gaussians.empty(sh_degree, device)
     params = {name: Parameter(value) for name, value in empty.items()}
     optimizers = {
-        name: Adam([value], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
-        for name, value in params.items()
+        name: Adam([value], lr=LEARNING_RATES[name], eps=1e-15, fused=True) for name, value in params.items()
     }
     return params, optimizers
 

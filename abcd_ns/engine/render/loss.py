@@ -1,8 +1,7 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
 import functools
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -12,34 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW, photometric_sums
-
-try:
-    from abcd_ns.engine.render.cuda.photometric import photometric
-except ImportError:  # Triton comes with torch for Linux
-    photometric = None
-
-
-class Fused:
-    """CUDA's kernels, until they turn out not to compile here."""
-
-    def __init__(self, function: Callable[..., Any] | None) -> None:
-        self._function = function
-
-    def __call__(self, rendered: Tensor, photo: Tensor, *weights: float) -> tuple[Tensor, Tensor] | None:
-        """The loss and its gradient; None where it has to be found otherwise."""
-        if self._function is None or not rendered.is_cuda or rendered.dtype != torch.float32:
-            return None
-        try:
-            return self._function(rendered, photo, *weights)
-        except torch.cuda.OutOfMemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - Triton's own, the compiler's, or that there is none
-            warnings.warn(f"The loss runs uncompiled, so steps take longer: {error}", stacklevel=2)
-            self._function = None
-            return None
-
-
-fused = Fused(photometric)
+from abcd_ns.engine.render.cuda import fused
 
 
 class _Photometric(torch.autograd.Function):
@@ -53,7 +25,7 @@ class _Photometric(torch.autograd.Function):
         by_pixel: float,
         by_window: float,
     ) -> Float[Tensor, ""]:
-        found = fused(rendered, photo, by_pixel, by_window)
+        found = fused.photometric(rendered, photo, by_pixel, by_window)
         if found is None:
             weights = _pair(by_pixel, by_window, rendered.dtype, rendered.device)
             planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
