@@ -132,8 +132,7 @@ class VisitWorker:
         empty = Gaussians.empty(setup.config.sh_degree, self._device)
         params = {name: Parameter(value) for name, value in empty.items()}
         optimizers = {
-            name: Adam([params[name]], fused=True, **options)
-            for name, options in setup.optimizers.items()
+            name: Adam([params[name]], fused=True, **options) for name, options in setup.optimizers.items()
         }
         run = TrainingRun(
             setup.config,

@@ -124,7 +124,7 @@ class ExactTrainer(Trainer):
             for whole, sample in zip(wholes, batch.samples, strict=True)
         ]
         clamped = tuple(picture.clamp(0, 1) for picture in self._pictures)
-        return Rendered(clamped, tuple(whole.transmittance for whole in wholes), ())
+        return Rendered(clamped, tuple(wholes), ())
 
     def loss(
         self,

@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 from abcd_ns.engine.kernels.photometric import photometric_sums
+from abcd_ns.engine.layers.compositing import composite, sandwich
 from abcd_ns.engine.render.cuda import fused
+from abcd_ns.engine.render.cuda.frame import Shown
+from abcd_ns.engine.types import Layer
 from tests.reference import simulated_device
 
 
@@ -36,21 +39,61 @@ def statistics(
     return torch.stack([before + added for before, added in zip(sums, more, strict=True)])
 
 
-TWINS = {photometric: 5, statistics: 1}
-"""Their launches; one of the loss' fills the sum with zeros."""
+def between(
+    features: Tensor, alphas: Tensor, shown: Sequence[Shown], gradients: Sequence[Tensor] | None = None
+) -> list[Tensor]:
+    """Pictures, or the gradients by features and alphas of what they and the weights of pixels add up to."""
+    features, alphas = (value.detach().requires_grad_() for value in (features, alphas))
+    pictures, weights = [], []
+    with torch.enable_grad():
+        for camera, (part, frame) in enumerate(shown):
+            drawn, through = features[camera][part], 1 - alphas[camera][part][..., 0]
+            own = Layer(drawn[..., :3], through)
+            if frame.front is None:
+                picture = composite(own, frame.background)
+            else:
+                picture = sandwich(frame.front, own, frame.back, frame.background)
+            pictures.append(picture.clamp(0, 1))
+            weights.append(drawn[..., 3])
+        if gradients is None:
+            return [picture.detach() for picture in pictures]
+        counts = [
+            (frame.front.transmittance if frame.front is not None else torch.ones_like(weight)) * frame.counts
+            for (_, frame), weight in zip(shown, weights, strict=True)
+        ]
+        return list(torch.autograd.grad([*pictures, *weights], [features, alphas], [*gradients, *counts]))
 
 
-def _on_device(twin: Callable[..., Any], launches: int) -> Callable[..., Any]:
+LAUNCHES: dict[Callable[..., Any], Callable[..., int]] = {
+    photometric: lambda *_: 5,  # one fills the sum with zeros
+    statistics: lambda *_: 1,
+    between: lambda _features, _alphas, shown, *_: len(shown),
+}
+
+
+def _map(function: Callable[[Tensor], Tensor], value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, Layer):
+        return Layer(function(value.color), function(value.transmittance))
+    if isinstance(value, (list, tuple)):
+        parts = [_map(function, part) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    return value
+
+
+def _on_device(twin: Callable[..., Any]) -> Callable[..., Any]:
     def run(*given: Any) -> Any:
-        tensors = simulated_device._tensors(given)
-        if not any(isinstance(x, simulated_device.OnDevice) for x in tensors):
+        tensors: list[Tensor] = []
+        _map(lambda tensor: tensors.append(tensor) or tensor, given)
+        if not isinstance(tensors[0], simulated_device.OnDevice) or tensors[0].dtype != torch.float32:
             return None
 
         def compute(*values: Tensor) -> Any:
             rest = iter(values)
-            return twin(*simulated_device._map(lambda _: next(rest), given))
+            return twin(*_map(lambda _: next(rest), given))
 
-        simulated_device._counts.launches += launches - 1
+        simulated_device._counts.launches += LAUNCHES[twin](*given) - 1
         return simulated_device.kernel(compute, *tensors)
 
     return run
@@ -60,6 +103,6 @@ def _on_device(twin: Callable[..., Any], launches: int) -> Callable[..., Any]:
 def lent_triton() -> Iterator[None]:
     """Within, the simulated device has the package's kernels."""
     with pytest.MonkeyPatch.context() as patch:
-        for twin, launches in TWINS.items():
-            patch.setattr(fused, twin.__name__, _on_device(twin, launches))
+        for twin in LAUNCHES:
+            patch.setattr(fused, twin.__name__, _on_device(twin))
         yield

@@ -39,9 +39,40 @@ for views, n in ((1, 1), (1, 300), (4, 257)):
     given = gradient, radii, weights, sums, (320.0, 240.0), views / 3
     torch.testing.assert_close(statistics(*given), twins.statistics(*given), rtol=1e-6, atol=1e-5)
 """
+BETWEEN = """
+import torch
+from abcd_ns.engine.render.cuda.between import between
+from abcd_ns.engine.render.cuda.frame import Frame
+from abcd_ns.engine.types import Layer
+from tests.reference import triton_stand_ins as twins
+
+generator = torch.Generator().manual_seed(0)
+def values(*shape):
+    return torch.rand(*shape, generator=generator)
+
+def layer(height, width):  # as a visit keeps them: channels of one tensor, a part of a larger one
+    pixels = values(height + 3, width + 5, 4)[2 : height + 2, 1 : width + 1]
+    return Layer(pixels[..., :3], pixels[..., 3])
+
+features, alphas = 2 * values(3, 32, 48, 4) - 0.5, values(3, 32, 48, 1)
+features[0, 5, 9, 1] = torch.nan
+parts = (slice(3, 28), slice(0, 41)), (slice(0, 32), slice(15, 48)), (slice(0, 1), slice(0, 1))
+for layers, counts in ((False, 0.0), (True, 1.0), (True, 2.5)):
+    shown = []
+    for rows, columns in parts:
+        size = rows.stop - rows.start, columns.stop - columns.start
+        pair = (layer(*size), layer(*size)) if layers else (None, None)
+        shown.append(((rows, columns), Frame(*pair, values(3), counts)))
+    found, expected = between(features, alphas, shown), twins.between(features, alphas, shown)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
+    upstream = [values(*picture.shape) - 0.5 for picture in found]
+    found, expected = (each(features, alphas, shown, upstream) for each in (between, twins.between))
+    assert bool(expected[0][..., 3].any()) == (counts > 0)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
+"""
 
 
-@pytest.mark.parametrize("compare", [LOSS, STATISTICS])
+@pytest.mark.parametrize("compare", [LOSS, STATISTICS, BETWEEN])
 def test_they_are_their_twins(compare):
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
     done = subprocess.run(

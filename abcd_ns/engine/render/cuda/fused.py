@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 try:
+    from abcd_ns.engine.render.cuda import between as _between
     from abcd_ns.engine.render.cuda import photometric as _loss
     from abcd_ns.engine.render.cuda import statistics as _statistics
 except ImportError:  # Triton comes with torch for Linux
-    _loss = _statistics = None
+    _between = _loss = _statistics = None
 
 
 class Fused:
@@ -58,3 +59,4 @@ def _is_of_the_device(error: Exception) -> bool:
 
 photometric = Fused("The loss", _loss and _loss.photometric)
 statistics = Fused("The statistics of density control", _statistics and _statistics.statistics)
+between = Fused("Compositing", _between and _between.between)

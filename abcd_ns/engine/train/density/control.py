@@ -129,7 +129,7 @@ class DensityControl:
     def before_backward(self, infos: Infos) -> None:
         """Keep the gradient of the projected means, by which the default strategy judges."""
         for info in infos:
-            if self.config.strategy == "default" and info["means2d"].requires_grad:
+            if self.config.strategy == "default" and info["means2d"].requires_grad and not self.absgrad:
                 info["means2d"].retain_grad()
 
     def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
@@ -165,7 +165,7 @@ class DensityControl:
         Args:
             infos: of the step's drawings, after backward.
         """
-        return self.is_due(clock) and (self.config.strategy != "default" or bool(_with_gradient(infos)))
+        return self.is_due(clock) and (self.config.strategy != "default" or bool(self._with_gradient(infos)))
 
     def resets(self, clock: DensityClock) -> bool:
         """Whether this step resets opacities (`default` strategy); that needs no gradients. Among others
@@ -185,7 +185,7 @@ class DensityControl:
         """
         if self.config.strategy != "default":
             return {}
-        with_gradient = _with_gradient(infos)
+        with_gradient = self._with_gradient(infos)
         if not with_gradient or len(means) == 0:
             return {}
         drawings = [each for info in with_gradient for each in zip(*self._norms(info), strict=True)]
@@ -209,8 +209,12 @@ class DensityControl:
             growth = {**growth, **dict(zip(names, found, strict=True))}
         return growth
 
-    def _gradient(self, info: dict[str, Any]) -> Tensor:
-        return info["means2d"].absgrad if self.absgrad else info["means2d"].grad
+    def _gradient(self, info: dict[str, Any]) -> Tensor | None:
+        means2d = info["means2d"]
+        return getattr(means2d, "absgrad", None) if self.absgrad else means2d.grad
+
+    def _with_gradient(self, infos: Infos) -> Infos:
+        return tuple(info for info in infos if self._gradient(info) is not None)
 
     @staticmethod
     def _scale(info: dict[str, Any]) -> tuple[float, float]:
@@ -249,7 +253,7 @@ class DensityControl:
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth
         if self.config.strategy == "default":
-            infos = _with_gradient(infos)
+            infos = self._with_gradient(infos)
             growth = self._gathered(growth, params["means"], infos, clock.views)
             if not (self.refines(clock, infos) or self.resets(clock)):
                 return growth
@@ -327,10 +331,6 @@ class DensityControl:
         strategy.step_post_backward(
             params, optimizers, {"binoms": self._binomials}, step, {}, lr=learning_rate
         )
-
-
-def _with_gradient(infos: Infos) -> Infos:
-    return tuple(info for info in infos if info["means2d"].grad is not None)
 
 
 def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:
