@@ -15,7 +15,7 @@ from abcd_ns.engine.events import Event
 from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.render import Rasterizer
-from abcd_ns.engine.render.loss import psnrs
+from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.store.lent_scene import LentScene
 from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
@@ -170,4 +170,4 @@ class VisitWorker:
             for pixels, into in zip(found, (pictures, photos, wanted), strict=True):
                 into.append(pixels)
         step_by(training.loss(batch, pictures, wanted), training.run.optimizers)
-        training.after_step(rendered, psnrs(pictures, photos))
+        training.after_step(rendered, squared_errors(pictures, photos))

@@ -58,15 +58,54 @@ def between(
         if gradients is None:
             return [picture.detach() for picture in pictures]
         counts = [
-            (frame.front.transmittance if frame.front is not None else torch.ones_like(weight)) * frame.counts
+            (torch.ones_like(weight) if frame.front is None else frame.front.transmittance.float())
+            * frame.counts
             for (_, frame), weight in zip(shown, weights, strict=True)
         ]
         return list(torch.autograd.grad([*pictures, *weights], [features, alphas], [*gradients, *counts]))
 
 
+def shade(colors: Tensor, depths: Tensor | None) -> tuple[Tensor, Tensor]:
+    """What is composited, and which colours would be less than 0."""
+    lighter = colors + 0.5
+    last = torch.zeros_like(colors[..., 0]) if depths is None else depths
+    return torch.cat((lighter.clamp_min(0.0), last[..., None]), dim=-1), lighter < 0
+
+
+def skips(count: Tensor, norms: Sequence[Tensor]) -> Tensor:
+    """1 where any norm is no number, else 0; counts the others."""
+    found = 1 - torch.stack(list(norms)).isfinite().all().float()
+    count += 1 - found
+    return found
+
+
+def windowed(
+    near: Tensor,
+    far: Tensor,
+    keys: Tensor,
+    owners: Tensor,
+    always: int,
+    bits: int,
+    tiles: int,
+    last_key: int,
+) -> tuple[Tensor, Tensor]:
+    """Keys and owners: those that are kept, and as many others as there were."""
+    place, z = keys >> 32, (keys & 0xFFFFFFFF).int().view(torch.float32)
+    tile = (place >> bits) * tiles + place % (1 << bits)
+    keep = (z >= near[tile]) & (z < far[tile]) | (owners < always)
+    others = int((~keep).sum())
+    return (
+        torch.cat((keys[keep], keys.new_full((others,), last_key))),
+        torch.cat((owners[keep], owners.new_zeros(others))),
+    )
+
+
 LAUNCHES: dict[Callable[..., Any], Callable[..., int]] = {
-    photometric: lambda *_: 5,  # one fills the sum with zeros
+    photometric: lambda *_: 4,
+    shade: lambda *_: 1,
+    skips: lambda *_: 1,
     statistics: lambda *_: 1,
+    windowed: lambda *_: 3,
     between: lambda _features, _alphas, shown, *_: len(shown),
 }
 

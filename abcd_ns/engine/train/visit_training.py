@@ -150,11 +150,11 @@ class VisitTraining:
             loss = loss + run.density.regularisation(run.params, run.count())
         return loss
 
-    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
 
         Args:
-            psnrs: of each picture, dB; listeners are told their mean.
+            errors: the mean squared one of each picture; listeners are told the mean PSNR.
         """
         run, active = self.run, self.run.active
         taken = len(rendered.pictures)
@@ -162,7 +162,7 @@ class VisitTraining:
         self._note_influence(rendered)
         run.state.step += 1
         active.done += 1
-        sound, psnr = run.health.end_step(psnrs)
+        sound, psnr = run.health.end_step(errors)
         self.live.count_step(self.batch, taken)
         clock = self.live.density_clock(taken, self.batch, self._visits.room())
         self.live.refine(rendered.infos if sound else (), clock)

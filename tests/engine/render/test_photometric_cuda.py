@@ -51,7 +51,7 @@ def values(*shape):
     return torch.rand(*shape, generator=generator)
 
 def layer(height, width):  # as a visit keeps them: channels of one tensor, a part of a larger one
-    pixels = values(height + 3, width + 5, 4)[2 : height + 2, 1 : width + 1]
+    pixels = values(height + 3, width + 5, 4).half()[2 : height + 2, 1 : width + 1]
     return Layer(pixels[..., :3], pixels[..., 3])
 
 features, alphas = 2 * values(3, 32, 48, 4) - 0.5, values(3, 32, 48, 1)
@@ -70,9 +70,49 @@ for layers, counts in ((False, 0.0), (True, 1.0), (True, 2.5)):
     assert bool(expected[0][..., 3].any()) == (counts > 0)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
 """
+GAUSSIANS = """
+import torch
+from abcd_ns.engine.render.cuda.statistics import shade, skips
+from tests.reference import triton_stand_ins as twins
+
+generator = torch.Generator().manual_seed(0)
+for cameras, n in ((1, 1), (3, 257)):
+    colors = torch.randn(cameras, n, 3, generator=generator)
+    depths = torch.rand(cameras, n, generator=generator)
+    colors[0, 0, 0] = -0.5
+    for given in (depths, None):
+        for found, expected in zip(shade(colors, given), twins.shade(colors, given), strict=True):
+            assert torch.equal(found, expected)
+for wrong in (None, torch.nan, torch.inf):
+    norms = list(torch.rand(5, generator=generator))
+    if wrong is not None:
+        norms[2] = torch.tensor(wrong)
+    count = torch.tensor(7.5)
+    assert float(skips(count, norms)) == (wrong is not None)
+    assert float(count) == 7.5 + (wrong is None)
+"""
+WINDOWS = """
+import torch
+from abcd_ns.engine.render.cuda.windowed import windowed
+from tests.reference import triton_stand_ins as twins
+
+generator = torch.Generator().manual_seed(0)
+cameras, tiles, bits = 3, 11, 4
+for count, always in ((0, 0), (1, 0), (700, 0), (700, 150)):
+    camera = torch.randint(cameras, (count,), generator=generator)
+    tile = torch.randint(tiles, (count,), generator=generator)
+    z = (torch.rand(count, generator=generator) + 0.5).view(torch.int32).long()
+    keys = ((camera << bits | tile) << 32 | z).sort().values
+    owners = torch.randint(300, (count,), generator=generator, dtype=torch.int32)
+    near = torch.rand(cameras * tiles, generator=generator)
+    sheet = bits, tiles, (2 << bits | 10) << 32 | 0x7FFFFFFF
+    given = near, near + 0.6, keys, owners, always, *sheet
+    found, expected = windowed(*given), twins.windowed(*given)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+"""
 
 
-@pytest.mark.parametrize("compare", [LOSS, STATISTICS, BETWEEN])
+@pytest.mark.parametrize("compare", [LOSS, STATISTICS, BETWEEN, GAUSSIANS, WINDOWS])
 def test_they_are_their_twins(compare):
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
     done = subprocess.run(

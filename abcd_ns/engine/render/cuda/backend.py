@@ -105,7 +105,7 @@ class GsplatRasterizer(Rasterizer):
             )
             members = drawing.members(drawing.inside([shot.inside for shot in few]))
             fronts, backs = [shot.front for shot in few], [shot.back for shot in few]
-            layers = (drawing.only(drawing.inside(windows)).layers() for windows in (fronts, backs))
+            layers = (drawing.windowed(windows).layers() for windows in (fronts, backs))
             for k, (front, back, which) in enumerate(zip(*layers, members, strict=True)):
                 yield Cut(front, back, seen.splats(k, which), which)
 
@@ -154,7 +154,7 @@ class GsplatRasterizer(Rasterizer):
         drawing = Drawing.of(self._kind, everyone, crops, self._cameras, windowed=windowed)
         if windowed:
             always = 0 if shots[0].frozen is None else own.radii.numel()
-            drawing = drawing.only(drawing.inside(windows, always))
+            drawing = drawing.windowed(windows, always)
         absgrad = absgrad and self.primitive.has_absgrad
         if absgrad and own.means2d.requires_grad:
             _forward_absgrad(own.means2d, drawing.means2d)

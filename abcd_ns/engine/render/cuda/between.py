@@ -2,7 +2,8 @@
 
     picture = clamp(C_F + T_F (C_A + T_A (C_B + T_B bg)), 0, 1)
 
-See `layers/compositing.py` for the algebra. C_A and 1 - T_A are crops of what gsplat has drawn.
+See `layers/compositing.py` for the algebra. C_A and 1 - T_A are crops of what gsplat has drawn; layers may be
+half floats.
 """
 
 from collections.abc import Sequence
@@ -42,18 +43,20 @@ def _between(
     through = 1 - tl.load(alphas_ptr + pixel, mask=inside, other=0.0)
     before, behind_all = tl.full((BLOCK,), 1.0, tl.float32), tl.full((BLOCK,), 1.0, tl.float32)
     if LAYERS:
-        before = tl.load(hides_ptr + row * hides_row + column * hides_step, mask=inside, other=0.0)
-        behind_all = tl.load(shows_ptr + row * shows_row + column * shows_step, mask=inside, other=0.0)
+        hides = hides_ptr + row * hides_row + column * hides_step
+        shows = shows_ptr + row * shows_row + column * shows_step
+        before = tl.load(hides, mask=inside, other=0.0).to(tl.float32)
+        behind_all = tl.load(shows, mask=inside, other=0.0).to(tl.float32)
     by_through = tl.zeros((BLOCK,), tl.float32)
     for channel in tl.static_range(3):
         behind = behind_all * tl.load(background_ptr + channel)
         if LAYERS:
             back = back_ptr + row * back_row + column * back_step + channel
-            behind += tl.load(back, mask=inside, other=0.0)
+            behind += tl.load(back, mask=inside, other=0.0).to(tl.float32)
         value = tl.load(features_ptr + 4 * pixel + channel, mask=inside, other=0.0) + through * behind
         if LAYERS:
             front = front_ptr + row * front_row + column * front_step + channel
-            value = tl.load(front, mask=inside, other=0.0) + before * value
+            value = tl.load(front, mask=inside, other=0.0).to(tl.float32) + before * value
         place = picture_ptr + 3 * (row * width + column) + channel
         if BACKWARD:
             shown = inside & (value >= 0) & (value <= 1)

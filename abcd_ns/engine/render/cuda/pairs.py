@@ -15,6 +15,7 @@ from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles
 from jaxtyping import Bool, Float, Int, Int64, Shaped
 from torch import Tensor
 
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected
 from abcd_ns.engine.render.projection import Splats
@@ -107,7 +108,7 @@ class Sheet:
         return self.shape[2] * TILE, (self.shape[1] - self.spare) * TILE
 
     @property
-    def _bits(self) -> int:
+    def bits(self) -> int:
         """Of a tile's number in a key, as gsplat has them."""
         return (self.shape[1] * self.shape[2]).bit_length()
 
@@ -115,14 +116,14 @@ class Sheet:
     def last_key(self) -> int:
         """The largest: in the last tile of all."""
         cameras, rows, cols = self.shape
-        return ((cameras - 1) << self._bits | rows * cols - 1) << 32 | LAST_DEPTH
+        return ((cameras - 1) << self.bits | rows * cols - 1) << 32 | LAST_DEPTH
 
     def tile(self, keys: Int64[Tensor, "q"]) -> Int64[Tensor, "q"]:
         """Number of each key's tile among those of all cameras."""
         tile = keys >> 32
         if len(self.crops) == 1:
             return tile
-        return (tile >> self._bits) * (self.shape[1] * self.shape[2]) + (tile & (1 << self._bits) - 1)
+        return (tile >> self.bits) * (self.shape[1] * self.shape[2]) + (tile & (1 << self.bits) - 1)
 
     def drawn(self, device: torch.device) -> Bool[Tensor, "c rows cols"] | None:
         """Which tiles are; None for all."""
@@ -224,6 +225,16 @@ class Drawing:
         tile, z = self.tile, self.z
         inside = (z >= near.index_select(0, tile)) & (z < far.index_select(0, tile))
         return inside | (self.owners < always) if always else inside
+
+    def windowed(self, windows: Sequence[ZWindow | None], always: int = 0) -> "Drawing":
+        """Only what `inside` finds."""
+        near, far = self.sheet.spread(windows, self.splats.depths)
+        _, rows, cols = self.sheet.shape
+        sheet = self.sheet.bits, rows * cols, self.sheet.last_key
+        found = fused.windowed(near, far, self.keys, self.owners, always, *sheet)
+        if found is None:
+            return self.only(self.inside(windows, always))
+        return replace(self, keys=found[0], owners=found[1])
 
     def only(self, keep: Bool[Tensor, "q"]) -> "Drawing":
         """Without some pairs. The others move up, in order, and the end of the lists belongs to the last

@@ -7,10 +7,11 @@ from typing import Any
 
 import torch
 from gsplat.cuda._wrapper import spherical_harmonics
-from jaxtyping import Float, Int, Int64
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind, OnScreen
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -190,12 +191,9 @@ class _Features(torch.autograd.Function):
         with torch.set_grad_enabled(any(ctx.needs_input_grad)):
             seen = zip(directions, (radii > 0).unbind(), strict=True)
             colors = [spherical_harmonics(sh_degree, d, coefficients, masks=m) for d, m in seen]
-        features = means.new_empty((*radii.shape, 4))
-        every = torch.add(_stacked([color.detach() for color in colors]), 0.5, out=features[..., :3])
         ctx.graph = leaves, colors
-        ctx.save_for_backward(every < 0)
-        every.clamp_min_(0.0)
-        features[..., 3].zero_() if weigh else features[..., 3].copy_(last)
+        features, dark = _shaded(_stacked([color.detach() for color in colors]), None if weigh else last)
+        ctx.save_for_backward(dark)
         return features
 
     @staticmethod
@@ -211,6 +209,18 @@ class _Features(torch.autograd.Function):
         by_means = directions[0] if len(directions) == 1 else directions.sum(dim=0)
         by_eyes = -directions.sum(dim=1) if ctx.needs_input_grad[1] else None
         return by_means, by_eyes, coefficients[:, 0], coefficients[:, 1:], grad[..., 3], None, None, None
+
+
+def _shaded(
+    colors: Float[Tensor, "c n 3"], depths: Float[Tensor, "c n"] | None
+) -> tuple[Float[Tensor, "c n 4"], Bool[Tensor, "c n 3"]]:
+    """See `shade`."""
+    found = fused.shade(colors, depths)
+    if found is not None:
+        return found
+    lighter = colors + 0.5
+    last = torch.zeros_like(colors[..., 0]) if depths is None else depths
+    return torch.cat((lighter.clamp_min(0.0), last[..., None]), dim=-1), lighter < 0
 
 
 def _stacked(values: Sequence[Tensor]) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 from abcd_ns.engine.events import Announcer, Mended, VisitUndone
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.render.loss import decibels
 from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.settle import state_for_visit, with_mail
 from abcd_ns.engine.store.special_blocks import WHOLE
@@ -103,17 +104,17 @@ class Health:
         """Remember the loss of each view in this step: (view, loss) pairs."""
         self._losses = list(losses) if self.undoes else []
 
-    def end_step(self, psnrs: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
+    def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
         """Call after the optimizers stepped.
 
         Args:
-            psnrs: of what the step drew, dB.
+            errors: the mean squared one of each picture that the step drew.
 
         Returns:
             Whether the step's gradients were all numbers, as far as is known; and the mean PSNR, dB: on an
             accelerator of the step before, NaN in a visit's first.
         """
-        self._send(psnrs)
+        self._send(errors)
         self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
             self._clean += 1
@@ -245,11 +246,11 @@ class Health:
 
     # -- accounts ------------------------------------------------------------------------------------
 
-    def _send(self, psnrs: Sequence[Float[Tensor, ""]]) -> None:
+    def _send(self, errors: Sequence[Float[Tensor, ""]]) -> None:
         """All that the step tells, as one small tensor."""
         losses, self._losses = self._losses, []
         shares, self._shares = self._shares, []
-        parts = {"losses": [loss for _, loss in losses], "shares": shares, "psnrs": list(psnrs)}
+        parts = {"losses": [loss for _, loss in losses], "shares": shares, "errors": list(errors)}
         if self._guard is not None:
             parts["bad"], self._guard.found = self._guard.found, []
         self._numbers.send([view for view, _ in losses], parts)
@@ -260,7 +261,7 @@ class Health:
             self._note_losses(views, numbers["losses"])
             if self._active is not None and not self._active.shown and numbers["shares"]:
                 self._active.shown = float(torch.tensor(numbers["shares"]).max()) > HIDDEN
-            psnrs = numbers["psnrs"]
+            psnrs = [decibels(error) for error in numbers["errors"]]
             self._psnr = sum(psnrs) / len(psnrs) if psnrs else math.nan
             skipped = int(sum(numbers.get("bad", ())))
             if skipped and self._clean >= LATE_AFTER:  # now row by row, so that the others are trained

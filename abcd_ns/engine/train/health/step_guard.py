@@ -4,10 +4,11 @@ import math
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.adam import Adam
+from abcd_ns.engine.render.cuda import fused
 
 
 class StepGuard:
@@ -38,17 +39,29 @@ class StepGuard:
             skips: whether they do nothing if a gradient is no number.
         """
         if not self._told or any(told is optimizer for told in self._told):
-            self._told, self._found = [], None
-            self._begin(self._are_numbers() if skips else None)
+            self._told, self._found = [], self._begin(skips)
         self._told.append(optimizer)
         optimizer.found_inf = self._found
 
     @torch.no_grad()
-    def _begin(self, sound: Bool[Tensor, ""] | None) -> None:
-        """A round of steps."""
-        if sound is not None:
-            self._found = torch.logical_not(sound, out=torch.empty((), device=sound.device))
-            self.found.append(self._found)
+    def _begin(self, skips: bool) -> Float[Tensor, ""] | None:
+        """Count a round of steps; whether it is skipped, if it may be."""
+        count, norms = self._count(), self._norms() if skips else []
+        if not norms:
+            if count is not None:
+                count.add_(1)
+            return None
+        found = None if count is None else fused.skips(count, norms)
+        if found is None:
+            sound = torch.stack(norms).sum() < math.inf
+            found = torch.logical_not(sound, out=torch.empty((), device=sound.device))
+            if count is not None:
+                count.add_(sound)
+        self.found.append(found)
+        return found
+
+    def _count(self) -> Float[Tensor, ""] | None:
+        """The steps of all that are `Adam`, which share it from now on."""
         count = None
         for optimizer in self._optimizers.values():
             if isinstance(optimizer, Adam):
@@ -56,14 +69,10 @@ class StepGuard:
                 for state in optimizer.state.values():
                     count = state["step"] if count is None else count
                     state["step"] = count
-        if count is not None:
-            count.add_(1 if sound is None else sound)
+        return count
 
-    @torch.no_grad()
-    def _are_numbers(self) -> Bool[Tensor, ""]:
+    def _norms(self) -> list[Float[Tensor, ""]]:
+        """Of all gradients. An overflow of the squares counts, as it would in Adam's second moment."""
         live = [p for o in self._optimizers.values() for p in o.param_groups[0]["params"]]
         gradients = [p.grad for p in live if p.grad is not None and p.grad.numel()]
-        if not gradients:
-            return torch.ones((), dtype=torch.bool, device=live[0].device)
-        # An overflow of the squares counts, as it would in Adam's second moment.
-        return torch.stack(torch._foreach_norm(gradients)).sum() < math.inf
+        return list(torch._foreach_norm(gradients)) if gradients else []
