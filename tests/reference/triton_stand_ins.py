@@ -135,6 +135,7 @@ def _on_device(twin: Callable[..., Any]) -> Callable[..., Any]:
         simulated_device._counts.launches += LAUNCHES[twin](*given) - 1
         return simulated_device.kernel(compute, *tensors)
 
+    run.runs = True
     return run
 
 
