@@ -20,7 +20,7 @@ from torch.profiler import ProfilerActivity
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render import loss, make_rasterizer
-from abcd_ns.engine.render.loss import psnrs
+from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
@@ -133,7 +133,7 @@ def step(coordinator: Coordinator, photo: PhotoReader, clock: StageClock) -> int
         for optimizer in coordinator.optimizers.values():
             optimizer.step()
     with clock.stage("density and settling"):
-        coordinator.after_step(rendered, psnrs(rendered.pictures, photos))
+        coordinator.after_step(rendered, squared_errors(rendered.pictures, photos))
     return len(batch.samples)
 
 

@@ -131,9 +131,9 @@ class Dispatcher(Coordinator):
         self.workers.go_on()
         super().resume()
 
-    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """As the coordinator's, for a step that was taken here."""
-        super().after_step(rendered, psnrs)
+        super().after_step(rendered, errors)
         self._counted = self.state.step
 
     # -- lending -------------------------------------------------------------------------------------

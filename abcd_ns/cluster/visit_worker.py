@@ -12,9 +12,10 @@ from torch.nn import Parameter
 from abcd_ns.cluster.lease import VisitOutcome, VisitTask
 from abcd_ns.cluster.shared_residual import ROOM, SharedResidual
 from abcd_ns.engine.events import Event
+from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.render import Rasterizer
-from abcd_ns.engine.render.loss import psnrs
+from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.store.lent_scene import LentScene
 from abcd_ns.engine.train.capture.light import HeldLight
 from abcd_ns.engine.train.config import TrainingConfig
@@ -131,8 +132,7 @@ class VisitWorker:
         empty = Gaussians.empty(setup.config.sh_degree, self._device)
         params = {name: Parameter(value) for name, value in empty.items()}
         optimizers = {
-            name: torch.optim.Adam([params[name]], fused=True, **options)
-            for name, options in setup.optimizers.items()
+            name: Adam([params[name]], fused=True, **options) for name, options in setup.optimizers.items()
         }
         run = TrainingRun(
             setup.config,
@@ -170,4 +170,4 @@ class VisitWorker:
             for pixels, into in zip(found, (pictures, photos, wanted), strict=True):
                 into.append(pixels)
         step_by(training.loss(batch, pictures, wanted), training.run.optimizers)
-        training.after_step(rendered, psnrs(pictures, photos))
+        training.after_step(rendered, squared_errors(pictures, photos))

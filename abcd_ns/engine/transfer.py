@@ -13,6 +13,11 @@ Numbers = dict[str, list[float]]
 """The same, read."""
 
 
+def finest(device: torch.device) -> torch.dtype:
+    """float64, or float32 where the device has none: Apple's."""
+    return torch.float32 if device.type == "mps" else torch.float64
+
+
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
     """A tensor of the host on a device, which copies it when it comes to it, if it is not there."""
     if device.type == "cuda" and tensor.device.type == "cpu":

@@ -25,7 +25,7 @@ from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
-from abcd_ns.engine.render.loss import photometric_loss, psnr, psnrs, ssim_windows
+from abcd_ns.engine.render.loss import photometric_loss, psnr, squared_errors, ssim_windows
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store.derived_scenes import ChangedScene
@@ -335,12 +335,12 @@ class AbcdModel(SplatfactoModel):
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """PSNR of what was drawn, a batch's mean, and the number of Gaussians in the scene.
 
-        The PSNR of each picture is left in `outputs`, for the pipeline to take.
+        The mean squared error of each picture is left in `outputs`, for the pipeline to take.
         """
         pictures, photos = self._pairs(outputs, batch)
-        outputs["psnrs"] = psnrs(pictures, photos)
+        errors = outputs["errors"] = squared_errors(pictures, photos)
         count = len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
-        return {"psnr": torch.stack(outputs["psnrs"]).mean(), "gaussian_count": count}
+        return {"psnr": -10 * torch.stack(errors).log10().mean(), "gaussian_count": count}
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None

@@ -61,7 +61,6 @@ def rendered_outputs(batch: Batch, rendered: Rendered) -> dict[str, Any]:
     """A training batch's pictures under the same names, in lists, and what they came from."""
     return {
         "rgb": list(rendered.pictures),
-        "accumulation": [1 - transmittance[..., None] for transmittance in rendered.transmittances],
         "background": [sample.background for sample in batch.samples],
         "batch": batch,
         "rendered": rendered,

@@ -172,7 +172,7 @@ class AbcdPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         """As VanillaPipeline's, but keeps what the coordinator must be told after the step."""
         outputs, losses, metrics = super().get_train_loss_dict(step)
-        self._rendered, self._psnrs = outputs.pop("rendered"), outputs.pop("psnrs")
+        self._rendered, self._errors = outputs.pop("rendered"), outputs.pop("errors")
         return outputs, losses, metrics
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -205,7 +205,7 @@ class AbcdPipeline(VanillaPipeline):
 
     def _after_step(self) -> None:
         if self._rendered is not None:  # else workers took the step
-            self.coordinator.after_step(self._rendered, self._psnrs)
+            self.coordinator.after_step(self._rendered, self._errors)
             self._rendered = None
 
     # -- set-up --------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.data.input_errors import exit_on_user_error, print_error
 from abcd_ns.engine.events import Event, LayersDrawn, Shedding, WorkersSeen
+from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
@@ -47,6 +48,7 @@ from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam as 3DGS uses it, one pass over memory for each parameter."""
 
+    _target: type = Adam
     fused: bool = True
     """Update a parameter and its moments in one kernel."""
 

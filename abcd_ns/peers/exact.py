@@ -124,7 +124,7 @@ class ExactTrainer(Trainer):
             for whole, sample in zip(wholes, batch.samples, strict=True)
         ]
         clamped = tuple(picture.clamp(0, 1) for picture in self._pictures)
-        return Rendered(clamped, tuple(whole.transmittance for whole in wholes), ())
+        return Rendered(clamped, tuple(wholes), ())
 
     def loss(
         self,
@@ -136,7 +136,7 @@ class ExactTrainer(Trainer):
         losses = batch.losses(pictures, photos, self.config)
         return sum(losses[1:], start=losses[0]) / len(losses)
 
-    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Pass 2, and a step of every block's optimizers."""
         gradients, taken = self.gradients(), len(rendered.pictures)
         self.state.step += 1
@@ -150,7 +150,7 @@ class ExactTrainer(Trainer):
         self._all = joined[order.argsort()] if kept else joined
         self._lay_over()
         self._pictures, self._layers_of = [], []
-        _, psnr = self.health.end_step(psnrs)
+        _, psnr = self.health.end_step(errors)
         self.announce(StepTaken(self.state.step, 0, self.state.step, psnr))
         if self.finished:
             self.save()

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import torch
 
-from abcd_ns.engine.transfer import Download, upload
+from abcd_ns.engine.transfer import Download, finest, upload
 
 
 class OnDevice(torch.Tensor):
@@ -24,6 +24,11 @@ class OnDevice(torch.Tensor):
 def test_what_is_on_the_device_is_not_pinned():
     there = torch.zeros(3).as_subclass(OnDevice)
     assert upload(there, torch.device("cuda")) is there
+
+
+def test_apples_device_has_no_float64():
+    found = [finest(torch.device(name)) for name in ("cpu", "cuda", "mps")]
+    assert found == [torch.float64, torch.float64, torch.float32]
 
 
 class Event:

@@ -22,6 +22,7 @@ from torch import Tensor
 from tests.reference.differentiable_kernel import Differentiable
 from tests.reference.gsplat_surfel_stand_ins import fully_fused_projection_2dgs, surfel_sigma  # noqa: F401 - lent
 from tests.reference.simulated_device import kernel
+from tests.reference.triton_stand_ins import lent_triton
 
 PAIRS_AT_ONCE = 4096
 """(Gaussian, tile) pairs that are composited together, unless a tile has more: bounds memory."""
@@ -84,14 +85,13 @@ def fully_fused_projection(
             # Those alone: what is not drawn has no gradient, not even one of 0 times infinity.
             values = (value[0] for value in project(drawn, *inputs)[1:])
             empty = [means.new_full((len(means), *size), torch.nan) for size in ((2,), (), (3,))]
-            empty.append(means.new_zeros(len(means)))  # gsplat initialises these alone
-            cameras.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=True))])
+            if calc_compensations:
+                empty.append(means.new_zeros(len(means)))  # gsplat initialises these alone
+            cameras.append([radii, *(e.index_copy(0, drawn, v) for e, v in zip(empty, values, strict=False))])
         return [torch.stack(values) for values in zip(*cameras, strict=True)]
 
-    radii, means2d, depths, conics, compensations = Differentiable.apply(
-        _project, means, quats, scales, viewmats, Ks
-    )
-    return radii, means2d, depths, conics, compensations if calc_compensations else None
+    found = Differentiable.apply(_project, means, quats, scales, viewmats, Ks)
+    return found if calc_compensations else (*found, None)
 
 
 def spherical_harmonics(
@@ -104,6 +104,7 @@ def spherical_harmonics(
         return (torch.where(masks[0][..., None], colors, torch.nan) if masks else colors,)
 
     tensors = (dirs, coeffs) if masks is None else (dirs, coeffs, masks)
+    tensors = (tensor.contiguous() for tensor in tensors)
     return Differentiable.apply(_harmonics, *tensors)[0]
 
 
@@ -147,7 +148,8 @@ def isect_tiles(
             flatten_ids = flatten_ids[order]
         return counts.int(), isect_ids, flatten_ids.int()
 
-    return kernel(_isect_tiles, means2d, radii, depths, camera_ids, waits=1)
+    tensors = (tensor.contiguous() for tensor in (means2d, radii, depths, camera_ids))
+    return kernel(_isect_tiles, *tensors, waits=1)
 
 
 def _bits(tile_width: int, tile_height: int) -> int:
@@ -195,13 +197,11 @@ def rasterize_to_pixels(
     assert flatten_ids.dtype == isect_offsets.dtype == torch.int32
     assert isect_offsets.shape[1] * tile_size >= image_height
     assert isect_offsets.shape[2] * tile_size >= image_width
-    if masks is None:
-        masks = torch.ones_like(isect_offsets, dtype=torch.bool)
-    assert masks.shape == isect_offsets.shape
+    assert masks is None or masks.shape == isect_offsets.shape
     size = image_width, image_height, tile_size
-    tensors = means2d, conics, colors, opacities, isect_offsets, flatten_ids, masks
-    image = _Rasterize.apply(size, absgrad, *tensors)
-    return image[..., :-1], image[..., -1:]
+    splats = (tensor.contiguous() for tensor in (means2d, conics, colors, opacities))
+    tensors = *splats, isect_offsets, flatten_ids
+    return _Rasterize.apply(size, absgrad, *tensors, *(() if masks is None else (masks,)))
 
 
 def rasterize_to_pixels_2dgs(
@@ -257,26 +257,35 @@ class _Rasterize(torch.autograd.Function):
     """Composites tiles, some of them at a time, and does so again for the gradient."""
 
     @staticmethod
-    def forward(ctx: Any, size: tuple[int, int, int], absgrad: bool, *tensors: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, size: tuple[int, int, int], absgrad: bool, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
         ctx.size, ctx.absgrad = size, absgrad
         ctx.save_for_backward(*tensors)
 
-        def _rasterize(*tensors: Tensor) -> Tensor:
-            *inputs, offsets, flatten_ids, masks = tensors
+        def _rasterize(*tensors: Tensor) -> tuple[Tensor, Tensor]:
+            *inputs, offsets, flatten_ids, masks = _with_masks(tensors)
             lists = _drawn_lists(offsets, flatten_ids, masks, size)
             parts = torch.cat([_tiles(p, b, (*inputs, *lists), size[2])[0] for p, b in _parts(*lists)])
             parts[~masks.flatten(), :, -1] = torch.nan
-            return _image(parts, offsets, size).to(tensors[2])
+            image = _image(parts, offsets, size).to(tensors[2])
+            return image[..., :-1].contiguous(), image[..., -1:].contiguous()
 
-        return kernel(_rasterize, *tensors)
+        return tuple(kernel(_rasterize, *tensors))
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> Any:
+    def backward(ctx: Any, *upstream: Tensor) -> Any:
         means2d = ctx.saved_tensors[0]
-        *gradients, absolute = kernel(partial(_gradients, ctx.size), *ctx.saved_tensors, upstream)
+        upstream = [gradient.contiguous() for gradient in upstream]
+        *gradients, absolute = kernel(partial(_gradients, ctx.size), *upstream, *ctx.saved_tensors)
         if ctx.absgrad:
             means2d.absgrad = absolute
-        return None, None, *gradients, None, None, None
+        return None, None, *gradients, *[None] * (len(ctx.saved_tensors) - len(gradients))
+
+
+def _with_masks(tensors: Sequence[Tensor]) -> Sequence[Tensor]:
+    """What is rasterized, with masks: of all tiles where none are given."""
+    return tensors if len(tensors) == 7 else (*tensors, torch.ones_like(tensors[4], dtype=torch.bool))
 
 
 def _parts(offsets: Tensor, flatten_ids: Tensor) -> Iterator[tuple[range, list[int]]]:
@@ -349,9 +358,10 @@ def _by_tiles(image: Tensor, offsets: Tensor, side: int) -> Tensor:
 
 def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
     """Of means2d, conics, colours and opacities, and the sum of the means' absolute ones over pixels."""
-    *inputs, offsets, flatten_ids, masks, upstream = tensors
+    by_color, by_alpha, *tensors = tensors
+    *inputs, offsets, flatten_ids, masks = _with_masks(tensors)
     lists = _drawn_lists(offsets, flatten_ids, masks, size)
-    upstream = _by_tiles(upstream, offsets, size[2]).double()
+    upstream = _by_tiles(torch.cat((by_color, by_alpha), dim=-1), offsets, size[2]).double()
     sums = [torch.zeros_like(x, dtype=torch.float64) for x in (*inputs, inputs[0])]
     for tiles, starts in _parts(*lists):
         with torch.enable_grad():
@@ -364,10 +374,11 @@ def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
 
 @contextmanager
 def lent() -> Iterator[None]:
-    """Within, the package's modules call the stand-ins, where they call gsplat's functions by name."""
+    """Within, the package's modules call the stand-ins, where they call gsplat's functions by name; and those
+    of the package's own kernels."""
     import abcd_ns.engine.render.cuda.backend  # noqa: F401 - so that it is among the modules
 
-    with pytest.MonkeyPatch.context() as patch:
+    with lent_triton(), pytest.MonkeyPatch.context() as patch:
         for module in [m for n, m in sys.modules.items() if n.startswith("abcd_ns.engine.render")]:
             for name in NAMES:
                 if hasattr(module, name):

@@ -10,6 +10,7 @@ import gc
 import pytest
 
 from abcd_ns.engine.layers.layer_store import LayerStore
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train import visit_training
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -46,6 +47,13 @@ def peak_of_steps(counts, folder, **options) -> tuple[int, int]:
 
 PLAIN, LIT = {"density": STILL}, {"density": STILL, "light": "bilateral"}
 CONSISTENT = {"density": STILL, "primitive": "2dgs", "normal_consistency": 0.05}
+
+
+@pytest.fixture(autouse=True)
+def _uncompiled(simulated_gsplat, monkeypatch):  # noqa: ARG001 - which lends the kernels
+    """What is modelled is what most is taken by: steps without Triton's kernels."""
+    for name in ("between", "photometric", "shade", "skips", "statistics", "windowed"):
+        monkeypatch.setattr(fused, name, fused.Fused(name, None))
 
 
 @pytest.mark.parametrize(("batch", "given"), [(1, PLAIN), (2, PLAIN), (1, LIT), (1, CONSISTENT)])

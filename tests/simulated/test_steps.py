@@ -6,12 +6,14 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import Mended, StepTaken
+from abcd_ns.engine.gaussians import param_swap
 from abcd_ns.engine.gaussians.param_swap import PARAM_NAMES
 from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.degrees import lowered
 from abcd_ns.engine.train.density.shedding import WEIGHED
+from abcd_ns.engine.train.health.health import LATE_AFTER
 from abcd_ns.engine.train.health.health_rules import wider_than
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.transfer import StepNumbers
@@ -86,6 +88,19 @@ def test_rules_of_a_refinement_copy_cameras_once_however_many_there_are(counts, 
     before = counts.copy()
     lowered(gaussians, growth, ring)
     assert counts.since(before).copies_to_device == 1
+
+
+def test_no_more_ram_is_pinned_for_a_block_than_there_is_for_that(counts, monkeypatch):
+    """Four of 4,000 bytes take 4,096 each, and the last is always waited for."""
+    values = [torch.full((1000,), float(k), device=DEVICE) for k in range(4)]
+    waits = []
+    for room in (0, 8192, 1 << 20):
+        monkeypatch.setattr(param_swap, "PINNED_BYTES", room)
+        before = counts.copy()
+        copies = param_swap._on_cpu(values)
+        waits.append(counts.since(before).waited)
+        assert all(bool((copy == k).all()) for k, copy in enumerate(copies))
+    assert waits == [4, 2, 1]
 
 
 def test_numbers_of_a_step_are_there_a_step_later(counts):
@@ -168,6 +183,32 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, start, views
     assert bool(coordinator.visit.live.growth["grad2d"].isfinite().all())
     train(coordinator, photos)
     assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
+
+
+def test_a_step_waits_as_before_some_steps_after_one_that_was_skipped(
+    tmp_path, start, views, photos, simulated_gsplat
+):
+    """Rows are looked at one by one for a while, and steps that six optimizers count once are counted on."""
+    coordinator = make_coordinator(
+        tmp_path,
+        start,
+        views,
+        blocks=1,
+        steps=LATE_AFTER + 12,
+        density=GATHERING,
+        rasterizer=GsplatRasterizer(),
+        device=DEVICE,
+    )
+    spoil_once(coordinator, 3)
+    waits = []
+    for _ in range(LATE_AFTER + 10):
+        before = simulated_gsplat.copy()
+        train_step(coordinator, photos)
+        waits.append(simulated_gsplat.since(before).waited)
+    assert min(waits[5 : 4 + LATE_AFTER]) > 2
+    assert set(waits[-4:]) == {2}
+    steps = [o.state[coordinator.params[name]]["step"] for name, o in coordinator.optimizers.items()]
+    assert {float(step) for step in steps} == {LATE_AFTER + 9.0}
 
 
 def test_the_torch_rasterizer_is_what_it_is_on_the_cpu(tmp_path, start, views, photos, counts):  # noqa: ARG001

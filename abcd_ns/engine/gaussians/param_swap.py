@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
+from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState, Clocks
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 
@@ -29,6 +30,8 @@ RATED_FOR = 10_000
 YOUNG_RATES = 4.0
 """Times as large they are before, at most; a step of four views is as large as that by itself."""
 
+PINNED_BYTES = 256 << 20
+"""Of RAM that is pinned to copy a block from a GPU, at most: torch gives none of it back."""
 STEP_PARTS = 128
 """Adam's step count is a multiple of 1 over this, which float32 counts exactly to beyond 100,000."""
 
@@ -57,8 +60,8 @@ def attach(state: BlockState, params: Params, optimizers: Optimizers, *, batch: 
 def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clocks: Clocks) -> BlockState:
     """The live block as a BlockState on the CPU that shares no memory with later steps; it stays live.
 
-    From a GPU the copies are in pinned memory, which is not for keeping: what is put to rest is copied once
-    more.
+    From a GPU up to PINNED_BYTES of the copies are in pinned memory, which is not for keeping: what is put to
+    rest is copied once more.
 
     Args:
         growth: the strategy's statistics, each [n]; copied.
@@ -72,9 +75,15 @@ def detach(params: Params, optimizers: Optimizers, growth: dict[str, Tensor], cl
 
 
 def _on_cpu(values: list[Tensor]) -> list[Tensor]:
-    """Copies of tensors of one device, for which it is waited once: the last comes when all have come."""
-    last = len(values) - 1
-    return [value.detach().to("cpu", copy=True, non_blocking=k < last) for k, value in enumerate(values)]
+    """Copies of tensors of one device. Those in pinned RAM are waited for once: the last comes when all have.
+    The others, for which PINNED_BYTES do not suffice, are waited for one by one."""
+    copies, room = [], PINNED_BYTES
+    for k, value in enumerate(values):
+        pinned = 1 << (value.nbytes - 1).bit_length() if value.nbytes else 0  # torch rounds up so
+        is_late = k + 1 < len(values) and pinned <= room
+        room -= pinned if is_late else 0
+        copies.append(value.detach().to("cpu", copy=True, non_blocking=is_late))
+    return copies
 
 
 def adam_step(clocks: Clocks, batch: int) -> Float[Tensor, ""]:
@@ -100,8 +109,7 @@ def nothing_live(
     empty = Gaussians.empty(sh_degree, device)
     params = {name: Parameter(value) for name, value in empty.items()}
     optimizers = {
-        name: torch.optim.Adam([value], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
-        for name, value in params.items()
+        name: Adam([value], lr=LEARNING_RATES[name], eps=1e-15, fused=True) for name, value in params.items()
     }
     return params, optimizers
 

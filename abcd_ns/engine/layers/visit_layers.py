@@ -111,7 +111,9 @@ class VisitLayers:
             ((_, kept),) = self._draw([view])
         part = crop or whole
         layers = kept.layers[(slice(None), *part.within(whole).slices)]
-        layers, window = unpacked(layers.to(self._views[view].viewmat.dtype)), self._window(view)
+        if layers.device.type == "cpu":  # elsewhere what reads them does so
+            layers = layers.to(self._views[view].viewmat.dtype)
+        layers, window = unpacked(layers), self._window(view)
         window = window and window.on(TileGrid(part, window.grid.side))
         return replace(layers, inside=kept.interleaved), window
 

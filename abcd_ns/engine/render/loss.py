@@ -1,7 +1,7 @@
 """The photometric loss of 3DGS on a crop, weighed as a part of the full image."""
 
-import warnings
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -11,34 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW, photometric_sums
-
-try:
-    from abcd_ns.engine.render.cuda.photometric import photometric
-except ImportError:  # Triton comes with torch for Linux
-    photometric = None
-
-
-class Fused:
-    """CUDA's kernels, until they turn out not to compile here."""
-
-    def __init__(self, function: Callable[..., Any] | None) -> None:
-        self._function = function
-
-    def __call__(self, rendered: Tensor, photo: Tensor, *weights: float) -> tuple[Tensor, Tensor] | None:
-        """The loss and its gradient; None where it has to be found otherwise."""
-        if self._function is None or not rendered.is_cuda or rendered.dtype != torch.float32:
-            return None
-        try:
-            return self._function(rendered, photo, *weights)
-        except torch.cuda.OutOfMemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001 - Triton's own, the compiler's, or that there is none
-            warnings.warn(f"The loss runs uncompiled, so steps take longer: {error}", stacklevel=2)
-            self._function = None
-            return None
-
-
-fused = Fused(photometric)
+from abcd_ns.engine.render.cuda import fused
 
 
 class _Photometric(torch.autograd.Function):
@@ -52,7 +25,7 @@ class _Photometric(torch.autograd.Function):
         by_pixel: float,
         by_window: float,
     ) -> Float[Tensor, ""]:
-        found = fused(rendered, photo, by_pixel, by_window)
+        found = fused.photometric(rendered, photo, by_pixel, by_window)
         if found is None:
             sums, gradient = photometric_sums(rendered, photo, (by_pixel, by_window))
             found = by_pixel * sums[0] + by_window * sums[1], gradient
@@ -121,10 +94,17 @@ def psnr(rendered: Float[Tensor, "..."], photo: Float[Tensor, "..."]) -> Float[T
     return -10 * torch.log10(torch.mean((rendered - photo) ** 2))
 
 
+def decibels(error: float) -> float:
+    """The PSNR of a mean squared error; infinite for 0."""
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
 @torch.no_grad()
-def psnrs(
+def squared_errors(
     rendered: Sequence[Float[Tensor, "..."]], photos: Sequence[Float[Tensor, "..."]]
 ) -> list[Float[Tensor, ""]]:
-    """The PSNR of each pair, dB."""
-    errors = [F.mse_loss(a, b) for a, b in zip(rendered, photos, strict=True)]
-    return list((-10 * torch.stack(errors).log10()).unbind()) if errors else []
+    """The mean squared error of each pair; see `decibels`."""
+    return [F.mse_loss(a, b) for a, b in zip(rendered, photos, strict=True)]
+
+
+# as benchmarks/visit.py calls it

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from abcd_ns.engine.render.tile_grid import TileGrid
+from abcd_ns.engine.transfer import finest
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def showing(
     """
     crops, tiles = pixels.shape
     ends = torch.searchsorted(tile, torch.arange(crops * tiles, device=tile.device), right=True)
-    share = weight.double() / pixels.flatten().clamp_min(1).index_select(0, tile)
+    share = weight.to(finest(weight.device)) / pixels.flatten().clamp_min(1).index_select(0, tile)
     so_far, mass = _from_zero(share), _from_zero(share * z)
     starts = torch.cat((ends.new_zeros(1), ends[:-1]))
     before, after = so_far[starts], so_far[ends]

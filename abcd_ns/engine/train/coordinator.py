@@ -88,15 +88,15 @@ class Coordinator(Trainer):
         """The loss of a step, over what says something about the block."""
         return self.visit.loss(batch, pictures, photos)
 
-    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes, and ends the visit when its steps are done.
 
         Args:
-            psnrs: of each picture, dB; listeners are told their mean.
+            errors: the mean squared one of each picture; listeners are told the mean PSNR.
         """
         if self.poses is not None:
             self.poses.count(len(rendered.pictures))
-        self.visit.after_step(rendered, psnrs)
+        self.visit.after_step(rendered, errors)
         if self.visit.is_over:
             self.end_visit()
         elif self.scene.is_due(self.config.commit_seconds):

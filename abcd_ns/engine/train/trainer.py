@@ -45,11 +45,11 @@ class Trainer(ABC):
         """The loss of a step."""
 
     @abstractmethod
-    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped.
 
         Args:
-            psnrs: of each picture, dB; listeners are told their mean.
+            errors: the mean squared one of each picture; listeners are told the mean PSNR.
         """
 
     def complete(self) -> None:  # noqa: B027 - most have nothing left to do

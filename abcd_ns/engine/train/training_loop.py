@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers
-from abcd_ns.engine.render.loss import psnrs
+from abcd_ns.engine.render.loss import squared_errors
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Crop
 
@@ -34,7 +34,7 @@ def train_step(coordinator: Trainer, photo: PhotoReader) -> None:
     photos = [pixels.to(coordinator.device, non_blocking=True) for pixels in read]
     rendered = coordinator.render(batch)
     step_by(coordinator.loss(batch, rendered.pictures, photos), coordinator.optimizers)
-    coordinator.after_step(rendered, psnrs(rendered.pictures, photos))
+    coordinator.after_step(rendered, squared_errors(rendered.pictures, photos))
 
 
 def step_by(loss: Float[Tensor, ""], optimizers: Optimizers) -> None:

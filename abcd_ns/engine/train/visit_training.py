@@ -10,6 +10,8 @@ from abcd_ns.engine.events import PhotosWanted, StepTaken, VisitBegan
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import Pace, live_gaussians
 from abcd_ns.engine.layers.visit_layers import VisitLayers
+from abcd_ns.engine.render import Raster
+from abcd_ns.engine.render.cuda.drawn import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, Use, gradients_of
@@ -136,7 +138,7 @@ class VisitTraining:
         the samples', plus what surfels and the density strategy ask for."""
         run = self.run
         losses = batch.losses(*self._visits.compared(batch, pictures, photos), run.config)
-        loss = sum(losses[1:], start=losses[0]) / len(losses)
+        loss = losses[0] if len(losses) == 1 else sum(losses[1:], start=losses[0]) / len(losses)
         run.health.note(
             [(s.view.index, found.detach()) for s, found in zip(batch.samples, losses, strict=True)]
         )
@@ -148,11 +150,11 @@ class VisitTraining:
             loss = loss + run.density.regularisation(run.params, run.count())
         return loss
 
-    def after_step(self, rendered: Rendered, psnrs: Sequence[Tensor] = ()) -> None:
+    def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
 
         Args:
-            psnrs: of each picture, dB; listeners are told their mean.
+            errors: the mean squared one of each picture; listeners are told the mean PSNR.
         """
         run, active = self.run, self.run.active
         taken = len(rendered.pictures)
@@ -160,7 +162,7 @@ class VisitTraining:
         self._note_influence(rendered)
         run.state.step += 1
         active.done += 1
-        sound, psnr = run.health.end_step(psnrs)
+        sound, psnr = run.health.end_step(errors)
         self.live.count_step(self.batch, taken)
         clock = self.live.density_clock(taken, self.batch, self._visits.room())
         self.live.refine(rendered.infos if sound else (), clock)
@@ -262,19 +264,27 @@ class VisitTraining:
             absgrad=run.density.absgrad,
             weigh=run.density.weighs,
         )
-        if run.density.weighs:
-            pairs = zip(rasters, samples, strict=True)
-            rasters = tuple(weighed(raster, sample.in_front, sample.share) for raster, sample in pairs)
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         run.density.before_backward(infos)
-        light = run.light
-        lights = [None if light is None else light.of(sample.view.index) for sample in samples]
-        drawn = zip(samples, rasters, lights, strict=True)
-        pictures = tuple(sample.picture(raster, transform) for sample, raster, transform in drawn)
+        lights = [None if run.light is None else run.light.of(sample.view.index) for sample in samples]
         uses = [
             Use(sample.view.index, transform, sample.weight / self.batch)
             for sample, transform in zip(samples, lights, strict=True)
             if transform is not None
         ]
-        views = tuple(sample.view for sample in samples)
-        return Rendered(pictures, tuple(raster.transmittance for raster in rasters), infos, uses, views)
+        pictures = self._pictures(samples, rasters, lights)
+        return Rendered(pictures, rasters, infos, uses, tuple(sample.view for sample in samples))
+
+    def _pictures(
+        self, samples: Sequence[Sample], rasters: Sequence[Raster], lights: Sequence[Tensor | None]
+    ) -> tuple[Tensor, ...]:
+        weigh = self.run.density.weighs
+        if all(light is None for light in lights):
+            found = pictures_of(rasters, [sample.frame(weigh) for sample in samples])
+            if found is not None:
+                return found
+        drawn = zip(samples, rasters, lights, strict=True)
+        return tuple(
+            s.picture(weighed(raster, s.in_front, s.share) if weigh else raster, light)
+            for s, raster, light in drawn
+        )

@@ -29,6 +29,8 @@ class TrainingLine(Line):
     """On the number of Gaussians in the scene."""
     budgets: dict[str, int]
     """Limits of what is kept at hand, bytes, by name."""
+    compiled_loss: bool = False
+    """Whether the loss runs in Triton's kernels."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from abcd_ns.engine.events import (
     WorkerSeen,
     WorkersSeen,
 )
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
@@ -72,7 +73,7 @@ class RunLog:
         budgets = {name: limit for name, (_, limit) in self._meters.items()}
         limit, blocks = coordinator.config.density.limit, coordinator.scene.tree.num_blocks
         scene = {"blocks": blocks, "gaussians": coordinator.count(), "limit": limit}
-        self._note("training", schema=SCHEMA, **scene, budgets=budgets)
+        self._note("training", schema=SCHEMA, **scene, budgets=budgets, compiled_loss=fused.photometric.runs)
         self._flush()
 
     def __call__(self, event: Event) -> None:

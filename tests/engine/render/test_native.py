@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 
+from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.kernels import find_compiler, library, native
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
 from abcd_ns.engine.render import CutShot, Shot, TorchRasterizer, ZWindow
@@ -267,3 +268,18 @@ def test_float64_is_drawn_by_torch():
 def test_a_tile_side_of_its_own_is_drawn_by_torch(own_library):
     TorchRasterizer(tile_side=8)(SCENE, VIEW, sh_degree=0)
     assert not own_library.exists()
+
+
+@needs_compiler
+def test_adam_is_that_of_torch():
+    values = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    ours, theirs = (values.clone().requires_grad_() for _ in range(2))
+    options = {"lr": 0.01, "betas": (0.9, 0.99), "eps": 1e-15}
+    pairs = ((ours, Adam([ours], fused=True, **options)), (theirs, torch.optim.Adam([theirs], **options)))
+    for step in range(5):
+        for value, optimizer in pairs:
+            value.grad = torch.sin(value.detach() * (step + 1))
+            optimizer.step()
+    assert off(ours.detach(), theirs.detach()) < 1e-5
+    for name in ("exp_avg", "exp_avg_sq", "step"):
+        assert off(pairs[0][1].state[ours][name], pairs[1][1].state[theirs][name]) < 1e-5

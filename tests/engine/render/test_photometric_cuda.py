@@ -1,4 +1,4 @@
-"""The loss' Triton kernels, run by Triton's interpreter where there is no GPU."""
+"""The Triton kernels, run by Triton's interpreter where there is no GPU, against their torch twins."""
 
 import os
 import subprocess
@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("triton")
 
-COMPARE = """
+LOSS = """
 import torch
 from abcd_ns.engine.kernels.photometric import photometric_sums
 from abcd_ns.engine.render.cuda.photometric import photometric
@@ -24,11 +24,98 @@ for height, width in ((11, 11), (11, 40), (29, 12), (33, 61)):
     torch.testing.assert_close(loss.double(), sums @ weights.double(), rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(gradient.double(), expected.permute(1, 2, 0), rtol=1e-4, atol=1e-5)
 """
+STATISTICS = """
+import torch
+from abcd_ns.engine.render.cuda.statistics import statistics
+from tests.reference import triton_stand_ins as twins
+
+generator = torch.Generator().manual_seed(0)
+for views, n in ((1, 1), (1, 300), (4, 257)):
+    gradient = torch.randn(views, n, 2, generator=generator)
+    radii = torch.randint(0, 3, (views, n), generator=generator, dtype=torch.int32)
+    weights = torch.rand(views, n, generator=generator)
+    sums = list(torch.rand(4, n, generator=generator))
+    gradient[0, ::7], gradient[-1, ::11], weights[0, ::5] = torch.nan, torch.inf, torch.nan
+    given = gradient, radii, weights, sums, (320.0, 240.0), views / 3
+    torch.testing.assert_close(statistics(*given), twins.statistics(*given), rtol=1e-6, atol=1e-5)
+"""
+BETWEEN = """
+import torch
+from abcd_ns.engine.render.cuda.between import between
+from abcd_ns.engine.render.cuda.frame import Frame
+from abcd_ns.engine.types import Layer
+from tests.reference import triton_stand_ins as twins
+
+generator = torch.Generator().manual_seed(0)
+def values(*shape):
+    return torch.rand(*shape, generator=generator)
+
+def layer(height, width):  # as a visit keeps them: channels of one tensor, a part of a larger one
+    pixels = values(height + 3, width + 5, 4).half()[2 : height + 2, 1 : width + 1]
+    return Layer(pixels[..., :3], pixels[..., 3])
+
+features, alphas = 2 * values(3, 32, 48, 4) - 0.5, values(3, 32, 48, 1)
+features[0, 5, 9, 1] = torch.nan
+parts = (slice(3, 28), slice(0, 41)), (slice(0, 32), slice(15, 48)), (slice(0, 1), slice(0, 1))
+for layers, counts in ((False, 0.0), (True, 1.0), (True, 2.5)):
+    shown = []
+    for rows, columns in parts:
+        size = rows.stop - rows.start, columns.stop - columns.start
+        pair = (layer(*size), layer(*size)) if layers else (None, None)
+        shown.append(((rows, columns), Frame(*pair, values(3), counts)))
+    found, expected = between(features, alphas, shown), twins.between(features, alphas, shown)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
+    upstream = [values(*picture.shape) - 0.5 for picture in found]
+    found, expected = (each(features, alphas, shown, upstream) for each in (between, twins.between))
+    assert bool(expected[0][..., 3].any()) == (counts > 0)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6, equal_nan=True)
+"""
+GAUSSIANS = """
+import torch
+from abcd_ns.engine.render.cuda.statistics import shade, skips
+from tests.reference import triton_stand_ins as twins
+
+generator = torch.Generator().manual_seed(0)
+for cameras, n in ((1, 1), (3, 257)):
+    colors = torch.randn(cameras, n, 3, generator=generator)
+    depths = torch.rand(cameras, n, generator=generator)
+    colors[0, 0, 0] = -0.5
+    for given in (depths, None):
+        for found, expected in zip(shade(colors, given), twins.shade(colors, given), strict=True):
+            assert torch.equal(found, expected)
+for wrong in (None, torch.nan, torch.inf):
+    norms = list(torch.rand(5, generator=generator))
+    if wrong is not None:
+        norms[2] = torch.tensor(wrong)
+    count = torch.tensor(7.5)
+    assert float(skips(count, norms)) == (wrong is not None)
+    assert float(count) == 7.5 + (wrong is None)
+"""
+WINDOWS = """
+import torch
+from abcd_ns.engine.render.cuda.windowed import windowed
+from tests.reference import triton_stand_ins as twins
+
+generator = torch.Generator().manual_seed(0)
+cameras, tiles, bits = 3, 11, 4
+for count, always in ((0, 0), (1, 0), (700, 0), (700, 150)):
+    camera = torch.randint(cameras, (count,), generator=generator)
+    tile = torch.randint(tiles, (count,), generator=generator)
+    z = (torch.rand(count, generator=generator) + 0.5).view(torch.int32).long()
+    keys = ((camera << bits | tile) << 32 | z).sort().values
+    owners = torch.randint(300, (count,), generator=generator, dtype=torch.int32)
+    near = torch.rand(cameras * tiles, generator=generator)
+    sheet = bits, tiles, (2 << bits | 10) << 32 | 0x7FFFFFFF
+    given = near, near + 0.6, keys, owners, always, *sheet
+    found, expected = windowed(*given), twins.windowed(*given)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+"""
 
 
-def test_they_are_the_kernels_of_the_cpu():
+@pytest.mark.parametrize("compare", [LOSS, STATISTICS, BETWEEN, GAUSSIANS, WINDOWS])
+def test_they_are_their_twins(compare):
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
     done = subprocess.run(
-        [sys.executable, "-c", COMPARE], env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", compare], env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr

@@ -5,9 +5,8 @@ Importing this module imports gsplat, which compiles its CUDA extension at the f
 
 import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import gsplat
 import torch
@@ -15,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
+from abcd_ns.engine.render.cuda.drawn import Drawn
 from abcd_ns.engine.render.cuda.kinds import KINDS
 from abcd_ns.engine.render.cuda.pairs import TILE, Drawing, Packed
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_screen, project
@@ -100,10 +100,12 @@ class GsplatRasterizer(Rasterizer):
         for few in _a_few(shots, [(shot.view, shot.crop) for shot in shots], gaussians):
             views, crops = [shot.view for shot in few], [shot.crop for shot in few]
             seen = self._seen(gaussians, views, sh_degree, antialiased)
-            drawing = Drawing.of(self._kind, Packed.of(seen), crops, self._cameras, windowed=True)
+            drawing = Drawing.of(
+                self._kind, Packed.of(seen, self._cameras), crops, self._cameras, windowed=True
+            )
             members = drawing.members(drawing.inside([shot.inside for shot in few]))
             fronts, backs = [shot.front for shot in few], [shot.back for shot in few]
-            layers = (drawing.only(drawing.inside(windows)).layers() for windows in (fronts, backs))
+            layers = (drawing.windowed(windows).layers() for windows in (fronts, backs))
             for k, (front, back, which) in enumerate(zip(*layers, members, strict=True)):
                 yield Cut(front, back, seen.splats(k, which), which)
 
@@ -120,7 +122,7 @@ class GsplatRasterizer(Rasterizer):
         for few in _a_few(seen, seen, gaussians):
             views, crops = zip(*few, strict=True)
             projected = self._seen(gaussians, views, 0, antialiased)
-            drawing = Drawing.of(self._kind, Packed.of(projected), crops, self._cameras)
+            drawing = Drawing.of(self._kind, Packed.of(projected, self._cameras), crops, self._cameras)
             yield from drawing.windows(visible)
 
     def _seen(
@@ -145,27 +147,20 @@ class GsplatRasterizer(Rasterizer):
         ]
         if len(gaussians) == 0 and not frozen:
             return _nothing(gaussians, shots)
-        own = project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased)
-        weights = torch.zeros_like(own.depths, requires_grad=weigh)
-        everyone = Packed.of(_showing(own, weights) if weigh else own)
-        if frozen:
-            others = Packed.of_splats(frozen)
-            others = _showing(others, torch.zeros_like(others.depths)) if weigh else others
-            everyone = everyone.and_then(others)
+        own = project(self._kind, gaussians, views, self._cameras, sh_degree, antialiased, weigh)
+        everyone = Packed.of(own, self._cameras, frozen, weigh)
         windows = [shot.z_window for shot in shots]
         windowed = any(window is not None for window in windows)
         drawing = Drawing.of(self._kind, everyone, crops, self._cameras, windowed=windowed)
         if windowed:
             always = 0 if shots[0].frozen is None else own.radii.numel()
-            drawing = drawing.only(drawing.inside(windows, always))
+            drawing = drawing.windowed(windows, always)
         absgrad = absgrad and self.primitive.has_absgrad
         if absgrad and own.means2d.requires_grad:
             _forward_absgrad(own.means2d, drawing.means2d)
-        info = _info(own, views[0]) | ({"weights": weights} if weigh else {})
-        return [
-            Raster(features[..., :3], transmittance, features[..., 3], info)
-            for features, transmittance in drawing.draw(absgrad)
-        ]
+        info = _info(own, views[0]) | ({"weights": own.weights} if weigh else {})
+        sheet = drawing.rasterized(absgrad)
+        return [Drawn(*sheet, k, part, info) for k, part in enumerate(drawing.parts)]
 
 
 def _a_few(
@@ -175,14 +170,6 @@ def _a_few(
     crops = [crop for _, crop in seen]
     limits = {"gaussians": len(gaussians), "splats": DEVICE_SPLATS}
     return runs(items, crops, DEVICE_PIXELS, **limits, kinds=kinds, padded=True)
-
-
-Seen = TypeVar("Seen", Projected, Packed)
-
-
-def _showing(seen: Seen, depths: Tensor) -> Seen:
-    """With these in place of the depths that are composited; those that are sorted by stay."""
-    return replace(seen, features=torch.cat((seen.features[..., :3], depths[..., None]), dim=-1))
 
 
 def _alike(kinds: Sequence[object]) -> list[list[int]]:
@@ -223,7 +210,7 @@ def _nothing(gaussians: Gaussians, shots: Sequence[Shot]) -> list[Raster]:
     )
     features = means.new_zeros((len(shots), 0, 4))
     centers = means[..., :2]
-    empty = Projected(opacities.int(), centers, opacities, means, opacities, features, centers)
+    empty = Projected(opacities.int(), centers, opacities, means, opacities, features, centers, opacities)
     zero, info = empty.centers.sum(), _info(empty, shots[0].view)
     colors = [zero.expand(shot.crop.height, shot.crop.width, 3) for shot in shots]
     return [Raster(color, 1.0 - color[..., 0], color[..., 0], info) for color in colors]

@@ -6,8 +6,8 @@ what is left out goes to the end of the list, to a tile that is not drawn.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +15,7 @@ from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles
 from jaxtyping import Bool, Float, Int, Int64, Shaped
 from torch import Tensor
 
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected
 from abcd_ns.engine.render.projection import Splats
@@ -44,26 +45,27 @@ class Packed:
         return len(self.radii)
 
     @staticmethod
-    def of(projected: Projected) -> "Packed":
-        """Camera by camera."""
-        cameras, n = projected.radii.shape
-        numbers = torch.arange(cameras, device=projected.radii.device)[:, None].expand(-1, n)
-        names = (field.name for field in fields(Packed) if field.name != "cameras")
-        return Packed(numbers.flatten(), *(getattr(projected, name).flatten(0, 1) for name in names))
+    def of(
+        own: Projected, cameras: Cameras, frozen: Sequence[tuple[int, Splats]] = (), weigh: bool = False
+    ) -> "Packed":
+        """Camera by camera; then what is frozen, as (camera, what it sees) pairs.
 
-    @staticmethod
-    def of_splats(splats: Sequence[tuple[int, Splats]]) -> "Packed":
-        """(camera, what it sees) pairs."""
-        numbers = [s.planes.new_full((len(s),), camera, dtype=torch.int64) for camera, s in splats]
-        each = Splats(torch.cat([s.planes for _, s in splats], dim=1))
-        features = torch.cat((each.colors, each.depths[:, None]), dim=-1)
-        values = (each.radii, each.means2d, each.depths, each.shapes, each.opacities, features)
-        return Packed(torch.cat(numbers), *(value.contiguous() for value in values))
-
-    def and_then(self, others: "Packed") -> "Packed":
-        """These, and others after them."""
-        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
-        return Packed(*(torch.cat(pair) for pair in pairs))
+        Args:
+            weigh: as `own` was projected, with zeros for the depths that are composited.
+        """
+        count, n = own.radii.shape
+        numbers = cameras.numbers(count, n, own.radii.device)
+        names = ("radii", "means2d", "depths", "shapes", "opacities", "features")
+        values = [getattr(own, name).flatten(0, 1) for name in names]
+        if not frozen:
+            return Packed(numbers, *values)
+        firsts = numbers.view(count, n)[:, :1] if n else torch.arange(count, device=numbers.device)[:, None]
+        each = Splats(torch.cat([splats.planes for _, splats in frozen], dim=1))
+        last = F.pad(each.colors, (0, 1)) if weigh else torch.cat((each.colors, each.depths[:, None]), dim=-1)
+        theirs = (each.radii, each.means2d, each.depths, each.shapes, each.opacities, last)
+        owners = [firsts[camera].expand(len(splats)) for camera, splats in frozen]
+        pairs = zip(values, theirs, strict=True)
+        return Packed(torch.cat((numbers, *owners)), *(torch.cat(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Sheet:
         return self.shape[2] * TILE, (self.shape[1] - self.spare) * TILE
 
     @property
-    def _bits(self) -> int:
+    def bits(self) -> int:
         """Of a tile's number in a key, as gsplat has them."""
         return (self.shape[1] * self.shape[2]).bit_length()
 
@@ -114,23 +116,20 @@ class Sheet:
     def last_key(self) -> int:
         """The largest: in the last tile of all."""
         cameras, rows, cols = self.shape
-        return ((cameras - 1) << self._bits | rows * cols - 1) << 32 | LAST_DEPTH
+        return ((cameras - 1) << self.bits | rows * cols - 1) << 32 | LAST_DEPTH
 
     def tile(self, keys: Int64[Tensor, "q"]) -> Int64[Tensor, "q"]:
         """Number of each key's tile among those of all cameras."""
         tile = keys >> 32
         if len(self.crops) == 1:
             return tile
-        return (tile >> self._bits) * (self.shape[1] * self.shape[2]) + (tile & (1 << self._bits) - 1)
+        return (tile >> self.bits) * (self.shape[1] * self.shape[2]) + (tile & (1 << self.bits) - 1)
 
     def drawn(self, device: torch.device) -> Bool[Tensor, "c rows cols"] | None:
         """Which tiles are; None for all."""
         if all((grid.rows, grid.cols) == self.shape[1:] for grid in self.grids):
             return None
-        drawn = torch.zeros(self.shape, dtype=torch.bool, device=device)
-        for each, grid in zip(drawn, self.grids, strict=True):
-            each[: grid.rows, : grid.cols].fill_(True)
-        return drawn
+        return torch.stack([_mask(grid.rows, grid.cols, *self.shape[1:], device) for grid in self.grids])
 
     def pixels(self, device: torch.device) -> Int64[Tensor, "c t"]:
         """How many of its crop's each tile holds."""
@@ -146,6 +145,15 @@ class Sheet:
         """Values by tile of a grid, by tile of the sheet; 0 where the grid has none."""
         beyond = (0, self.shape[2] - grid.cols, 0, self.shape[1] - grid.rows)
         return F.pad(values.unflatten(-1, (grid.rows, grid.cols)), beyond).flatten(-2)
+
+
+@lru_cache(maxsize=1024)
+def _mask(rows: int, cols: int, of_rows: int, of_cols: int, device: torch.device) -> Bool[Tensor, "r c"]:
+    """True in the upper left corner."""
+    with torch.inference_mode(False):  # they outlive this call
+        mask = torch.zeros((of_rows, of_cols), dtype=torch.bool, device=device)
+        mask[:rows, :cols].fill_(True)
+        return mask
 
 
 @dataclass(frozen=True)
@@ -218,6 +226,16 @@ class Drawing:
         inside = (z >= near.index_select(0, tile)) & (z < far.index_select(0, tile))
         return inside | (self.owners < always) if always else inside
 
+    def windowed(self, windows: Sequence[ZWindow | None], always: int = 0) -> "Drawing":
+        """Only what `inside` finds."""
+        near, far = self.sheet.spread(windows, self.splats.depths)
+        _, rows, cols = self.sheet.shape
+        sheet = self.sheet.bits, rows * cols, self.sheet.last_key
+        found = fused.windowed(near, far, self.keys, self.owners, always, *sheet)
+        if found is None:
+            return self.only(self.inside(windows, always))
+        return replace(self, keys=found[0], owners=found[1])
+
     def only(self, keep: Bool[Tensor, "q"]) -> "Drawing":
         """Without some pairs. The others move up, in order, and the end of the lists belongs to the last
         tile, a spare one: the host need not know how many there are.
@@ -238,22 +256,21 @@ class Drawing:
         counts = of_cameras.sum(1).tolist()
         return [own[:count] for own, count in zip(ids, counts, strict=True)]
 
-    def draw(self, absgrad: bool = False) -> list[tuple[Float[Tensor, "h w 4"], Float[Tensor, "h w"]]]:
-        """(features, transmittance) of each crop."""
+    def rasterized(self, absgrad: bool = False) -> tuple[Float[Tensor, "c h w 4"], Float[Tensor, "c h w 1"]]:
+        """Features and alphas of the whole sheet."""
         splats = self.splats
-        features, alphas = self._rasterize(
+        return self._rasterize(
             self.means2d, self.shapes, splats.features, splats.opacities, self.owners, absgrad
         )
-        parts = self._parts()
-        return [
-            (feature[part], 1.0 - alpha[part][..., 0])
-            for feature, alpha, part in zip(features.unbind(), alphas.unbind(), parts, strict=True)
-        ]
 
     def layers(self) -> list[Layer]:
         """What each crop looks like."""
         # Its own memory: else each would keep that of all that were drawn with it.
-        return [Layer(features[..., :3].contiguous(), seen) for features, seen in self.draw()]
+        features, alphas = self.rasterized()
+        return [
+            Layer(features[k][part][..., :3].contiguous(), 1.0 - alphas[k][part][..., 0])
+            for k, part in enumerate(self.parts)
+        ]
 
     def windows(self, visible: float) -> list[ZWindow]:
         """Where the splats show in each crop; see z_window.showing."""
@@ -280,7 +297,7 @@ class Drawing:
         each = torch.arange(count, device=dark.device, dtype=self.owners.dtype)
         with torch.enable_grad():
             picture, _ = self._rasterize(means2d, shapes, dark, opacities, each)
-            shown = [one[part].sum() for one, part in zip(picture, self._parts(), strict=True)]
+            shown = [one[part].sum() for one, part in zip(picture, self.parts, strict=True)]
             (found,) = torch.autograd.grad(torch.stack(shown).sum(), dark)
         return found[:, 0]
 
@@ -309,7 +326,8 @@ class Drawing:
             absgrad=absgrad,
         )
 
-    def _parts(self) -> list[tuple[slice, slice]]:
+    @property
+    def parts(self) -> list[tuple[slice, slice]]:
         """Rows and columns of each crop in what is drawn of it."""
         return [
             crop.within(tiled).slices for crop, tiled in zip(self.sheet.crops, self.sheet.tiled, strict=True)

@@ -22,9 +22,11 @@ SIZES = ("height", "width")
 
 @triton.jit(do_not_specialize=SIZES)
 def _moments_along_rows(
-    x_ptr, y_ptr, taps_ptr, out_ptr, height, width, WINDOW: tl.constexpr, BLOCK: tl.constexpr
+    x_ptr, y_ptr, taps_ptr, out_ptr, sum_ptr, height, width, WINDOW: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """[3 h w-10] of x, y, x^2, y^2 and x y each, blurred along rows; pictures are [h w 3]."""
+    """[3 h w-10] of x, y, x^2, y^2 and x y each, blurred along rows; pictures are [h w 3]. The sum, to which
+    the kernels after it add, is set to 0."""
+    tl.store(sum_ptr, 0.0, mask=tl.program_id(0) == 0)
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     columns = width - WINDOW + 1
     count = 3 * height * columns
@@ -148,7 +150,7 @@ def photometric(
     height, width = rendered.shape[:2]
     rendered, photo, taps = rendered.contiguous(), photo.contiguous(), _taps(rendered.device)
     columns, lines = width - REACH, height - REACH
-    loss, gradient = rendered.new_zeros(()), torch.empty_like(rendered)
+    loss, gradient = rendered.new_empty(()), torch.empty_like(rendered)
     moments, by_moment, rows = map(
         rendered.new_empty, ((5, 3, height, columns), (9, lines, columns), (9, lines, width))
     )
@@ -158,7 +160,7 @@ def photometric(
     def over(count: int) -> tuple[int]:
         return (triton.cdiv(count, BLOCK),)
 
-    _moments_along_rows[over(moments[0].numel())](rendered, photo, taps, moments, *size, **options)
+    _moments_along_rows[over(moments[0].numel())](rendered, photo, taps, moments, loss, *size, **options)
     _dissimilarity_along_columns[over(3 * lines * columns)](
         moments, taps, by_moment, loss, by_window, *size, C1=C1, C2=C2, **options
     )

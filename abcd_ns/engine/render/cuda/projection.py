@@ -3,12 +3,15 @@
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from gsplat.cuda._wrapper import spherical_harmonics
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind, OnScreen
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -41,6 +44,16 @@ class Cameras:
     def __init__(self) -> None:
         self._views: dict[tuple[int, int], View] = {}
         self._poses, self._corners = Kept(), Kept()
+        self._numbers: tuple[Any, Tensor] | None = None
+
+    def numbers(self, cameras: int, n: int, device: torch.device) -> Int64[Tensor, "m"]:
+        """0 to `cameras` less 1, n times each; the last are kept."""
+        key = cameras, n, device
+        if self._numbers is None or self._numbers[0] != key:
+            with torch.inference_mode(False):  # they outlive this call
+                each = torch.arange(cameras, device=device)[:, None].expand(-1, n)
+                self._numbers = key, each.reshape(-1).contiguous()
+        return self._numbers[1]
 
     def poses(
         self, views: Sequence[View], like: Tensor
@@ -54,13 +67,13 @@ class Cameras:
             packed = _rows(views).to(like)
         else:
             keys = [(id(view.viewmat), id(view.K), *place) for view in views]
-            packed = torch.stack(self._poses.get(keys, partial(self._new_poses, views, like)))
+            packed = _stacked(self._poses.get(keys, partial(self._new_poses, views, like)))
         return packed[:, :16].view(-1, 4, 4), packed[:, 16:25].view(-1, 3, 3), packed[:, 25:]
 
     def corners(self, crops: Sequence[Crop], like: Tensor) -> Float[Tensor, "c 2"]:
         """(x, y) of upper left corners; written there by the device, so nothing is copied."""
         keys = [(crop.x, crop.y, like.device, like.dtype) for crop in crops]
-        return torch.stack(self._corners.get(keys, partial(_new_corners, crops, like)))
+        return _stacked(self._corners.get(keys, partial(_new_corners, crops, like)))
 
     def _new_poses(self, views: Sequence[View], like: Tensor, new: list[int]) -> Sequence[Tensor]:
         for k in new:  # holds on to tensors by whose identity views are known
@@ -94,13 +107,15 @@ class Projected:
     """Colour, then depth: what is composited."""
     centers: Float[Tensor, "c n 2"]
     """Where their middles are; by whose gradient they grow."""
+    weights: Float[Tensor, "c n"]
+    """What gets the gradient of the depths that are composited."""
 
     @staticmethod
     def nothing(cameras: int, rows: int, like: Tensor) -> "Projected":
         """No Gaussian, of which Splats would have so many rows."""
         centers, features, shapes = (like.new_zeros((cameras, 0, k)) for k in (2, 4, rows - 11))
         depths = features[..., 3]
-        return Projected(depths.int(), centers, depths, shapes, depths, features, centers)
+        return Projected(depths.int(), centers, depths, shapes, depths, features, centers, depths)
 
     def splats(self, camera: int, which: Int[Tensor, "k"] | None = None) -> Splats:
         """As one of the cameras sees them, or these of them."""
@@ -129,23 +144,85 @@ def project(
     cameras: Cameras,
     sh_degree: int,
     antialiased: bool,
+    weigh: bool = False,
 ) -> Projected:
     """The first half of gsplat's `rasterization(packed=False)`, for the full images.
 
     Args:
         views: of one size and near plane.
+        weigh: give zeros for the depths that are composited.
     """
     placed, eyes = place_on_screen(kind, gaussians, views, cameras, antialiased)
     radii, means2d, depths, shapes, centers, compensations = placed
-    opacities = gaussians.opacities[:, 0].sigmoid().expand(len(views), -1)
+    opacities = gaussians.opacities.flatten().sigmoid()
+    opacities = opacities[None] if len(views) == 1 else opacities.expand(len(views), -1)
     if compensations is not None:
         opacities = opacities * compensations
-    used = (sh_degree + 1) ** 2
-    rest = gaussians.features_rest[:, : used - 1]
-    coefficients = torch.cat((gaussians.features_dc[:, None], rest), dim=1)
-    # Camera by camera: for all at once gsplat would copy the coefficients, most of a Gaussian, for each.
-    directions = (gaussians.means - eyes[:, None]).unbind()
-    seen = zip(directions, (radii > 0).unbind(), strict=True)
-    colors = torch.stack([spherical_harmonics(sh_degree, d, coefficients, masks=m) for d, m in seen])
-    features = torch.cat((torch.clamp_min(colors + 0.5, 0.0), depths[..., None]), dim=-1)
-    return Projected(radii, means2d, depths, shapes, opacities, features, centers)
+    weights = depths.detach().requires_grad_() if weigh else depths
+    coefficients = gaussians.features_dc, gaussians.features_rest
+    features = _Features.apply(gaussians.means, eyes, *coefficients, weights, radii, sh_degree, weigh)
+    return Projected(radii, means2d, depths, shapes, opacities, features, centers, weights)
+
+
+class _Features(torch.autograd.Function):
+    """Colours by spherical harmonics, 0 or more, and another number, side by side; gsplat's kernels apart, a
+    handful of operations, of which autograd would make twice as many.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Float[Tensor, "n 3"],
+        eyes: Float[Tensor, "c 3"],
+        features_dc: Float[Tensor, "n 3"],
+        features_rest: Float[Tensor, "n k 3"],
+        last: Float[Tensor, "c n"],
+        radii: Int[Tensor, "c n"],
+        sh_degree: int,
+        weigh: bool,
+    ) -> Float[Tensor, "c n 4"]:
+        # All, whatever the degree: gsplat's kernels read those of it alone.
+        coefficients = torch.cat((features_dc[:, None], features_rest), dim=1)
+        *directions, coefficients = leaves = [*(means - eyes[:, None]).unbind(), coefficients]
+        ctx.graph = None
+        if any(ctx.needs_input_grad):
+            leaves = [value.requires_grad_() for value in leaves]
+        # Camera by camera: for all at once gsplat would copy the coefficients, most of a Gaussian, for each.
+        with torch.set_grad_enabled(any(ctx.needs_input_grad)):
+            seen = zip(directions, (radii > 0).unbind(), strict=True)
+            colors = [spherical_harmonics(sh_degree, d, coefficients, masks=m) for d, m in seen]
+        ctx.graph = leaves, colors
+        features, dark = _shaded(_stacked([color.detach() for color in colors]), None if weigh else last)
+        ctx.save_for_backward(dark)
+        return features
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Float[Tensor, "c n 4"]) -> tuple[Tensor | None, ...]:
+        (dark,), (leaves, colors) = ctx.saved_tensors, ctx.graph
+        ctx.graph = None  # else it would last as long as what was drawn
+        upstream = grad[..., :3].masked_fill(dark, 0.0)
+        *directions, coefficients = torch.autograd.grad(
+            colors, leaves, upstream.unbind(), materialize_grads=True
+        )
+        directions = _stacked(directions)
+        by_means = directions[0] if len(directions) == 1 else directions.sum(dim=0)
+        by_eyes = -directions.sum(dim=1) if ctx.needs_input_grad[1] else None
+        return by_means, by_eyes, coefficients[:, 0], coefficients[:, 1:], grad[..., 3], None, None, None
+
+
+def _shaded(
+    colors: Float[Tensor, "c n 3"], depths: Float[Tensor, "c n"] | None
+) -> tuple[Float[Tensor, "c n 4"], Bool[Tensor, "c n 3"]]:
+    """See `shade`."""
+    found = fused.shade(colors, depths)
+    if found is not None:
+        return found
+    lighter = colors + 0.5
+    last = torch.zeros_like(colors[..., 0]) if depths is None else depths
+    return torch.cat((lighter.clamp_min(0.0), last[..., None]), dim=-1), lighter < 0
+
+
+def _stacked(values: Sequence[Tensor]) -> Tensor:
+    """`torch.stack`, which copies nothing where there is one."""
+    return values[0][None] if len(values) == 1 else torch.stack(tuple(values))

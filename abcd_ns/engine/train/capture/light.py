@@ -14,7 +14,7 @@ from torch import Tensor
 
 from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.train.capture import bilateral_grid
-from abcd_ns.engine.transfer import Download, upload
+from abcd_ns.engine.transfer import Download, finest, upload
 from abcd_ns.engine.types import Crop, View
 from abcd_ns.errors import UserError
 
@@ -73,7 +73,7 @@ class Light:
         # Less the identity and what they have in common, which is `_sum` by the number of views: no step
         # needs to touch more than its own.
         self._changes = torch.zeros((len(self._rows), *shape), dtype=torch.float32, device=self._home)
-        self._sum = torch.zeros(shape, dtype=torch.float64, device=self._home)
+        self._sum = torch.zeros(shape, dtype=finest(self._home), device=self._home)
         self._first, self._second = (torch.zeros_like(self._changes) for _ in BETAS)
         self._uses = torch.zeros(len(self._rows), device=self._home)
         self._stepped: set[int] = set()
@@ -129,7 +129,7 @@ class Light:
         before = self._changes[places]
         after = before - damping * self._rate / (1 + uses / SETTLES) * first / (second.sqrt() + 1e-15)
         self._changes[places] = after
-        self._sum += (after.double() - before.double()).sum(dim=0)
+        self._sum += (after.to(self._sum) - before.to(self._sum)).sum(dim=0)
 
     # -- at rest -------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from gsplat.strategy import ops as gsplat_ops
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
+from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.clock import DensityClock
@@ -25,6 +26,7 @@ from abcd_ns.engine.train.density.relocation import binomials, compute_relocatio
 from abcd_ns.engine.train.density.shedding import (
     FAINT,
     LAST,
+    WEIGHED,
     are_weighed,
     fills,
     haze,
@@ -128,7 +130,7 @@ class DensityControl:
     def before_backward(self, infos: Infos) -> None:
         """Keep the gradient of the projected means, by which the default strategy judges."""
         for info in infos:
-            if self.config.strategy == "default" and info["means2d"].requires_grad:
+            if self.config.strategy == "default" and info["means2d"].requires_grad and not self.absgrad:
                 info["means2d"].retain_grad()
 
     def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
@@ -164,7 +166,7 @@ class DensityControl:
         Args:
             infos: of the step's drawings, after backward.
         """
-        return self.is_due(clock) and (self.config.strategy != "default" or bool(_with_gradient(infos)))
+        return self.is_due(clock) and (self.config.strategy != "default" or bool(self._with_gradient(infos)))
 
     def resets(self, clock: DensityClock) -> bool:
         """Whether this step resets opacities (`default` strategy); that needs no gradients. Among others
@@ -184,20 +186,47 @@ class DensityControl:
         """
         if self.config.strategy != "default":
             return {}
-        with_gradient = _with_gradient(infos)
+        with_gradient = self._with_gradient(infos)
         if not with_gradient or len(means) == 0:
             return {}
         drawings = [each for info in with_gradient for each in zip(*self._norms(info), strict=True)]
         norms, seen = (reduce(torch.add, parts) for parts in zip(*drawings, strict=True))
         return {**dict(zip(GRADIENTS, (norms, seen), strict=True)), **weigh(with_gradient, views)}
 
+    def _gathered(
+        self, growth: dict[str, Tensor], means: Tensor, infos: Infos, views: int
+    ) -> dict[str, Tensor]:
+        """Statistics with those of more drawings, see `count`; on CUDA in one kernel for each of `infos`."""
+        names = (*GRADIENTS, *WEIGHED)
+        if not self.weighs or any("weights" not in i or i["weights"].grad is None for i in infos):
+            return added(growth, self.count(means, infos, views))
+        for info in infos:
+            sums = [growth[name] if name in growth else torch.zeros_like(means[:, 0]) for name in names]
+            weights = info["weights"].grad
+            drawn = self._gradient(info), info["radii"], weights
+            found = fused.statistics(*drawn, sums, self._scale(info), len(weights) / views)
+            if found is None:
+                return added(growth, self.count(means, infos, views))
+            growth = {**growth, **dict(zip(names, found, strict=True))}
+        return growth
+
+    def _gradient(self, info: dict[str, Any]) -> Tensor | None:
+        means2d = info["means2d"]
+        return getattr(means2d, "absgrad", None) if self.absgrad else means2d.grad
+
+    def _with_gradient(self, infos: Infos) -> Infos:
+        return tuple(info for info in infos if self._gradient(info) is not None)
+
+    @staticmethod
+    def _scale(info: dict[str, Any]) -> tuple[float, float]:
+        """Of a gradient, along both axes: from pixels to halves of the image, for the sum of drawings."""
+        return tuple(info[side] / 2.0 * info["n_cameras"] for side in ("width", "height"))
+
     def _norms(self, info: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """What DefaultStrategy._update_state adds up: norms of the gradients in each view, and 1 where there
         is one, [v, n]. It picks rows, whose number the host has to wait for; here the others are 0.
         """
-        means2d = info["means2d"]
-        gradient = means2d.absgrad if self.absgrad else means2d.grad
-        width, height = (info[side] / 2.0 * info["n_cameras"] for side in ("width", "height"))
+        gradient, (width, height) = self._gradient(info), self._scale(info)
         norms = torch.stack((gradient[..., 0] * width, gradient[..., 1] * height), dim=-1).norm(dim=-1)
         # An accelerator may have skipped the step that these are of.
         seen = (info["radii"] > 0) & norms.isfinite()
@@ -223,8 +252,8 @@ class DensityControl:
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth
         if self.config.strategy == "default":
-            infos = _with_gradient(infos)
-            growth = added(growth, self.count(params["means"], infos, clock.views))
+            infos = self._with_gradient(infos)
+            growth = self._gathered(growth, params["means"], infos, clock.views)
             if not (self.refines(clock, infos) or self.resets(clock)):
                 return growth
         device = params["means"].device
@@ -300,10 +329,6 @@ class DensityControl:
         strategy.step_post_backward(
             params, optimizers, {"binoms": self._binomials}, step, {}, lr=learning_rate
         )
-
-
-def _with_gradient(infos: Infos) -> Infos:
-    return tuple(info for info in infos if info["means2d"].grad is not None)
 
 
 def added(growth: Mapping[str, Tensor], more: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -9,7 +9,6 @@ remain take their place, and each step costs less. Nor do those grow that could 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -60,7 +59,8 @@ def weighed(raster: Raster, in_front: Float[Tensor, "h w"] | None, share: float)
         share: of the pixels that might have been drawn, those that are.
     """
     counts = torch.ones_like(raster.depth) if in_front is None else in_front.to(raster.depth)
-    return replace(raster, color=_Weigh.apply(raster.color, raster.depth, counts.detach() / share))
+    color = _Weigh.apply(raster.color, raster.depth, counts.detach() / share)
+    return Raster(color, raster.transmittance, raster.depth, raster.info)
 
 
 def weigh(infos: Sequence[Mapping[str, Any]], views: int) -> dict[str, Tensor]:

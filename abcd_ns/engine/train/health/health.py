@@ -17,6 +17,7 @@ from torch import Tensor
 from abcd_ns.engine.events import Announcer, Mended, VisitUndone
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
+from abcd_ns.engine.render.loss import decibels
 from abcd_ns.engine.store.scene import VisitScene
 from abcd_ns.engine.store.settle import state_for_visit, with_mail
 from abcd_ns.engine.store.special_blocks import WHOLE
@@ -35,6 +36,8 @@ from abcd_ns.engine.train.run_state import ActiveVisit
 from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Gaussians, View
 
+LATE_AFTER = 16
+"""Steps without a fault after which an accelerator's gradients are looked at a step late, without a wait."""
 LEAST_DAMPING = 1 / 16
 """Of learning rates, however often a block's visits were undone."""
 
@@ -68,7 +71,7 @@ class Health:
         self._shares: list[Tensor] = []
         self._numbers = StepNumbers(params["means"].device)
         self._guard = StepGuard(optimizers) if self._numbers.are_late else None
-        self._skips, self._psnr = True, math.nan
+        self._clean, self._psnr = LATE_AFTER, math.nan
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
 
@@ -91,7 +94,7 @@ class Health:
         self._active, self._ledger = active, ledger
         self._attached, self._bad, self._shares = self._params["means"], None, []
         self._resumed = active.saved
-        self._skips, self._psnr = True, math.nan
+        self._clean, self._psnr = LATE_AFTER, math.nan
 
     def see(self, share: Float[Tensor, ""]) -> None:
         """Take note of how large a part of a picture the live block was, while none has shown it."""
@@ -101,22 +104,23 @@ class Health:
         """Remember the loss of each view in this step: (view, loss) pairs."""
         self._losses = list(losses) if self.undoes else []
 
-    def end_step(self, psnrs: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
+    def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
         """Call after the optimizers stepped.
 
         Args:
-            psnrs: of what the step drew, dB.
+            errors: the mean squared one of each picture that the step drew.
 
         Returns:
             Whether the step's gradients were all numbers, as far as is known; and the mean PSNR, dB: on an
             accelerator of the step before, NaN in a visit's first.
         """
-        self._send(psnrs)
+        self._send(errors)
         self._read(all_but=int(self._numbers.are_late))
         if self._bad is None:
+            self._clean += 1
             return True, self._psnr
         self.count("gradients", int(self._bad.sum()))
-        self._bad = None
+        self._bad, self._clean = None, 0
         self._mend()
         return False, self._psnr
 
@@ -184,9 +188,11 @@ class Health:
     # -- numbers -------------------------------------------------------------------------------------
 
     def _clean_gradients(self, optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:  # noqa: ARG002
-        if self._guard is not None and self._skips and self._guard.works:
-            self._guard.tell(optimizer)
-            return
+        if self._guard is not None:
+            late = self._clean >= LATE_AFTER and self._guard.works
+            self._guard.tell(optimizer, late)
+            if late:
+                return
         for parameter in optimizer.param_groups[0]["params"]:
             if parameter.grad is None:
                 continue
@@ -240,11 +246,11 @@ class Health:
 
     # -- accounts ------------------------------------------------------------------------------------
 
-    def _send(self, psnrs: Sequence[Float[Tensor, ""]]) -> None:
+    def _send(self, errors: Sequence[Float[Tensor, ""]]) -> None:
         """All that the step tells, as one small tensor."""
         losses, self._losses = self._losses, []
         shares, self._shares = self._shares, []
-        parts = {"losses": [loss for _, loss in losses], "shares": shares, "psnrs": list(psnrs)}
+        parts = {"losses": [loss for _, loss in losses], "shares": shares, "errors": list(errors)}
         if self._guard is not None:
             parts["bad"], self._guard.found = self._guard.found, []
         self._numbers.send([view for view, _ in losses], parts)
@@ -255,12 +261,11 @@ class Health:
             self._note_losses(views, numbers["losses"])
             if self._active is not None and not self._active.shown and numbers["shares"]:
                 self._active.shown = float(torch.tensor(numbers["shares"]).max()) > HIDDEN
-            psnrs = numbers["psnrs"]
+            psnrs = [decibels(error) for error in numbers["errors"]]
             self._psnr = sum(psnrs) / len(psnrs) if psnrs else math.nan
             skipped = int(sum(numbers.get("bad", ())))
-            if skipped and self._skips:  # from now on row by row, so that the others are trained
-                self._skips = False
-                self._guard.stop()
+            if skipped and self._clean >= LATE_AFTER:  # now row by row, so that the others are trained
+                self._clean = 0
                 self._mend()
             self.count("gradients", skipped)
 

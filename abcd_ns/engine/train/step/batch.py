@@ -13,12 +13,13 @@ from torch import Tensor
 from abcd_ns.engine.layers.compositing import composite, sandwich
 from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render import Raster, Shot, ZWindow
+from abcd_ns.engine.render.cuda.frame import Frame
 from abcd_ns.engine.render.loss import photometric_loss, ssim_windows
 from abcd_ns.engine.train.capture.light import Use, lit
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.step.cutouts import random_part
 from abcd_ns.engine.transfer import upload
-from abcd_ns.engine.types import Crop, View
+from abcd_ns.engine.types import Crop, Layer, View
 
 Target = tuple[Float[Tensor, "h w 3"], Tensor | None]
 """What a sample's picture should be, 0..1, and where that counts: [h, w, 1], None for everywhere."""
@@ -87,6 +88,11 @@ class Sample:
             rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
         return (rgb if light is None else lit(rgb, light, self.crop, self.view)).clamp(0, 1)
 
+    def frame(self, weigh: bool) -> Frame:
+        """What the rasterizer's drawing is shown in; with `weigh` as in `weighed`."""
+        front, back = (None, None) if self.layers is None else (self.layers.front, self.layers.back)
+        return Frame(front, back, self.background, weigh / self.share)
+
     @property
     def weight(self) -> float:
         """Of this picture's loss, in expectation, in that of the whole image, by pixels."""
@@ -105,7 +111,7 @@ class Sample:
             ssim_lambda=config.ssim_lambda,
             pixel_loss=config.recipe.pixel_loss,
         )
-        return found / self.share
+        return found if self.share == 1 else found / self.share
 
 
 def _mean_of_squares(pixels: Float[Tensor, "_h _w c"], by: int) -> Float[Tensor, "h w c"]:
@@ -131,13 +137,18 @@ class Rendered:
 
     pictures: tuple[Float[Tensor, "_h _w 3"], ...]
     """Of each sample's crop, background included, 0..1."""
-    transmittances: tuple[Float[Tensor, "_h _w"], ...]
+    rasters: tuple[Raster | Layer, ...]
     """Of the active block and what was sorted in with it."""
     infos: tuple[dict[str, Any], ...]
     lights: Sequence[Use] = ()
     """What the pictures were drawn in."""
     views: Sequence[View] = ()
     """That the pictures are of."""
+
+    @property
+    def transmittances(self) -> tuple[Float[Tensor, "_h _w"], ...]:
+        """Of the rasters."""
+        return tuple(raster.transmittance for raster in self.rasters)
 
 
 def background(config: TrainingConfig, step: int, place: int) -> Float[Tensor, "3"]:
