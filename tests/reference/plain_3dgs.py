@@ -4,6 +4,7 @@ import random
 
 import torch
 
+from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES, rates_of_young
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import photometric_loss
@@ -21,7 +22,7 @@ def train_plain(
     """Train for `steps` on the views in the order that a run of one block takes, and return the result."""
     params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
     adam = {
-        name: torch.optim.Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
+        name: Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
         for name in PARAM_NAMES
     }
     draw, density, growth = TorchRasterizer(), DensityControl(config.density), {}

@@ -18,10 +18,8 @@ from tests.reference import simulated_device
 
 def photometric(rendered: Tensor, photo: Tensor, by_pixel: float, by_window: float) -> tuple[Tensor, Tensor]:
     """The loss, and its gradient by `rendered`."""
-    weights = rendered.new_tensor([by_pixel, by_window])
-    planes = (image.permute(2, 0, 1).contiguous() for image in (rendered, photo))
-    sums, gradient = photometric_sums(*planes, weights)
-    return sums @ weights, gradient.permute(1, 2, 0).contiguous()
+    sums, gradient = photometric_sums(rendered, photo, (by_pixel, by_window))
+    return by_pixel * sums[0] + by_window * sums[1], gradient
 
 
 def statistics(

@@ -24,7 +24,7 @@ class Broken(TorchRasterizer):
     """A torch backend with a fault in one place."""
 
     def __init__(self, fault: str) -> None:
-        super().__init__("never")
+        super().__init__(use_native=False)
         self.name, self.fault = "broken", fault
 
     def project(self, gaussians, view, **options):

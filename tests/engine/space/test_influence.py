@@ -54,7 +54,7 @@ def test_large_views_are_looked_at_in_small_pictures():
 
     views = ring_of_views(2, width=800, height=600)
     found = influence(
-        random_gaussians(20, size=0.2), torch.zeros(20, dtype=torch.int64), views, Watching("never")
+        random_gaussians(20, size=0.2), torch.zeros(20, dtype=torch.int64), views, Watching(use_native=False)
     )
     assert set(sizes) == {(80, 60)}
     full = weights(

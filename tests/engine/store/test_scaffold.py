@@ -169,7 +169,7 @@ def test_density_controls_clock_is_the_runs(tmp_path, views, photos, start, monk
     )
     found = []
 
-    def watch(_control, _params, _optimizers, growth, _infos, clock, _wide):
+    def watch(_control, _params, _optimizers, growth, _infos, clock):
         found.append(clock.progress)
         return growth
 

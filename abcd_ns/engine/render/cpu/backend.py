@@ -103,7 +103,7 @@ class TorchRasterizer(Rasterizer):
         center = slice(self.primitive.center, self.primitive.center + 2)
         takes = planes.requires_grad
         means2d = planes.detach()[:, center].transpose(1, 2).contiguous().requires_grad_(takes)
-        weights = torch.zeros_like(planes[:, DEPTH]).requires_grad_(takes) if weigh else None
+        weights = torch.zeros_like(planes[:, DEPTH]).requires_grad_() if weigh else None
         info = _info(means2d, planes, shots) | ({"weights": weights} if weigh else {})
         target = means2d if absgrad and self.primitive.has_absgrad else None
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]

@@ -160,7 +160,7 @@ def wrong_gradient(lab: Lab) -> Finding:  # noqa: ARG001 - nothing is trained
     """A21: the check at the start, of a sound backend and of one with a wrong gradient."""
     sound = self_check(TorchRasterizer(use_native=False), "cpu")
     try:
-        self_check(WrongGradient("never"), "cpu")
+        self_check(WrongGradient(use_native=False), "cpu")
     except RuntimeError as error:
         said = {"abcd": f'"{str(error).split(", so")[0]}"'}
         return Finding(sound == 0.0, said, {"difference of a sound one": sound})
