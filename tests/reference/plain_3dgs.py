@@ -22,8 +22,7 @@ def train_plain(
     """Train for `steps` on the views in the order that a run of one block takes, and return the result."""
     params = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
     adam = {
-        name: Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True)
-        for name in PARAM_NAMES
+        name: Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True) for name in PARAM_NAMES
     }
     draw, density, growth = TorchRasterizer(), DensityControl(config.density), {}
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):

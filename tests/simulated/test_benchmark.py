@@ -15,7 +15,7 @@ def test_the_benchmark_counts_and_writes(tmp_path, capsys):
     assert (one["blocks"], two["blocks"]) == (1, 2)
     assert one["steps"] == two["steps"] == 4
     for each in (one, two):
-        assert each["launches_per_step"] > 50
+        assert each["launches_per_step"] > 30
         assert each["waits_per_step"] >= each["waits_per_plain_step"] > 0
         assert each["copies_to_host_per_step"] > 0
         assert each["waits_in_isect_tiles_per_step"] == 1

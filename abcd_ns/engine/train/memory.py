@@ -22,7 +22,7 @@ from abcd_ns.units import bytes_in_words
 
 FLOAT = 4
 """Bytes."""
-PROJECTED_FLOATS = 3.6
+PROJECTED_FLOATS = 5.3
 """Of each row of a Gaussian in one view: itself, copies sorted by tile, the gradients of all these."""
 PIXEL_FLOATS = 120
 """Of a pixel of a crop in training: picture, photo, F, B, and the windowed moments of SSIM with gradients."""

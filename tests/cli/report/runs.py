@@ -33,7 +33,9 @@ def line(kind: str, step: int, seconds: float, **fields) -> str:
     """A line of a log; what is not given is made up."""
     values = {"step": step, "seconds": seconds, **fields}
     for entry in dataclasses.fields(KINDS[kind]):
-        values.setdefault(entry.name, {"psnr": 20.0, "held": {}, "block": 0}.get(entry.name, 1))
+        values.setdefault(
+            entry.name, {"psnr": 20.0, "held": {}, "block": 0, "compiled_loss": False}.get(entry.name, 1)
+        )
     return json.dumps({"kind": kind, **values})
 
 

@@ -10,6 +10,7 @@ from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, live_gaussians, nothing_live
 from abcd_ns.engine.render.primitive import SPLATS, SURFELS
 from abcd_ns.engine.train.config import TrainingConfig
+from abcd_ns.engine.train.density import control as control_module
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl, for_primitive
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
@@ -34,12 +35,19 @@ def fake_info(count: int, gradient: float) -> dict:
     return {"means2d": means2d, "radii": radii, "width": 2, "height": 2, "n_cameras": 1, "gaussian_ids": None}
 
 
+@pytest.fixture
+def no_cap(monkeypatch):
+    """All may be split in one refinement."""
+    monkeypatch.setattr(control_module, "MOST_NEW", 1.0)
+
+
 def clock(**changes) -> DensityClock:
     return DensityClock(
         **{"progress": 0.2, "steps": 100, "taken": 1, "views": 5, "room": None, "seed": 1, **changes}
     )
 
 
+@pytest.mark.usefixtures("no_cap")
 def test_the_default_strategy_makes_two_where_gradients_are_high():
     params, optimizers = live(random_gaussians(8, size=0.001))
     control = DensityControl(DensityConfig(densify_grad_thresh=0.5, cull_alpha_thresh=0.0))
@@ -102,6 +110,7 @@ def test_opacities_are_reset_on_the_blocks_own_clock_alone():
         assert bool((torch.sigmoid(params["opacities"]) < 0.02).all()) is reset, steps
 
 
+@pytest.mark.usefixtures("no_cap")
 @pytest.mark.parametrize(("views", "visit"), [(1, None), (3000, 40)])
 def test_only_those_grow_that_fill_several_prices(views, visit):
     """Eight alike by their gradients, of which the last four fill too little in all views, however few of
@@ -291,6 +300,7 @@ def test_random_numbers_are_forked_only_where_any_are_drawn(monkeypatch):
     assert forks == [1]
 
 
+@pytest.mark.usefixtures("no_cap")
 def test_a_refinement_leaves_the_allocator_its_memory(monkeypatch):
     emptied = []
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(1))

@@ -5,6 +5,7 @@ The default strategy is 3DGS's, judged by AbsGS's gradients, but for how one Gau
 Here the schedule is in shares of the run and in the block's own steps, so it is kept in this file.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -46,8 +47,8 @@ WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
 """A warm-up is refined whenever this share has been drawn of the views that the run would draw at its pace,
 or so many views if these are more, or all of the scene's: also a short one is to fill its room, but by what
 every view asks for."""
-MOST_NEW, LEAST_NEW = 0.1, 16
-"""Gaussians that one refinement may add: this share of the block's, or this many if that is more."""
+MOST_NEW = 0.1
+"""Gaussians that one refinement may add, as a share of the block's; at least one."""
 PLAIN_GRADIENT = 0.25
 """Thresholds of gradients, as a share of those of absolute ones: 0.0002 (3DGS, 2DGS) of 0.0008 (AbsGS)."""
 MCMC_MIN_OPACITY = 0.005
@@ -300,7 +301,7 @@ class DensityControl:
         if self.refines(clock, infos):
             gradients = growth["grad2d"] / growth["count"].clamp_min(1)
             wanted = torch.where(gradients > config.densify_grad_thresh, gradients, 0.0)
-            most = max(int(MOST_NEW * len(wanted)), LEAST_NEW)
+            most = math.ceil(MOST_NEW * len(wanted))
             room = most if clock.room is None else min(most, clock.room)
             which = chosen(torch.where(may_grow(growth, config.price), wanted, 0.0), room)
             growth = halve(params, optimizers, growth, which, self._axes)
