@@ -7,6 +7,7 @@ from abcd_ns.engine.events import BlockSplit, VisitBegan, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.special_blocks import RESERVE
+from abcd_ns.engine.train.density import control
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.density.splitting import FULL, cut_at_rest, split_full
 from abcd_ns.engine.train.health_record import BlockHealth, standing
@@ -79,7 +80,8 @@ def test_a_part_has_had_the_visits_of_the_block_it_came_from():
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, start, blocks):
+def test_a_run_never_has_a_larger_block_than_it_may(tmp_path, views, photos, start, blocks, monkeypatch):
+    monkeypatch.setattr(control, "MOST_NEW", 1.0)
     limit = 130
     coordinator = make_coordinator(
         tmp_path, start, views, blocks=blocks, steps=50, density=GROWING, block_limit=limit, warmup=0.0

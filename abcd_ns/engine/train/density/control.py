@@ -205,7 +205,9 @@ class DensityControl:
             sums = [growth[name] if name in growth else torch.zeros_like(means[:, 0]) for name in names]
             weights = info["weights"].grad
             drawn = self._gradient(info), info["radii"], weights
-            found = fused.statistics(*drawn, sums, self._scale(info), len(weights) / views)
+            scale, share = self._scale(info), len(weights) / views
+            of_one_size = not isinstance(scale[0], Tensor)
+            found = fused.statistics(*drawn, sums, scale, share) if of_one_size else None
             if found is None:
                 return added(growth, self.count(means, infos, views))
             growth = {**growth, **dict(zip(names, found, strict=True))}
@@ -219,8 +221,9 @@ class DensityControl:
         return tuple(info for info in infos if self._gradient(info) is not None)
 
     @staticmethod
-    def _scale(info: dict[str, Any]) -> tuple[float, float]:
-        """Of a gradient, along both axes: from pixels to halves of the image, for the sum of drawings."""
+    def _scale(info: dict[str, Any]) -> tuple[float | Tensor, float | Tensor]:
+        """Of a gradient, along both axes: from pixels to halves of the image, for the sum of drawings; [v, 1]
+        where views have several sizes."""
         return tuple(info[side] / 2.0 * info["n_cameras"] for side in ("width", "height"))
 
     def _norms(self, info: dict[str, Any]) -> tuple[Tensor, Tensor]:
