@@ -68,6 +68,8 @@ def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
     """A coordinator at the beginning of a run, on CUDA where there is any; its store in `folder`."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     loss.warm_up(device)
+    rasterizer = make_rasterizer("auto", device)
+    rasterizer.warm_up()
     start = gaussians_from_points(capture.points.float(), capture.colors)
     tree = build_kd(start.means, blocks)
     store = ParameterStore.create(folder / "store", {"tree": tree.to_json()})
@@ -78,7 +80,7 @@ def begin(capture: Stage, blocks: int, args: Args, folder: Path) -> Coordinator:
         Budget(seconds=args.seconds),
         StoredScene(tree, store),
         capture.views,
-        make_rasterizer("auto", device),
+        rasterizer,
         *nothing_live(3, device),
         device=device,
     )

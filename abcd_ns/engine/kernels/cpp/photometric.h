@@ -21,9 +21,11 @@ static const Bell bell;
 
 // out[j] = sum over k of tap_k in[j + k step], j < count.
 static inline void slide(const float* in, int64_t step, int64_t count, float* out) {
-  for (int64_t j = 0; j < count; j++) out[j] = bell.tap[0] * in[j];
-  for (int k = 1; k < TAPS; k++)
-    for (int64_t j = 0; j < count; j++) out[j] += bell.tap[k] * in[j + k * step];
+  for (int64_t j = 0; j < count; j++) {
+    float total = 0;
+    for (int k = 0; k < TAPS; k++) total += bell.tap[k] * in[j + k * step];
+    out[j] = total;
+  }
 }
 }  // namespace photometric
 
