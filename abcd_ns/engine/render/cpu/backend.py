@@ -117,28 +117,43 @@ class TorchRasterizer(Rasterizer):
             return tuple(
                 Raster(color, left, depth, info) for color, left, depth in zip(*[drawn] * 3, strict=True)
             )
+        images = self._composited_in_torch(planes, shots, means2d, weights, target)
+        return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
+
+    def _composited_in_torch(
+        self,
+        planes: Float[Tensor, "v r n"],
+        shots: Sequence[Shot],
+        means2d: Float[Tensor, "v n 2"],
+        weights: Float[Tensor, "v n"] | None,
+        target: Tensor | None,
+    ) -> list[Float[Tensor, "5 h w"]]:
+        """By reference.composite; see native.Composite for `means2d` and `weights`, native.Drawing for
+        `target`."""
+        center = self.primitive.center
+        frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
+        windows = [shot.z_window for shot in shots]
         # The leaves add nothing, and get the gradients.
         own = list(planes[:, : self.primitive.graded].unbind(1))
         for axis in range(2):
-            own[center.start + axis] = own[center.start + axis] + (means2d - means2d.detach())[..., axis]
+            own[center + axis] = own[center + axis] + (means2d - means2d.detach())[..., axis]
         own[DEPTH] = own[DEPTH] if weights is None else weights
         others = [part[: self.primitive.graded].clone() for _, part in frozen]
-        for part in others if weigh else ():
+        for part in others if weights is not None else ():
             part[DEPTH] = 0.0
         rows = torch.cat((torch.stack(own).flatten(1), *others), dim=1)
         bounds = torch.cat((*planes.detach(), *(part for _, part in frozen)), dim=1)
         counts = [planes.shape[2]] * len(shots) + [part.shape[1] for _, part in frozen]
         places = [*range(len(shots)), *(k for k, _ in frozen)]
         picture = _repeated(places, counts, planes)
-        lists = reference.find_lists(bounds, picture, crops, self.tile_side, self.primitive)
+        lists = reference.find_lists(bounds, picture, [s.crop for s in shots], self.tile_side, self.primitive)
         if any(window is not None for window in windows):
             applies = [shot.frozen is None for shot in shots] + [True] * len(frozen)
             lists = lists.within(windows, _repeated(applies, counts, planes))
         absolute = None if target is None else torch.zeros_like(bounds[:2].T)
         if target is not None:
             target.absgrad = absolute[: means2d[..., 0].numel()].view_as(means2d)
-        images = reference.composite(rows, lists, self.primitive, absolute)
-        return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
+        return reference.composite(rows, lists, self.primitive, absolute)
 
     @torch.no_grad()
     def cuts(
