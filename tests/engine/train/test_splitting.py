@@ -122,7 +122,7 @@ def test_a_block_that_has_room_is_not_cut(tmp_path, views, photos, start):
 
 
 def test_a_run_that_was_cut_resumes_bit_for_bit(tmp_path, views, photos, start):
-    options = {"blocks": 2, "steps": 50, "density": GROWING, "block_limit": 110, "warmup": 0.0}
+    options = {"blocks": 2, "steps": 50, "density": GROWING, "block_limit": 75, "warmup": 0.0}
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     whole.mkdir()
     halves.mkdir()
@@ -130,6 +130,7 @@ def test_a_run_that_was_cut_resumes_bit_for_bit(tmp_path, views, photos, start):
     train(expected, photos)
     first = make_coordinator(halves, start, views, **options)
     while first.scene.tree.num_blocks == 2 or first.state.active is None:
+        assert not first.finished
         train_step(first, photos)
     train(first, photos, 3)
     first.save()
