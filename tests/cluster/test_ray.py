@@ -24,7 +24,7 @@ from abcd_ns.errors import UserError, is_out_of_memory
 from tests.cluster.conftest import GROWING, make_run
 from tests.reference.scenes import equal, listen, whole_scene
 
-os.environ["RAY_worker_niceness"] = "0"  # beside the other tests they would starve
+os.environ.update(RAY_worker_niceness="0")  # niced, as Ray has it, they starve beside the other tests
 keep_to_ourselves(starts=True)  # before Ray is imported
 ray = pytest.importorskip("ray")
 from ray.cluster_utils import Cluster  # noqa: E402
