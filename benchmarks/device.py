@@ -44,7 +44,7 @@ from tests.reference.gsplat_stand_ins import lent
 from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE, simulated_device
 
-GROWS = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=4, densify_grad_thresh=2e-4)
+GROWS = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=4, split_pixels=0.0)
 """Refines often, so that steps that do are among those counted."""
 MOST_PLACES = 12
 

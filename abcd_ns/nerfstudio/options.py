@@ -48,12 +48,11 @@ SAME = {
     DensityConfig: {
         "refine_every": "refine-every",
         "cull_alpha_thresh": "cull-alpha-thresh",
-        "densify_grad_thresh": "densify-grad-thresh",
-        "use_absgrad": "use-absgrad",
     },
 }
 """By class and field, the flag of splatfacto's under --pipeline.model that means the same; taken too."""
-_HALVES = "each that grows becomes two along its longest axis, large or small"
+_HALVES = "each that grows becomes two, large or small"
+_ERROR = "set --pipeline.training.density.split-pixels instead: Gaussians grow by error, not by gradients"
 _REDUCED = "set --pipeline.training.coarse, a share of the run, instead"
 _GIANTS = "--pipeline.training.heal shrinks giants"
 _GRIDS = "grids are 16 x 16 x 8, splatfacto's default, and adapt as --pipeline.training.light says"
@@ -64,6 +63,7 @@ UNUSED_OF_MODEL = {
     "reset_alpha_every": "set --pipeline.training.density.reset-every, in views drawn, instead",
     **{name: f"set --pipeline.training.density.{flag} instead" for name, flag in SAME[DensityConfig].items()},
     **dict.fromkeys(("densify_size_thresh", "n_split_samples"), _HALVES),
+    **dict.fromkeys(("densify_grad_thresh", "use_absgrad"), _ERROR),
     "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",
     **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),
     **dict.fromkeys(("cull_screen_size", "stop_screen_size_at"), _GIANTS),

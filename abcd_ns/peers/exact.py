@@ -17,7 +17,6 @@ way to the device and back.
 import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
@@ -28,13 +27,14 @@ from abcd_ns.engine.gaussians.block_state import BlockState, join
 from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
-from abcd_ns.engine.render.image_size import image_size
+from abcd_ns.engine.render.residual_sums import SUMS
 from abcd_ns.engine.space.culling import Optics
 from abcd_ns.engine.space.intervals import ray_interval
 from abcd_ns.engine.space.ordering import front_to_back
 from abcd_ns.engine.space.visibility import reaches
 from abcd_ns.engine.store.scaffold import split_by_block
 from abcd_ns.engine.train.density.clock import DensityClock
+from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
 from abcd_ns.engine.train.step.batch import COMING, Batch, Rendered, Sample, background, part_to_draw
@@ -48,28 +48,19 @@ class Gradients:
 
     params: dict[str, Tensor]
     """By parameter, of its shape."""
-    means2d: Float[Tensor, "v n 2"]
-    """By view, of the projected means; density control judges by it."""
-    absolute: Float[Tensor, "v n 2"]
-    """Sums of absolute values over pixels, where asked for."""
-    radii: Tensor
-    """[v, n], px; 0 where culled."""
+    sums: Float[Tensor, "v n 10"]
+    """By view, see ResidualSums; density control judges by it."""
 
     @staticmethod
     def zero(gaussians: Gaussians, views: int) -> "Gradients":
         """Nothing yet."""
-        flat = gaussians.means.new_zeros(views, len(gaussians), 2)
         params = {name: torch.zeros_like(value) for name, value in gaussians.items()}
-        return Gradients(params, flat, flat.clone(), torch.zeros(flat.shape[:2], dtype=torch.int32))
+        return Gradients(params, gaussians.means.new_zeros(views, len(gaussians), SUMS))
 
     def add(self, rows: Int64[Tensor, "m"], view: int, raster: Raster) -> None:
         """Take over what one drawing's backward left in its info; `rows` are its Gaussians."""
-        means2d = raster.info["means2d"]
-        if means2d.grad is not None:
-            self.means2d[view].index_add_(0, rows, means2d.grad[0].to(self.means2d))
-        if hasattr(means2d, "absgrad"):
-            self.absolute[view].index_add_(0, rows, means2d.absgrad[0].to(self.absolute))
-        self.radii[view, rows] = raster.info["radii"][0].to(self.radii)
+        if "sums" in raster.info and raster.info["sums"].values is not None:
+            self.sums[view].index_add_(0, rows, raster.info["sums"].values[0].to(self.sums))
 
 
 class ExactTrainer(Trainer):
@@ -85,6 +76,7 @@ class ExactTrainer(Trainer):
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []
+        self._residuals: list[Float[Tensor, "_h _w 3"]] = []
         self._pictures: list[Tensor] = []
         self._take()
 
@@ -133,7 +125,8 @@ class ExactTrainer(Trainer):
         photos: Sequence[Float[Tensor, "_h _w 3"]],
     ) -> Float[Tensor, ""]:
         """Photometric, the mean of the samples'; what the density strategy asks for is added by block."""
-        losses = batch.losses(pictures, photos, self.config)
+        losses, pairs = batch.losses(pictures, photos, self.config), zip(pictures, photos, strict=True)
+        self._residuals = [photo[..., :3] - picture.detach() for picture, photo in pairs]
         return sum(losses[1:], start=losses[0]) / len(losses)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
@@ -164,7 +157,6 @@ class ExactTrainer(Trainer):
             leaves = Gaussians(**{name: v.detach().requires_grad_() for name, v in gaussians.items()})
             for place in range(len(self._pictures)):
                 raster = self._draw(block, leaves, place)
-                raster.info["means2d"].retain_grad()
                 self._backward(block, place, raster)
                 gradients.add(rows, place, raster)
             for name, leaf in leaves.items():
@@ -222,8 +214,8 @@ class ExactTrainer(Trainer):
             grid = self.run.rasterizer.window_grid(sample.crop)
             window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
-        options = {"antialiased": self.config.antialiased, "absgrad": self.run.density.absgrad}
-        return self.run.rasterizer.draw(gaussians, [shot], sh_degree=self._degree, **options)[0]
+        options = {"sh_degree": self._degree, "antialiased": self.config.antialiased}
+        return self.run.rasterizer.draw(gaussians, [shot], **options)[0]
 
     def _in_order(self, place: int) -> list[Layer]:
         """The view's layers, front to back."""
@@ -235,6 +227,9 @@ class ExactTrainer(Trainer):
         layers, own = self._in_order(place), self._layers_of[place][block]
         at = next(k for k, layer in enumerate(layers) if layer is own)
         front, back = fold(layers[:at], like=own), fold(layers[at + 1 :], like=own)
+        if self.run.density.asks(self.progress, first=False) and "sums" in raster.info:
+            shows = front.transmittance[..., None]
+            raster.info["sums"].ask([torch.cat((self._residuals[place] * shows, shows), dim=-1)])
         picture = sandwich(front, raster.layer, back, self._batch.samples[place].background)
         picture.backward(self._pictures[place].grad)
 
@@ -255,21 +250,22 @@ class ExactTrainer(Trainer):
             self.params,
             self.optimizers,
             {name: value.to(self.device) for name, value in state.growth.items()},
-            (self._info(gradients, rows),),
+            (),
+            self._judged(gradients.sums[:, rows]),
             self._clock_of(block, len(state), clocks.steps, taken),
         )
         stepped = detach(self.params, self.optimizers, growth, clocks)
         attach(stepped[:0].to(self.device), self.params, self.optimizers)
         return stepped
 
-    def _info(self, gradients: Gradients, rows: Int64[Tensor, "m"]) -> dict[str, Any]:
-        """As a rasterizer gives it, of one block's Gaussians and all views of the step."""
-        means2d = torch.zeros_like(gradients.means2d[:, rows]).to(self.device)
-        means2d.grad = gradients.means2d[:, rows].to(self.device)
-        means2d.absgrad = gradients.absolute[:, rows].to(self.device)
-        radii = gradients.radii[:, rows].to(self.device)
-        size = image_size([sample.view for sample in self._batch.samples], self.device)
-        return {"means2d": means2d, "radii": radii, "gaussian_ids": None, "n_cameras": len(radii), **size}
+    def _judged(self, sums: Float[Tensor, "v m 10"]) -> list[Judged]:
+        """What a step's pictures ask of one block's Gaussians."""
+        if not self.run.density.asks(self.progress, first=False):
+            return []
+        return [
+            Judged(sample.view, own.to(self.device), residual.square().sum(dim=-1).mean(), sample.share)
+            for sample, own, residual in zip(self._batch.samples, sums, self._residuals, strict=True)
+        ]
 
     def _clock_of(self, block: int, gaussians: int, steps: int, taken: int) -> DensityClock:
         limit, everything = self.config.density.limit, max(self.count(), 1)

@@ -70,19 +70,19 @@ def test_crop_is_the_crop_of_the_full_image(rasterizer, scene, crop):
 
 
 @pytest.mark.parametrize("crop", CROPS)
-def test_absgrad_and_means2d_gradient(rasterizer, scene, crop):
+def test_sums_of_residuals_and_means2d_gradient(rasterizer, scene, crop):
     infos = []
     for backend in (rasterizer, TorchRasterizer(use_native=False)):
-        raster = backend(
-            as_leaves(scene(200)), view(), sh_degree=1, crop=crop, frozen=scene(50, seed=3), absgrad=True
-        )
+        raster = backend(as_leaves(scene(200)), view(), sh_degree=1, crop=crop, frozen=scene(50, seed=3))
         raster.info["means2d"].retain_grad()
         weights = probe(*raster.transmittance.shape, dtype=torch.float32).to(raster.color.device)
+        raster.info["sums"].ask([weights[..., :4]])
         (stacked(raster) * weights).sum().backward()
-        infos.append(raster.info["means2d"])
-    assert infos[0].absgrad.shape == infos[1].absgrad.shape == (1, 200, 2)
-    assert relative_error(infos[0].absgrad, infos[1].absgrad) < 1e-2
-    assert relative_error(infos[0].grad, infos[1].grad) < 1e-2
+        infos.append(raster.info)
+    one, other = (info["sums"].values for info in infos)
+    assert one.shape == other.shape == (1, 200, 10)
+    assert relative_error(one, other) < 1e-2
+    assert relative_error(*(info["means2d"].grad for info in infos)) < 1e-2
 
 
 @pytest.mark.parametrize("windowed", [False, True])
@@ -128,7 +128,7 @@ def test_graph_is_freed_without_a_backward_pass(rasterizer, scene, device):
     seen = view()  # cameras are kept on the device
 
     def draw():
-        return rasterizer(as_leaves(scene(2000)), seen, sh_degree=3, crop=CROPS[1], absgrad=True)
+        return rasterizer(as_leaves(scene(2000)), seen, sh_degree=3, crop=CROPS[1])
 
     draw()
     torch.cuda.synchronize()

@@ -25,7 +25,7 @@ from tests.reference.scenes import (
 
 pytestmark = pytest.mark.gpu
 STEPS = 20
-GROWING = {"refine_start": 0.0, "refine_every": 5, "densify_grad_thresh": 2e-4}
+GROWING = {"refine_start": 0.0, "refine_every": 5, "split_pixels": 0.0}
 
 
 @pytest.fixture(scope="module")

@@ -100,14 +100,13 @@ def test_the_same_options_of_splatfacto_are_taken():
     model = "--pipeline.model."
     training = parsed(
         f"{model}sh-degree", "2", f"{model}ssim_lambda", "0.3", f"{model}background-color", "white",
-        f"{model}cull_alpha_thresh=0.01", f"{model}densify-grad-thresh", "0.0004", f"{model}use-absgrad",
-        "False", f"{model}refine-every", "50", f"{model}camera-optimizer.mode", "SO3xR3",
+        f"{model}cull_alpha_thresh=0.01", f"{model}refine-every", "50",
+        f"{model}camera-optimizer.mode", "SO3xR3",
     ).pipeline.training  # fmt: skip
     density = training.density
     assert training.poses == "SO3xR3"
     assert (training.sh_degree, training.ssim_lambda, training.background) == (2, 0.3, "white")
-    assert (density.cull_alpha_thresh, density.densify_grad_thresh) == (0.01, 0.0004)
-    assert (density.use_absgrad, density.refine_every) == (False, 50)
+    assert (density.cull_alpha_thresh, density.refine_every) == (0.01, 50)
 
 
 def test_the_antialiased_mode_of_splatfacto_is_ours():

@@ -20,7 +20,7 @@ from abcd_ns.peers.independent import (
 from tests.reference.scenes import Photos, listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
 
 
 def independent(folder, start, views, **options) -> independent_trainer:

@@ -145,7 +145,7 @@ def _open(folder: Path, views: list, commit_seconds: float) -> Coordinator:
         shutil.rmtree(folder / "clone")
     else:
         shutil.rmtree(folder / "store", ignore_errors=True)
-    density = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+    density = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
     return make_coordinator(
         folder,
         start,

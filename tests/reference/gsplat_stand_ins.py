@@ -3,7 +3,7 @@
     with lent():
         GsplatRasterizer()...  # on CPU tensors, or on the simulated device, where each counts as one launch
 
-Gradients are right, `absgrad` included. As in CUDA, what is not drawn is left uninitialised: it is NaN here.
+Gradients are right. As in CUDA, what is not drawn is left uninitialised: it is NaN here.
 Only what this package uses is there: projection by cameras, lists and pictures packed, no backgrounds.
 """
 

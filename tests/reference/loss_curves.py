@@ -24,7 +24,7 @@ from tests.reference.scenes import Photos, make_coordinator, random_gaussians, r
 CURVES = Path(__file__).with_suffix(".json")
 STEPS, BLOCKS, SCAFFOLD = 24, 4, 60
 METHODS = ("abcd", "abcd_ablated", "abcd_partition", "abcd_exact", "abcd_paper", "abcd_monolithic")
-OFTEN = {"refine_start": 0.1, "refine_every": 8, "densify_grad_thresh": 0.004}
+OFTEN = {"refine_start": 0.1, "refine_every": 8, "split_pixels": 1.0}
 """So that such short runs grow."""
 
 

@@ -11,6 +11,7 @@ from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityControl
+from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, settling, sh_degree_at
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from tests.reference.scenes import Photos
@@ -31,13 +32,7 @@ def train_plain(
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, config.means_lr_decay) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * share
-        raster = draw(
-            Gaussians(**{name: params[name] for name in PARAM_NAMES}),
-            view,
-            sh_degree=degree,
-            absgrad=density.absgrad,
-        )
-        density.before_backward((raster.info,))
+        raster = draw(Gaussians(**{name: params[name] for name in PARAM_NAMES}), view, sh_degree=degree)
         seed = random.Random(f"background {config.seed} {taken} 0").getrandbits(62)
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed))
         picture = torch.addcmul(raster.color, raster.transmittance[..., None], background).clamp(0, 1)
@@ -49,12 +44,16 @@ def train_plain(
         )
         for optimizer in adam.values():
             optimizer.zero_grad()
+        residual = (photos.images[row] - picture).detach()
+        raster.info["sums"].ask([torch.cat((residual, torch.ones_like(residual[..., :1])), dim=-1)])
         loss.backward()
         for optimizer in adam.values():
             optimizer.step()
         seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
         clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed)
-        growth = density.after_step(params, adam, growth, (raster.info,), clock)
+        judged = Judged(view, raster.info["sums"].values[0], residual.square().sum(dim=-1).mean())
+        judged = [judged] if density.asks(taken / steps, first=False) else []
+        growth = density.after_step(params, adam, growth, (raster.info,), judged, clock)
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 
 

@@ -22,21 +22,6 @@ def photometric(rendered: Tensor, photo: Tensor, by_pixel: float, by_window: flo
     return by_pixel * sums[0] + by_window * sums[1], gradient
 
 
-def statistics(
-    gradient: Tensor,
-    radii: Tensor,
-    weights: Tensor,
-    sums: Sequence[Tensor],
-    scale: tuple[float, float],
-    passes: float,
-) -> Tensor:
-    """The four sums, [4, n]."""
-    norms = (gradient * gradient.new_tensor(scale)).norm(dim=-1)
-    seen = (radii > 0) & norms.isfinite()
-    more = norms.masked_fill(~seen, 0.0).sum(0), seen.sum(0), weights.sum(0).nan_to_num(0.0, 0.0, 0.0), passes
-    return torch.stack([before + added for before, added in zip(sums, more, strict=True)])
-
-
 def between(
     features: Tensor, alphas: Tensor, shown: Sequence[Shown], gradients: Sequence[Tensor] | None = None
 ) -> list[Tensor]:
@@ -102,7 +87,6 @@ LAUNCHES: dict[Callable[..., Any], Callable[..., int]] = {
     photometric: lambda *_: 4,
     shade: lambda *_: 1,
     skips: lambda *_: 1,
-    statistics: lambda *_: 1,
     windowed: lambda *_: 3,
     between: lambda _features, _alphas, shown, *_: len(shown),
 }

@@ -52,7 +52,7 @@ CONSISTENT = {"density": STILL, "primitive": "2dgs", "normal_consistency": 0.05}
 @pytest.fixture(autouse=True)
 def _uncompiled(simulated_gsplat, monkeypatch):  # noqa: ARG001 - which lends the kernels
     """What is modelled is what most is taken by: steps without Triton's kernels."""
-    for name in ("between", "photometric", "shade", "skips", "statistics", "windowed"):
+    for name in ("between", "photometric", "shade", "skips", "windowed"):
         monkeypatch.setattr(fused, name, fused.Fused(name, None))
 
 

@@ -40,7 +40,7 @@ class BlockState:
     exp_avg_sq: Gaussians
     """Second moment of each parameter."""
     growth: dict[str, Tensor] = field(default_factory=dict)
-    """Densification's running statistics, each [n]: gsplat's strategy state."""
+    """Density control's running statistics, each [n, ...]."""
     clocks: Clocks = field(default_factory=Clocks)
     waits: Tensor | None = None
     """Bool [n]: who is not to be seen before the block's next visit. None becomes nobody."""
@@ -121,8 +121,10 @@ def join(states: Sequence[BlockState]) -> BlockState:
     itself. A statistic which only some have starts at zero for the others."""
     if len(states) == 1:
         return states[0]
-    names = dict.fromkeys(name for state in states for name in state.growth)
-    growth = {name: torch.cat([_statistic(state, name) for state in states]) for name in names}
+    known = {name: value[:0] for state in states for name, value in state.growth.items()}
+    growth = {
+        name: torch.cat([_statistic(state, name, like) for state in states]) for name, like in known.items()
+    }
     return BlockState(
         Gaussians.cat([state.gaussians for state in states]),
         *(Gaussians.cat([getattr(state, moment) for state in states]) for moment in MOMENTS),
@@ -140,7 +142,5 @@ def checksum(gaussians: Gaussians) -> str:
     return digest.hexdigest()
 
 
-def _statistic(state: BlockState, name: str) -> Tensor:
-    if name in state.growth:
-        return state.growth[name]
-    return torch.zeros(len(state), device=state.gaussians.device)
+def _statistic(state: BlockState, name: str, like: Tensor) -> Tensor:
+    return state.growth[name] if name in state.growth else like.new_zeros((len(state), *like.shape[1:]))

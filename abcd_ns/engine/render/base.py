@@ -28,7 +28,8 @@ class Raster:
     """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
     info: dict[str, Any]
     """gsplat 1.4.0's `info` for the Gaussians that take gradients, from v cameras: means2d [v, n, 2], radii
-    [v, n], width, height, n_cameras, gaussian_ids. Of the full image, not the crop."""
+    [v, n], width, height, n_cameras, gaussian_ids. Of the full image, not the crop. And `sums`, ResidualSums,
+    where there are Gaussians."""
 
     @property
     def layer(self) -> Layer:
@@ -120,7 +121,6 @@ class Rasterizer(Protocol):
         *,
         sh_degree: int,
         antialiased: bool = False,
-        absgrad: bool = False,
         weigh: bool = False,
     ) -> tuple[Raster, ...]:
         """Draw `gaussians` for each shot, sorted by depth with what is frozen there.
@@ -130,8 +130,6 @@ class Rasterizer(Protocol):
                 rasters may share one `info`, of that many cameras.
             sh_degree: the degree of spherical harmonics in use; at most `gaussians.sh_degree`.
             antialiased: scale opacities by gsplat's compensation factor; of surfels it has none.
-            absgrad: leave sum |d loss / d means2d| over pixels in `info["means2d"].absgrad` after backward,
-                where the primitive has it.
             weigh: give zeros for depths, from a leaf `info["weights"]` [v, n] that every Gaussian's depth is
                 taken from: after backward its gradient is the sum of the Gaussian's weights alpha T, each
                 times the gradient of the pixel's depth; and that changes no other gradient.
@@ -152,7 +150,6 @@ class Rasterizer(Protocol):
         frozen: Gaussians | None = None,
         z_window: ZWindow | None = None,
         antialiased: bool = False,
-        absgrad: bool = False,
     ) -> Raster:
         """`draw` for a single view and, without `crop`, all of its image."""
         crop = crop or view.full
@@ -160,7 +157,7 @@ class Rasterizer(Protocol):
         if frozen is not None:
             seen = self.project(frozen, view, sh_degree=sh_degree, antialiased=antialiased)
         shot = Shot(view, crop, seen, z_window)
-        options = {"sh_degree": sh_degree, "antialiased": antialiased, "absgrad": absgrad}
+        options = {"sh_degree": sh_degree, "antialiased": antialiased}
         return self.draw(gaussians, [shot], **options)[0]
 
     def cuts(

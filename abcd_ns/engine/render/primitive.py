@@ -30,9 +30,7 @@ class Primitive:
     graded: int
     """Rows that take gradients: all but the last four."""
     center: int
-    """The first of two such rows that say where on screen the middle is; its gradient asks for growth."""
-    has_absgrad: bool
-    """Whether that gradient's absolute values by pixel are summed, too."""
+    """The first of two such rows that say where on screen the middle is; residuals are summed about it."""
     axes: int
     """Along which it extends: those of its scales that are drawn."""
     blur_pixels: float
@@ -50,7 +48,6 @@ SPLATS = Primitive(
     project=splat_kernels.splat,
     graded=splat_kernels.GRADED,
     center=splat_kernels.X,
-    has_absgrad=True,
     axes=3,
     blur_pixels=DRAWN_SIGMAS * math.sqrt(splat_kernels.EPS_2D),
 )
@@ -60,7 +57,6 @@ SURFELS = Primitive(
     project=surfel_kernels.surfel,
     graded=surfel_kernels.GRADED,
     center=surfel_kernels.U,
-    has_absgrad=False,
     axes=2,
     blur_pixels=DRAWN_SIGMAS * math.sqrt(0.5),
 )

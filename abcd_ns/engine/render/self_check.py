@@ -97,6 +97,12 @@ def _loss(raster: Raster) -> Float[Tensor, ""]:
     return (planes * weights).sum()
 
 
+def _residual(raster: Raster) -> Float[Tensor, "h w 4"]:
+    """Something that differs from pixel to pixel."""
+    height, width = raster.depth.shape
+    return torch.arange(4 * height * width).to(raster.depth).sin().view(height, width, 4)
+
+
 @torch.enable_grad()  # whoever evaluates or renders asks for the first picture without
 def values_and_gradients(
     rasterizer: Rasterizer, device: torch.device | str, case: Case, shift: float = 0.0
@@ -111,18 +117,20 @@ def values_and_gradients(
     own, frozen = gaussians[: COUNT - case.frozen], gaussians[COUNT - case.frozen :]
     leaves = {name: value.clone().requires_grad_() for name, value in own.items()}
     shots = case.shots(rasterizer, frozen, view)
-    options = {"antialiased": case.antialiased, "absgrad": True, "weigh": case.weighs}
+    options = {"antialiased": case.antialiased, "weigh": case.weighs}
     rasters = rasterizer.draw(Gaussians(**leaves), shots, sh_degree=case.sh_degree, **options)
-    infos = {id(raster.info): raster.info for raster in rasters}.values()
+    infos = list({id(raster.info): raster.info for raster in rasters}.values())
     means2d = [info["means2d"] for info in infos]
     for each in means2d:
         each.retain_grad()
+    for info in infos:
+        info["sums"].ask([_residual(raster) for raster in rasters if raster.info is info])
     sum(map(_loss, rasters)).backward()
     planes = ("color", "transmittance", "depth")
     results = {name: [getattr(raster, name).flatten() for raster in rasters] for name in planes}
     results |= {f"gradient of {name}": [leaves[name].grad] for name in PARAM_NAMES}
     results["gradient of means2d"] = [each.grad for each in means2d]
-    results["absolute gradient of means2d"] = [getattr(m, "absgrad", torch.zeros_like(m)) for m in means2d]
+    results["sums of residuals"] = [info["sums"].values for info in infos]
     results |= {"weights": [info["weights"].grad for info in infos]} if case.weighs else {}
     return {name: torch.cat(value).detach().cpu().double() for name, value in results.items()}
 

@@ -40,6 +40,7 @@ from abcd_ns.engine.train.step.batch import (
 )
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.normal_consistency import BEGINS, normal_consistency
+from abcd_ns.engine.train.step.residuals import ASKED_EVERY, Residuals
 from abcd_ns.engine.types import Crop, View
 
 
@@ -67,6 +68,8 @@ class VisitTraining:
         self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
         self._backgrounds = Backgrounds(run.config, run.device)
         self._order: tuple[int, ...] = ()
+        self._rendered: Rendered | None = None
+        self._residuals = Residuals()
 
     @property
     def batch(self) -> int:
@@ -127,7 +130,7 @@ class VisitTraining:
 
     def render(self, batch: Batch) -> Rendered:
         """Draw the active block between its layers; differentiable in the live parameters."""
-        rendered = self._draw(batch.samples)
+        rendered = self._rendered = self._draw(batch.samples)
         if not self.run.active.shown:
             for sample, own in zip(batch.samples, rendered.transmittances, strict=True):
                 self.run.health.see(share_of_picture(sample.in_front, own))
@@ -137,7 +140,10 @@ class VisitTraining:
         """The loss of a step: photometric over what of the crops says something about the block, the mean of
         the samples', plus what surfels and the density strategy ask for."""
         run = self.run
-        losses = batch.losses(*self._visits.compared(batch, pictures, photos), run.config)
+        pictures, photos = self._visits.compared(batch, pictures, photos)
+        if self._asks:
+            self._residuals.ask(self._rendered, batch.samples, pictures, photos)
+        losses = batch.losses(pictures, photos, run.config)
         loss = losses[0] if len(losses) == 1 else sum(losses[1:], start=losses[0]) / len(losses)
         run.health.note(
             [(s.view.index, found.detach()) for s, found in zip(batch.samples, losses, strict=True)]
@@ -149,6 +155,12 @@ class VisitTraining:
         if run.config.density.strategy == "mcmc":
             loss = loss + run.density.regularisation(run.params, run.count())
         return loss
+
+    @property
+    def _asks(self) -> bool:
+        run = self.run
+        every = 1 if run.device.type == "cpu" else ASKED_EVERY
+        return run.state.step % every == 0 and run.density.asks(run.share, self.live.clocks.visits == 0)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
@@ -165,7 +177,8 @@ class VisitTraining:
         sound, psnr = run.health.end_step(errors)
         self.live.count_step(self.batch, taken)
         clock = self.live.density_clock(taken, self.batch, self._visits.room())
-        self.live.refine(rendered.infos if sound else (), clock)
+        judged, self._rendered = self._residuals.found(), None
+        self.live.refine(*(rendered.infos, judged) if sound else ((), ()), clock)
         if active.is_all and clock.reached(PASSES * len(active.geometry.views)):
             self.live.judge()
             self.live.hold_back_giants()
@@ -261,11 +274,9 @@ class VisitTraining:
             [sample.shot for sample in samples],
             sh_degree=self.degree,
             antialiased=run.config.antialiased,
-            absgrad=run.density.absgrad,
             weigh=run.density.weighs,
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
-        run.density.before_backward(infos)
         lights = [None if run.light is None else run.light.of(sample.view.index) for sample in samples]
         uses = [
             Use(sample.view.index, transform, sample.weight / self.batch)

@@ -18,7 +18,7 @@ def some_state(count: int, seed: int = 0) -> BlockState:
         random_gaussians(count, seed),
         random_gaussians(count, seed + 1),
         Gaussians(**{n: v**2 for n, v in random_gaussians(count, seed + 2).items()}),
-        {"grad2d": torch.rand(count, generator=generator), "count": torch.rand(count, generator=generator)},
+        {"worth": torch.rand(count, generator=generator), "count": torch.rand(count, generator=generator)},
         Clocks(steps=7, adam_views=5, visits=2),
     )
 
@@ -63,8 +63,8 @@ def test_rows_that_part_and_join_again_lose_nothing():
 
 def test_a_statistic_that_one_side_lacks_starts_at_zero():
     joined = join([BlockState.fresh(random_gaussians(2)), some_state(3)])
-    assert joined.growth["grad2d"][:2].tolist() == [0, 0]
-    assert torch.equal(joined.growth["grad2d"][2:], some_state(3).growth["grad2d"])
+    assert joined.growth["worth"][:2].tolist() == [0, 0]
+    assert torch.equal(joined.growth["worth"][2:], some_state(3).growth["worth"])
 
 
 def test_tensors_of_unequal_length_are_refused():

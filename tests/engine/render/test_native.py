@@ -83,15 +83,16 @@ def test_fewer_harmonics_are_taken_as_they_are(sh_degree):
 @BOTH
 def test_several_views_what_each_counts_and_weighs(primitive):
     shots = [Shot(VIEW, VIEW.full), Shot(VIEW, Crop(9, 8, 30, 20)), Shot(VIEW, Crop(40, 0, 43, 61))]
-    for options in ({"absgrad": True}, {"weigh": True}):
+    for options in ({}, {"weigh": True}):
         found = []
         for draw in pair(primitive):
             leaves = as_leaves(SCENE)
             rasters = draw.draw(leaves, shots, sh_degree=1, **options)
-            sum((stacked(r) * probe(*r.depth.shape, dtype=torch.float32)).sum() for r in rasters).backward()
             info = rasters[0].info
+            info["sums"].ask([probe(*r.depth.shape, dtype=torch.float32)[..., :4] for r in rasters])
+            sum((stacked(r) * probe(*r.depth.shape, dtype=torch.float32)).sum() for r in rasters).backward()
             more = [info["weights"].grad] if "weigh" in options else []
-            more += [info["means2d"].absgrad] if draw.primitive.has_absgrad and "absgrad" in options else []
+            more += info["sums"].values.split((1, 3, 3, 3), dim=2)
             found.append([leaves.means.grad, leaves.features_rest.grad, info["means2d"].grad, *more])
         for one, other in zip(*found, strict=True):
             assert one.shape == other.shape
@@ -149,34 +150,6 @@ def test_no_result_depends_on_the_number_of_threads(primitive):
         library().abcd_threads(threads_wanted())
     for other in found[1:]:
         assert all(map(torch.equal, found[0], other))
-
-
-@needs_compiler
-@BOTH
-def test_sums_for_growth_are_those_of_a_naive_loop(primitive):
-    """sum over pixels of w, w r, w r x and w r y, by weights of single Gaussians: colours' gradients."""
-    draw, scene = TorchRasterizer(primitive=primitive), random_gaussians(12, sh_degree=0, dtype=torch.float32)
-    residual = torch.randn(61, 83, 3, generator=torch.Generator().manual_seed(1))
-    raster = draw(as_leaves(scene), VIEW, sh_degree=0)
-    drawing = raster.info["drawing"]
-    drawing.residuals = [residual]
-    raster.color.sum().backward()
-    planes = draw.project(scene, VIEW)
-    y, x = torch.meshgrid(torch.arange(61) + 0.5, torch.arange(83) + 0.5, indexing="ij")
-    center = planes.planes[draw.primitive.center : draw.primitive.center + 2]
-    for k in range(12):
-        lit = torch.zeros(12, 3)
-        lit[k] = 1.0
-        others = draw.draw(scene[:0], [Shot(VIEW, VIEW.full, planes.colored(lit))], sh_degree=0)
-        weight = others[0].color[..., :1]
-        offset = torch.stack((x - center[0, k], y - center[1, k]), dim=-1)
-        asks = weight * residual
-        expected = [
-            weight.sum()[None],
-            asks.sum((0, 1)),
-            *((asks * offset[..., axis, None]).sum((0, 1)) for axis in (0, 1)),
-        ]
-        torch.testing.assert_close(drawing.growth[0, k], torch.cat(expected), rtol=1e-4, atol=2e-3)
 
 
 @needs_compiler

@@ -22,21 +22,6 @@ for height, width in ((11, 11), (11, 40), (29, 12), (33, 61)):
     torch.testing.assert_close(loss.double(), 0.3 * sums[0] + 0.7 * sums[1], rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(gradient.double(), expected, rtol=1e-4, atol=1e-5)
 """
-STATISTICS = """
-import torch
-from abcd_ns.engine.render.cuda.statistics import statistics
-from tests.reference import triton_stand_ins as twins
-
-generator = torch.Generator().manual_seed(0)
-for views, n in ((1, 1), (1, 300), (4, 257)):
-    gradient = torch.randn(views, n, 2, generator=generator)
-    radii = torch.randint(0, 3, (views, n), generator=generator, dtype=torch.int32)
-    weights = torch.rand(views, n, generator=generator)
-    sums = list(torch.rand(4, n, generator=generator))
-    gradient[0, ::7], gradient[-1, ::11], weights[0, ::5] = torch.nan, torch.inf, torch.nan
-    given = gradient, radii, weights, sums, (320.0, 240.0), views / 3
-    torch.testing.assert_close(statistics(*given), twins.statistics(*given), rtol=1e-6, atol=1e-5)
-"""
 BETWEEN = """
 import torch
 from abcd_ns.engine.render.cuda.between import between
@@ -70,7 +55,7 @@ for layers, counts in ((False, 0.0), (True, 1.0), (True, 2.5)):
 """
 GAUSSIANS = """
 import torch
-from abcd_ns.engine.render.cuda.statistics import shade, skips
+from abcd_ns.engine.render.cuda.by_gaussian import shade, skips
 from tests.reference import triton_stand_ins as twins
 
 generator = torch.Generator().manual_seed(0)
@@ -110,7 +95,7 @@ for count, always in ((0, 0), (1, 0), (700, 0), (700, 150)):
 """
 
 
-@pytest.mark.parametrize("compare", [LOSS, STATISTICS, BETWEEN, GAUSSIANS, WINDOWS])
+@pytest.mark.parametrize("compare", [LOSS, BETWEEN, GAUSSIANS, WINDOWS])
 def test_they_are_their_twins(compare):
     environment = {**os.environ, "TRITON_INTERPRET": "1"}
     done = subprocess.run(

@@ -1,5 +1,6 @@
 """TorchRasterizer against the naive twin: forward, gradient, crops, windows, frozen Gaussians."""
 
+import itertools
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -12,8 +13,7 @@ from hypothesis import strategies as st
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
 from abcd_ns.engine.render import Shot, TorchRasterizer, ZWindow, make_rasterizer
 from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
-from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
+from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians
 from tests.reference.naive_rasterizer import naive_rasterize
 from tests.reference.rasterizer_scenes import (
     as_leaves,
@@ -129,25 +129,29 @@ def test_gradients_of_crops_add_up_to_that_of_the_image():
         assert relative_error(getattr(parts, name).grad, getattr(whole, name).grad) < 1e-11, name
 
 
-def test_absgrad_sums_absolute_pixel_gradients():
-    gaussians = random_gaussians(6)
+@pytest.mark.parametrize("with_frozen", [False, True])
+def test_residuals_are_summed_by_weight_and_place(with_frozen):
+    """A loop over pixels, in which a weight is the gradient of the picture by a colour."""
+    gaussians, frozen = random_gaussians(6), random_gaussians(5, seed=7) if with_frozen else None
     crop = Crop(9, 5, 12, 8)
-    weights = probe(crop.height, crop.width)
+    residual = probe(crop.height, crop.width)[..., :4]
+    dark = replace(gaussians, features_dc=torch.zeros_like(gaussians.features_dc).requires_grad_())
+    naive = naive_rasterize(dark, VIEW, sh_degree=0, crop=crop, frozen=frozen)
+    expected = torch.zeros(6, 10, dtype=torch.float64)
+    for y, x in itertools.product(range(crop.height), range(crop.width)):
+        (gradient,) = torch.autograd.grad(naive.color[y, x, 0], dark.features_dc, retain_graph=True)
+        weight, r = gradient.flatten(1)[:, :1] / SH_C0, residual[y, x, :3]
+        place = torch.tensor([crop.x + x + 0.5, crop.y + y + 0.5]) - naive.means2d.detach()
+        expected += weight * torch.cat(
+            (residual[y, x, 3:].expand(6, 1), r.expand(6, 3), place[:, :1] * r, place[:, 1:] * r), dim=1
+        )
 
-    leaves = as_leaves(gaussians)
-    naive = naive_rasterize(leaves, VIEW, sh_degree=1, crop=crop)
-    per_pixel = (stacked(naive) * weights).sum(-1).flatten()
-    expected = torch.zeros_like(naive.means2d)
-    for value in per_pixel:
-        (grad,) = torch.autograd.grad(value, naive.means2d, retain_graph=True, allow_unused=True)
-        expected += 0 if grad is None else grad.abs()
-
-    raster = EAGER(as_leaves(gaussians), VIEW, sh_degree=1, crop=crop, frozen=None, absgrad=True)
-    raster.info["means2d"].retain_grad()
-    (stacked(raster) * weights).sum().backward()
-    assert raster.info["means2d"].absgrad.shape == (1, 6, 2)
-    assert relative_error(raster.info["means2d"].absgrad[0], expected) < 1e-10
-    assert (raster.info["means2d"].absgrad >= raster.info["means2d"].grad.abs() - 1e-12).all()
+    shot = Shot(VIEW, crop, None if frozen is None else EAGER.project(frozen, VIEW, sh_degree=0))
+    (raster,) = EAGER.draw(as_leaves(gaussians), [shot], sh_degree=1)
+    raster.info["sums"].ask([residual])
+    raster.color.sum().backward()
+    assert raster.info["sums"].values.shape == (1, 6, 10)
+    assert relative_error(raster.info["sums"].values[0], expected) < 1e-9
 
 
 @pytest.mark.parametrize("with_frozen", [False, True])
@@ -183,13 +187,12 @@ def test_info_is_about_the_gaussians_alone_and_carries_the_gradient():
     weights = probe(VIEW.height, VIEW.width)
     (expected,) = torch.autograd.grad((stacked(naive) * weights).sum(), naive.means2d)
 
-    raster = EAGER(as_leaves(gaussians), VIEW, sh_degree=1, frozen=frozen, absgrad=True)
+    raster = EAGER(as_leaves(gaussians), VIEW, sh_degree=1, frozen=frozen)
     info = raster.info
     info["means2d"].retain_grad()
     (stacked(raster) * weights).sum().backward()
     assert info["means2d"].shape == (1, 12, 2)
     assert relative_error(info["means2d"].grad[0], expected) < 1e-10
-    assert info["means2d"].absgrad.shape == (1, 12, 2)
     assert info["radii"].shape == (1, 12)
     assert info["radii"][0].tolist() == naive.radii
     assert (info["width"], info["height"], info["n_cameras"]) == (37, 21, 1)
@@ -220,7 +223,7 @@ def test_fold_of_complementary_windows_is_the_whole_drawing(dtype, tolerance):
 def test_no_gaussians(with_frozen):
     nothing = as_leaves(Gaussians.empty(dtype=torch.float64))
     frozen = random_gaussians(5) if with_frozen else None
-    raster = EAGER(nothing, VIEW, sh_degree=3, frozen=frozen, absgrad=True)
+    raster = EAGER(nothing, VIEW, sh_degree=3, frozen=frozen)
     raster.info["means2d"].retain_grad()
     stacked(raster).sum().backward()
     assert raster.info["means2d"].grad.shape == (1, 0, 2)
@@ -291,23 +294,3 @@ def test_clear_errors():
     with pytest.raises(ValueError, match="CUDA device"):
         make_rasterizer("gsplat", "cpu")
     assert make_rasterizer("auto", "cpu").name == EAGER.name
-
-
-def test_each_view_of_a_batch_counts_by_its_own_size():
-    """Density control finds for views of two sizes drawn together what it finds for each by itself."""
-    views = [small_view(*size, dtype=torch.float32) for size in ((37, 21), (80, 30), (37, 21))]
-    control, gaussians = DensityControl(DensityConfig()), random_gaussians(12, dtype=torch.float32)
-
-    def counted(batch: list[View], cameras: int) -> dict[str, torch.Tensor]:
-        leaves, shots = as_leaves(gaussians), [Shot(view, view.full) for view in batch]
-        rasters = EAGER.draw(leaves, shots, sh_degree=1, absgrad=True)
-        infos = tuple({id(r.info): {**r.info, "n_cameras": cameras} for r in rasters}.values())
-        control.before_backward(infos)
-        weights = [probe(*r.transmittance.shape, dtype=torch.float32) for r in rasters]
-        sum((stacked(r) * w).sum() for r, w in zip(rasters, weights, strict=True)).backward()
-        return control.count(gaussians.means, infos, 1)
-
-    together, one_by_one = counted(views, 3), [counted([view], 3) for view in views]
-    for name, value in together.items():
-        torch.testing.assert_close(value, sum(each[name] for each in one_by_one), rtol=1e-4, atol=1e-4)
-    assert float(together["grad2d"].abs().max()) > 0

@@ -95,14 +95,13 @@ def test_colours_equal_gsplats(degree):
         assert relative_error(value, reference) < 1e-10, name
 
 
-@pytest.mark.parametrize("absgrad", [False, True])
-def test_default_strategy_runs_unchanged(absgrad):
+def test_default_strategy_runs_unchanged():
     params = torch.nn.ParameterDict(
         {n: torch.nn.Parameter(v) for n, v in random_gaussians(30, dtype=torch.float32).items()}
     )
     optimizers = {name: torch.optim.Adam([params[name]], lr=1e-3) for name in PARAM_NAMES}
     strategy = DefaultStrategy(
-        refine_start_iter=0, refine_every=2, reset_every=5, grow_grad2d=1e-5, prune_opa=0.05, absgrad=absgrad
+        refine_start_iter=0, refine_every=2, reset_every=5, grow_grad2d=1e-5, prune_opa=0.05
     )
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state()
@@ -110,14 +109,14 @@ def test_default_strategy_runs_unchanged(absgrad):
     torch.manual_seed(0)
     counts = [30]
     for step in range(1, 9):
-        raster = rasterizer(Gaussians(**params), view, sh_degree=3, absgrad=absgrad)
+        raster = rasterizer(Gaussians(**params), view, sh_degree=3)
         strategy.step_pre_backward(params, optimizers, state, step, raster.info)
         (raster.color - 0.5).square().mean().backward()
         if step == 1:
             seen = raster.info["radii"][0] > 0
         strategy.step_post_backward(params, optimizers, state, step, raster.info)
         if step == 1:
-            grads = raster.info["means2d"].absgrad if absgrad else raster.info["means2d"].grad
+            grads = raster.info["means2d"].grad
             size = torch.tensor([view.width / 2, view.height / 2])
             torch.testing.assert_close(
                 state["grad2d"], torch.where(seen, (grads[0] * size).norm(dim=-1), 0.0)

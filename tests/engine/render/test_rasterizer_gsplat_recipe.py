@@ -1,4 +1,4 @@
-"""The gsplat backend's own logic (crops, frozen Gaussians, absgrad), with CPU stand-ins for the CUDA ops.
+"""The gsplat backend's own logic (crops, frozen Gaussians, sums), with CPU stand-ins for the CUDA ops.
 
 The real kernels are compared under tests/gpu.
 """
@@ -13,7 +13,6 @@ from abcd_ns.engine.render.cuda import backend as gsplat_backend
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.render.cuda.pairs import TILE
 from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.rasterizer_scenes import (
@@ -81,21 +80,19 @@ def test_the_near_plane_is_the_views(backend):
 @pytest.mark.parametrize("with_frozen", [False, True])
 def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen):
     frozen = random_gaussians(15, seed=3) if with_frozen else None
-    raster = backend(
-        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True
-    )
+    raster = backend(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen)
     expected = torch_twin(backend)(
-        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, absgrad=True
+        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen
     )
     size = raster.transmittance.shape
     for drawing in (raster, expected):
         drawing.info["means2d"].retain_grad()
+        drawing.info["sums"].ask([probe(*size)[..., :4]])
         (stacked(drawing) * probe(*size)).sum().backward()
     info = raster.info
     assert torch.equal(info["radii"], expected.info["radii"])
     assert relative_error(info["means2d"].grad, expected.info["means2d"].grad) < 1e-8
-    if backend.primitive.has_absgrad:
-        assert relative_error(info["means2d"].absgrad, expected.info["means2d"].absgrad) < 1e-8
+    assert relative_error(info["sums"].values, expected.info["sums"].values) < 1e-8
     assert (info["width"], info["height"]) == (VIEW.width, VIEW.height)
 
 
@@ -189,11 +186,13 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
             as_leaves(random_gaussians(40)),
             several_shots(torch_twin(backend, TILE), windowed, with_frozen),
         )
-        rasters = draws.draw(leaves, shots, sh_degree=2, absgrad=True)
+        rasters = draws.draw(leaves, shots, sh_degree=2)
         infos = {id(raster.info): raster.info for raster in rasters}
         assert {info["n_cameras"] for info in infos.values()} == {len(shots)}
         for info in infos.values():
             info["means2d"].retain_grad()
+            own = [r for r in rasters if r.info is info]
+            info["sums"].ask([probe(*r.transmittance.shape)[..., :4] for r in own])
         sum((stacked(r) * probe(*r.transmittance.shape)).sum() for r in rasters).backward()
         # One info for each size and near plane, or one for all: in the order of their cameras.
         places = [(id(raster.info), k) for k, raster in enumerate(rasters)]
@@ -201,9 +200,11 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
         assert sum(len(info["radii"]) for info in infos.values()) == len(shots)
         values = {"picture": torch.cat([stacked(raster).flatten() for raster in rasters])}
         values |= {name: value.grad for name, value in leaves.items()}
-        for name in ("grad", "absgrad")[: 1 + backend.primitive.has_absgrad]:
-            rows = torch.cat([getattr(info["means2d"], name) for info in infos.values()])
-            values[name] = rows[torch.tensor(order).argsort()]
+        for name, given in (
+            ("means2d", [info["means2d"].grad for info in infos.values()]),
+            ("sums", [info["sums"].values for info in infos.values()]),
+        ):
+            values[name] = torch.cat(given)[torch.tensor(order).argsort()]
         found.append(values)
     for name, value in found[0].items():
         assert relative_error(value.detach(), found[1][name].detach()) < 1e-8, name
@@ -294,9 +295,7 @@ def test_a_loss_of_nothing_has_a_gradient(backend):
     """A block whose last Gaussian was pruned is drawn until its visit ends."""
     leaves = as_leaves(Gaussians.empty())
     shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2
-    rasters = backend.draw(leaves, shots, sh_degree=3, absgrad=True)
-    control = DensityControl(DensityConfig())
-    control.before_backward(tuple(raster.info for raster in rasters))
+    rasters = backend.draw(leaves, shots, sh_degree=3)
     sum(stacked(raster).sum() for raster in rasters).backward()
     assert leaves.means.grad.shape == (0, 3)
-    assert control.count(leaves.means, tuple(raster.info for raster in rasters), 1) == {}
+    assert "sums" not in rasters[0].info

@@ -17,7 +17,7 @@ from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import listen, make_coordinator, whole_scene
 
 STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=1e-5, price=0.0)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0, price=0.0)
 LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
 """Enough for growth."""
 
@@ -169,7 +169,7 @@ def test_density_controls_clock_is_the_runs(tmp_path, views, photos, start, monk
     )
     found = []
 
-    def watch(_control, _params, _optimizers, growth, _infos, clock):
+    def watch(_control, _params, _optimizers, growth, _infos, _judged, clock):
         found.append(clock.progress)
         return growth
 

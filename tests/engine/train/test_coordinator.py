@@ -26,7 +26,7 @@ from tests.reference.scenes import (
     whole_scene,
 )
 
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
 
 
 BOTH = pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])

@@ -22,7 +22,7 @@ from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import equal, listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=2e-4, price=0.0)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0, price=0.0)
 
 
 def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:

@@ -17,7 +17,7 @@ from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.reference.scenes import listen, make_coordinator, random_gaussians, whole_scene
 
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, densify_grad_thresh=1e-5)
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
 
 
 def rows(state: BlockState) -> set[tuple[float, ...]]:

@@ -113,9 +113,7 @@ def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(
 
 
 def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(tmp_path, views, photos, start):
-    density = DensityConfig(
-        refine_start=0.0, refine_stop=0.01, refine_every=1, densify_grad_thresh=1e-9, price=0
-    )
+    density = DensityConfig(refine_start=0.0, refine_stop=0.01, refine_every=1, split_pixels=0.0, price=0)
     coordinator = make_coordinator(
         tmp_path, start, views, blocks=2, steps=60, scaffold=40, visit_steps=8, density=density
     )

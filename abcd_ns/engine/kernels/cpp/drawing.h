@@ -12,7 +12,7 @@
 
 namespace drawing {
 constexpr int SIDE = 4, PIXELS = SIDE * SIDE, VECTORS = PIXELS / LANES;
-constexpr int CHANNELS = 3, GROWTH = 10;  // w, w r, w r x, w r y
+constexpr int CHANNELS = 3, RESIDUAL = 4, GROWTH = 10;  // w f, w r, w r x, w r y
 constexpr int64_t AT_ONCE = 4096;
 constexpr int AHEAD = 4;  // records are fetched so many before they are needed
 
@@ -371,7 +371,7 @@ struct Batch {
         for (int c = 0; c < 4; c++) found[Shape::COLORS + c] += w[l] * up[c][p];
         if (GROWS) {
           V* more = found + Shape::SUMS;
-          more[0] += w[l];
+          more[0] += w[l] * residual[CHANNELS][p];
           for (int c = 0; c < CHANNELS; c++) {
             const V asks = w[l] * residual[c][p];
             more[1 + c] += asks, more[4 + c] -= asks * dx[px], more[7 + c] -= asks * dy[py];  // pixel - mean
@@ -397,7 +397,7 @@ struct Batch {
 // so that front to back serves as well as back to front.
 template <class Shape, bool GROWS>
 static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image* drawn, float* rows,
-                      float* absolute, float* weights, float* growth) {
+                      float* weights, float* growth) {
   using Few = Batch<Shape, GROWS>;
   std::vector<std::vector<float>> sums(lists.bands.size());
   parallel(int64_t(lists.bands.size()), [&](int64_t b) {
@@ -411,7 +411,7 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
     for (int t = 0; t + 1 < int(band.start.size()); t++) {
       if (band.start[t] == band.walked[t]) continue;
       const Tile tile(lists, band, t, picture);
-      float up[4][PIXELS] = {}, total[PIXELS] = {}, residual[CHANNELS][PIXELS] = {};
+      float up[4][PIXELS] = {}, total[PIXELS] = {}, residual[RESIDUAL][PIXELS] = {};
       tile.pixels(picture, [&](int v, int l, int64_t p) {
         const int k = v * LANES + l;
         if (grad.color)
@@ -420,7 +420,7 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
         if (grad.depth) up[3][k] = grad.depth[p], total[k] += up[3][k] * picture_drawn.depth[p];
         if (grad.transmittance) total[k] += grad.transmittance[p] * picture_drawn.transmittance[p];
         if (GROWS)
-          for (int c = 0; c < CHANNELS; c++) residual[c][k] = grad.residual[3 * p + c];
+          for (int c = 0; c < RESIDUAL; c++) residual[c][k] = grad.residual[RESIDUAL * p + c];
       });
       V e[4][VECTORS], rest[VECTORS];
       for (int v = 0; v < VECTORS; v++) {
@@ -468,8 +468,6 @@ static void draw_back(Lists& lists, int64_t own, const Image* grads, const Image
         if (weights) weights[column] += g[2], g[2] = 0;
         float* to = rows + (column - within) * Shape::ROWS + within;
         for (int c = 0; c < Shape::GRADED; c++) to[c * part.count] += g[c];
-        if (absolute && Shape::ABSOLUTE >= 0)
-          for (int c = 0; c < 2; c++) absolute[2 * column + c] += Shape::absolute(s, c);
         if (GROWS)
           for (int c = 0; c < GROWTH; c++) growth[GROWTH * column + c] += s[Shape::SUMS + c];
       }
@@ -560,14 +558,13 @@ extern "C" void abcd_free(Lists* lists) { delete lists; }
 extern "C" void abcd_draw(Lists* lists, const Picture* windows, const Image* images, int keep) {
   OF_SHAPE(lists, draw)(*lists, windows, images, keep);
 }
-// `rows` [views, rows, n], `absolute` and `weights` [views, n] (or null) and `growth` [views, n, 10] (or null)
-// are zero before.
+// `rows` [views, rows, n], `weights` [views, n] (or null) and `growth` [views, n, 10] (or null) are zero before.
 extern "C" void abcd_draw_back(Lists* lists, int64_t own, const Image* grads, const Image* drawn, float* rows,
-                               float* absolute, float* weights, float* growth) {
+                               float* weights, float* growth) {
   using namespace drawing;
   auto back = growth ? (lists->is_surfel ? draw_back<Surfel, true> : draw_back<Splat, true>)
                      : (lists->is_surfel ? draw_back<Surfel, false> : draw_back<Splat, false>);
-  back(*lists, own, grads, drawn, rows, absolute, weights, growth);
+  back(*lists, own, grads, drawn, rows, weights, growth);
 }
 extern "C" void abcd_windows(Lists* lists, float visible, float* near, float* far, double* held, double* mass) {
   OF_SHAPE(lists, windows)(*lists, visible, near, far, held, mass);

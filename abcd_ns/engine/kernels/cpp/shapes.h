@@ -32,7 +32,7 @@ static inline V alpha_of(V opacity, V bits, I drawn) {
 // bits (times log2 e), opacity and color.
 struct Splat {
   static constexpr int ROWS = 14, GRADED = 10, OPACITY = 6, RADIUS = 13;  // of planes
-  static constexpr int PARAMETERS = 6, ALPHA = 6, SUMS = 12, COLORS = 6, ABSOLUTE = 10;  // of records and sums
+  static constexpr int PARAMETERS = 6, ALPHA = 6, SUMS = 10, COLORS = 6;  // of records and sums
   static constexpr bool IS_SURFEL = false;
 
   static void record(const float* p, int64_t row, float* r) {
@@ -59,9 +59,7 @@ struct Splat {
     const V s_dx = s * dx, s_dy = s * dy;
     sums[0] += s, sums[1] += s_dx, sums[2] += s_dy;
     sums[3] += s_dx * dx, sums[4] += s_dx * dy, sums[5] += s_dy * dy;
-    sums[10] += vabs(2 * r[3] * s_dx + r[4] * s_dy), sums[11] += vabs(r[4] * s_dx + 2 * r[5] * s_dy);
   }
-  static float absolute(const float* s, int axis) { return s[ABSOLUTE + axis] / LOG2_E; }
 
   static void to_rows(const float* r, const float* p, int64_t row, const float* s, float* g) {
     const float a = p[3 * row], b = p[4 * row], c = p[5 * row];
@@ -76,7 +74,7 @@ struct Splat {
 // Records hold u, v, z, e - d, A, B, C, D, W, Wx, Wy, opacity and color.
 struct Surfel {
   static constexpr int ROWS = 19, GRADED = 15, OPACITY = 11, RADIUS = 18;
-  static constexpr int PARAMETERS = 12, ALPHA = 12, SUMS = 16, COLORS = 12, ABSOLUTE = -1;
+  static constexpr int PARAMETERS = 12, ALPHA = 12, SUMS = 16, COLORS = 12;
   static constexpr bool IS_SURFEL = true;
 
   static void relative(const float* p, int64_t row, float* m) {  // a b c d e f
@@ -151,7 +149,6 @@ struct Surfel {
     sums[6] += q * dy, sums[7] += k, sums[8] += k * dx, sums[9] += k * dy;
     sums[10] += filtered * ex, sums[11] += filtered * ey;
   }
-  static float absolute(const float*, int) { return 0; }
 
   static void to_rows(const float* r, const float* planes, int64_t row, const float* s, float* g) {
     float m[6];

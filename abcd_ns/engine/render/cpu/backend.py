@@ -15,6 +15,7 @@ from abcd_ns.engine.render.cpu import native, reference
 from abcd_ns.engine.render.image_size import image_size
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, camera_numbers, check_degree, project_in_torch
+from abcd_ns.engine.render.residual_sums import ResidualSums, SumsApart
 from abcd_ns.engine.render.splat_kernels import DEPTH
 from abcd_ns.engine.render.together import runs
 from abcd_ns.engine.render.z_window import ZWindow, showing, window_between
@@ -92,32 +93,27 @@ class TorchRasterizer(Rasterizer):
         *,
         sh_degree: int,
         antialiased: bool = False,
-        absgrad: bool = False,
         weigh: bool = False,
     ) -> tuple[Raster, ...]:
-        """See Rasterizer.draw. One pass for all shots: overheads are paid once.
-
-        By the native library `info["drawing"]` takes residuals and gives sums for growth, see native.Drawing.
-        """
+        """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
         planes = self._project(gaussians, [shot.view for shot in shots], sh_degree, antialiased)
         center = slice(self.primitive.center, self.primitive.center + 2)
         takes = planes.requires_grad
         means2d = planes.detach()[:, center].transpose(1, 2).contiguous().requires_grad_(takes)
         weights = torch.zeros_like(planes[:, DEPTH]).requires_grad_() if weigh else None
         info = _info(means2d, planes, shots) | ({"weights": weights} if weigh else {})
-        target = means2d if absgrad and self.primitive.has_absgrad else None
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
         crops, windows = [shot.crop for shot in shots], [shot.z_window for shot in shots]
         if self._suits(gaussians, planes, *(others for _, others in frozen)):
             parts = [native.Part(own, k, shots[k].frozen is None) for k, own in enumerate(planes)]
             parts += [native.Part(others, k, True) for k, others in frozen]
             lists = native.Lists(parts, crops, self.primitive, windows, weighs=weigh)
-            info["drawing"] = native.Drawing(lists, target)
-            drawn = iter(native.Composite.apply(planes, means2d, weights, info["drawing"]))
+            info["sums"] = native.Drawing(lists)
+            drawn = iter(native.Composite.apply(planes, means2d, weights, info["sums"]))
             return tuple(
                 Raster(color, left, depth, info) for color, left, depth in zip(*[drawn] * 3, strict=True)
             )
-        images = self._composited_in_torch(planes, shots, means2d, weights, target)
+        images, info["sums"] = self._composited_in_torch(planes, shots, means2d, weights)
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
     def _composited_in_torch(
@@ -126,10 +122,8 @@ class TorchRasterizer(Rasterizer):
         shots: Sequence[Shot],
         means2d: Float[Tensor, "v n 2"],
         weights: Float[Tensor, "v n"] | None,
-        target: Tensor | None,
-    ) -> list[Float[Tensor, "5 h w"]]:
-        """By reference.composite; see native.Composite for `means2d` and `weights`, native.Drawing for
-        `target`."""
+    ) -> tuple[list[Float[Tensor, "5 h w"]], ResidualSums]:
+        """By reference.composite; see native.Composite for `means2d` and `weights`."""
         center = self.primitive.center
         frozen = [(k, shot.frozen.planes) for k, shot in enumerate(shots) if shot.frozen is not None]
         windows = [shot.z_window for shot in shots]
@@ -150,10 +144,13 @@ class TorchRasterizer(Rasterizer):
         if any(window is not None for window in windows):
             applies = [shot.frozen is None for shot in shots] + [True] * len(frozen)
             lists = lists.within(windows, _repeated(applies, counts, planes))
-        absolute = None if target is None else torch.zeros_like(bounds[:2].T)
-        if target is not None:
-            target.absgrad = absolute[: means2d[..., 0].numel()].view_as(means2d)
-        return reference.composite(rows, lists, self.primitive, absolute)
+        images, drawn = reference.composite(rows, lists, self.primitive), rows.detach()
+
+        def find(residuals: Sequence[Tensor]) -> Float[Tensor, "v n 10"]:
+            sums = reference.residual_sums(drawn, lists, self.primitive, residuals)
+            return sums[: means2d[..., 0].numel()].view(*means2d.shape[:2], -1)
+
+        return images, SumsApart(find)
 
     @torch.no_grad()
     def cuts(

@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from abcd_ns.engine.kernels.native import address, library
 from abcd_ns.engine.render.primitive import Primitive
+from abcd_ns.engine.render.residual_sums import SUMS
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians
@@ -21,8 +22,6 @@ SIDE = 4
 """Of its tiles, px: a tile is 16 lanes."""
 COEFFICIENTS = (0, 3, 8, 15)
 """Of harmonics above degree 0, that it takes."""
-GROWTH = 10
-"""Sums for growth, of each Gaussian and view; see `Drawing.residuals`."""
 _POINTER = ctypes.c_void_p
 
 
@@ -193,16 +192,16 @@ def _as_images(images: Sequence[Sequence[Tensor | None]]) -> ctypes.Array:
 
 @dataclass
 class Drawing:
-    """All that compositing needs besides tensors that take gradients."""
+    """What compositing needs besides tensors that take gradients: ResidualSums, too."""
 
     lists: Lists
-    absgrad_target: Tensor | None
-    """Gets an attribute `absgrad` in the backward pass; None where the primitive has no such sums."""
     residuals: list[Tensor] | None = None
-    """Of each picture, [h, w, 3], put there before the backward pass, which then leaves `growth` [v, n, 10]:
-    sums over pixels of w, w r, w r x and w r y, with the weight w = alpha T, the residual r by channel, and
-    (x, y) the pixel less the Gaussian's middle."""
-    growth: Tensor | None = None
+    values: Tensor | None = None
+    """See ResidualSums."""
+
+    def ask(self, residuals: Sequence[Tensor]) -> None:
+        """See ResidualSums."""
+        self.residuals = [residual.contiguous() for residual in residuals]
 
 
 class Composite(torch.autograd.Function):
@@ -230,23 +229,18 @@ class Composite(torch.autograd.Function):
         drawing, (views, _, n) = ctx.drawing, ctx.shape
         lists, center = drawing.lists, drawing.lists.primitive.center
         rows, weights = torch.zeros(ctx.shape), torch.zeros((views, n)) if ctx.weighs else None
-        target, residuals = drawing.absgrad_target, drawing.residuals
-        absolute = None if target is None else torch.zeros((views, n, 2))
-        drawing.growth = torch.zeros((views, n, GROWTH)) if residuals else None
+        residuals = drawing.residuals
+        drawing.values = torch.zeros((views, n, SUMS)) if residuals else None
         held = [None if grad is None else grad.contiguous() for grad in grads]
         asked = [held[k : k + 3] for k in range(0, len(held), 3)]
         if residuals:
-            asked = [
-                [*given, residual.contiguous()] for given, residual in zip(asked, residuals, strict=True)
-            ]
+            asked = [[*given, residual] for given, residual in zip(asked, residuals, strict=True)]
         drawn = [ctx.saved_tensors[k : k + 3] for k in range(0, len(held), 3)]
         library().abcd_draw_back(
             lists.handle,
             ctypes.c_int64(views * n),
             _as_images(asked),
             _as_images(drawn),
-            *(_POINTER(address(each)) for each in (rows, absolute, weights, drawing.growth)),
+            *(_POINTER(address(each)) for each in (rows, weights, drawing.values)),
         )
-        if target is not None:
-            target.absgrad = absolute
         return rows, rows[:, center : center + 2].transpose(1, 2).contiguous(), weights, None

@@ -4,7 +4,7 @@ A pair is a Gaussian and a tile that may draw it. The state of a pixel is its tr
 added up; compositing stops for good at the fragment that would bring T to 1e-4 or below.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -17,6 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from abcd_ns.engine.render import splat_kernels as splat
 from abcd_ns.engine.render import surfel_kernels as surfel
 from abcd_ns.engine.render.primitive import Primitive
+from abcd_ns.engine.render.residual_sums import about, moments
 from abcd_ns.engine.render.splat_kernels import DEPTH, GSPLAT_TILE, MIN_ALPHA, REACH_MARGIN, X, Y
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.z_window import ZWindow, ends_of
@@ -136,19 +137,11 @@ def _pixels(grid: TileGrid) -> tuple[Tensor, Tensor, Tensor]:
     return x, y, inside
 
 
-def _alphas(
-    rows: Float[Tensor, "d t k"], group: _Group, primitive: Primitive, watch: Callable[[Tensor, int], None]
-) -> Float[Tensor, "t k p"]:
-    """min(0.999, opacity exp(-sigma)) of each fragment, 0 where it is not drawn.
-
-    Args:
-        watch: told dx and dy, mean less pixel, whose gradients are the means' by pixel.
-    """
+def _alphas(rows: Float[Tensor, "d t k"], group: _Group, primitive: Primitive) -> Float[Tensor, "t k p"]:
+    """min(0.999, opacity exp(-sigma)) of each fragment, 0 where it is not drawn."""
     center = primitive.center
     dx = rows[center, ..., None] - group.x[:, None]
     dy = rows[center + 1, ..., None] - group.y[:, None]
-    watch(dx, 0)
-    watch(dy, 1)
     if primitive.name == "3dgs":
         xx, xy, yy = rows[splat.CONIC_XX : splat.CONIC_YY + 1, ..., None]
         sigma = dx * (0.5 * xx * dx + xy * dy) + 0.5 * yy * dy * dy
@@ -182,24 +175,15 @@ def _advance(left: Tensor, live: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor,
     return torch.where(live, next_left, left), live, torch.where(live, alpha * left, 0.0)
 
 
-def composite(
-    rows: Float[Tensor, "d n"],
-    lists: Lists,
-    primitive: Primitive,
-    absolute: Float[Tensor, "n 2"] | None = None,
-) -> list[Float[Tensor, "5 h w"]]:
-    """Transmittance, colour and depth of each picture; differentiable in the rows that take gradients.
-
-    Args:
-        absolute: the backward pass adds sum |dL/d(x, y)| over pixels to it.
-    """
+def composite(rows: Float[Tensor, "d n"], lists: Lists, primitive: Primitive) -> list[Float[Tensor, "5 h w"]]:
+    """Transmittance, colour and depth of each picture; differentiable in the rows that take gradients."""
     tiled = rows.new_zeros((5, lists.starts[-1], lists.grids[0].pixels_per_tile))
     tiled[0] = 1.0
     tiled = tiled + rows[:, :0].sum()  # in the graph, even if nothing is drawn
     takes = rows.requires_grad and torch.is_grad_enabled()
     for group in _groups(lists):
         columns = lists.column[group.pairs]
-        given = (rows, columns, group, primitive, partial(_watch, absolute, columns))
+        given = (rows, columns, group, primitive)
         draw = partial(checkpoint, _composite_group, use_reentrant=False) if takes else _composite_group
         drawn = draw(*given)
         tiled = tiled.index_copy(1, group.tiles, drawn)
@@ -208,10 +192,10 @@ def composite(
 
 
 def _composite_group(
-    rows: Tensor, columns: Tensor, group: _Group, primitive: Primitive, watch: Callable[[Tensor, int], None]
+    rows: Tensor, columns: Tensor, group: _Group, primitive: Primitive
 ) -> Float[Tensor, "5 t p"]:
     chosen = rows.index_select(1, columns.flatten()).view(len(rows), *columns.shape)
-    alphas = _alphas(chosen, group, primitive, watch)
+    alphas = _alphas(chosen, group, primitive)
     left, live = torch.ones_like(group.x), group.inside
     sums = [torch.zeros_like(left) for _ in range(4)]
     values = (*chosen[-3:], chosen[DEPTH])
@@ -221,13 +205,26 @@ def _composite_group(
     return torch.stack((left, *sums))
 
 
-def _watch(absolute: Tensor | None, columns: Tensor, offset: Tensor, axis: int) -> None:
-    if absolute is not None and offset.requires_grad:
-        offset.register_hook(partial(_add_absolute, absolute, columns, axis))
-
-
-def _add_absolute(absolute: Tensor, columns: Tensor, axis: int, grad: Tensor) -> None:
-    absolute[:, axis].index_add_(0, columns.flatten(), grad.abs().sum(dim=2).flatten())
+def residual_sums(
+    rows: Float[Tensor, "d n"],
+    lists: Lists,
+    primitive: Primitive,
+    residuals: Sequence[Float[Tensor, "_h _w 4"]],
+) -> Float[Tensor, "n 10"]:
+    """See ResidualSums, of each column: gradients by colours, which stand for them, and by the depth."""
+    leaf = torch.zeros_like(rows[:4])
+    asked = [moments(r, grid.crop).to(rows) for r, grid in zip(residuals, lists.grids, strict=True)]
+    with torch.enable_grad():
+        *colors, depth = leaf.requires_grad_()
+        painted = torch.stack([*rows[:DEPTH], depth, *rows[DEPTH + 1 : -3], *colors])
+        drawn = [image[1:] for image in composite(painted, lists, primitive)]
+    found = []
+    for k in (1, 4, 7):
+        upstream = [torch.cat((part[..., k : k + 3], part[..., :1]), dim=-1) for part in asked]
+        upstream = [part.permute(2, 0, 1) for part in upstream]
+        found.append(torch.autograd.grad(drawn, leaf, upstream, retain_graph=k < 7)[0])
+    sums = torch.cat((found[0][3:], *(part[:3] for part in found))).T
+    return about(sums, rows[primitive.center : primitive.center + 2].T)
 
 
 @torch.no_grad()
@@ -235,7 +232,7 @@ def pair_weights(rows: Float[Tensor, "d n"], lists: Lists, primitive: Primitive)
     """For each pair the sum of the Gaussian's weight alpha T over the tile's pixels."""
     found = torch.zeros_like(lists.z)
     for group in _groups(lists):
-        alphas = _alphas(rows[:, lists.column[group.pairs]], group, primitive, lambda *_: None)
+        alphas = _alphas(rows[:, lists.column[group.pairs]], group, primitive)
         left, live = torch.ones_like(group.x), group.inside
         for k in range(group.pairs.shape[1]):
             left, live, weight = _advance(left, live, alphas[:, k])
@@ -254,7 +251,7 @@ def deepen(
     tiled = grid.to_tiles(state, fill=-1.0).transpose(1, 2).contiguous()
     for group in _groups(lists):
         columns = lists.column[group.pairs]
-        alphas = _alphas(rows[:, columns], group, primitive, lambda *_: None)
+        alphas = _alphas(rows[:, columns], group, primitive)
         left, depth = tiled[:, group.tiles]
         for k in range(columns.shape[1]):
             passes = left > 0.5

@@ -3,7 +3,6 @@
 Importing this module imports gsplat, which compiles its CUDA extension at the first call if need be.
 """
 
-import weakref
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -21,6 +20,7 @@ from abcd_ns.engine.render.cuda.projection import Cameras, Projected, place_on_s
 from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, check_degree
+from abcd_ns.engine.render.residual_sums import SumsApart
 from abcd_ns.engine.render.together import DEVICE_PIXELS, DEVICE_SPLATS, Item, runs
 from abcd_ns.engine.render.z_window import ZWindow
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -75,7 +75,6 @@ class GsplatRasterizer(Rasterizer):
         *,
         sh_degree: int,
         antialiased: bool = False,
-        absgrad: bool = False,
         weigh: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
@@ -85,7 +84,7 @@ class GsplatRasterizer(Rasterizer):
         kinds = [(s.view.width, s.view.height, s.view.near, s.frozen is None) for s in shots]
         for places in _alike(kinds):
             alike = [shots[k] for k in places]
-            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, absgrad, weigh)
+            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, weigh)
             rasters.update(zip(places, drawn, strict=True))
         for raster in rasters.values():
             raster.info["n_cameras"] = len(shots)
@@ -138,7 +137,6 @@ class GsplatRasterizer(Rasterizer):
         shots: Sequence[Shot],
         sh_degree: int,
         antialiased: bool,
-        absgrad: bool,
         weigh: bool,
     ) -> list[Raster]:
         views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
@@ -155,11 +153,9 @@ class GsplatRasterizer(Rasterizer):
         if windowed:
             always = 0 if shots[0].frozen is None else own.radii.numel()
             drawing = drawing.windowed(windows, always)
-        absgrad = absgrad and self.primitive.has_absgrad
-        if absgrad and own.means2d.requires_grad:
-            _forward_absgrad(own.means2d, drawing.means2d)
         info = _info(own, views[0]) | ({"weights": own.weights} if weigh else {})
-        sheet = drawing.rasterized(absgrad)
+        info["sums"] = SumsApart(partial(drawing.residual_sums, own.centers.detach()))
+        sheet = drawing.rasterized()
         return [Drawn(*sheet, k, part, info) for k, part in enumerate(drawing.parts)]
 
 
@@ -175,21 +171,6 @@ def _a_few(
 def _alike(kinds: Sequence[object]) -> list[list[int]]:
     """Places of equal kinds."""
     return [[k for k, each in enumerate(kinds) if each == kind] for kind in dict.fromkeys(kinds)]
-
-
-def _forward_absgrad(means2d: Float[Tensor, "c n 2"], drawn: Float[Tensor, "m 2"]) -> None:
-    """Have gsplat's `absgrad`, which it leaves on the tensor it drew from, appear on `means2d` too.
-
-    The hook holds `means2d` weakly, and `means2d` holds `drawn`: otherwise the graph would hold itself.
-    """
-    means2d.drawn_from = drawn
-    means2d.register_hook(partial(_copy_absgrad, weakref.ref(means2d)))
-
-
-def _copy_absgrad(reference: weakref.ref, _: Tensor) -> None:
-    target = reference()
-    if target is not None:
-        target.absgrad = target.drawn_from.absgrad[: target.numel() // 2].view_as(target)
 
 
 def _info(own: Projected, view: View) -> dict[str, Any]:

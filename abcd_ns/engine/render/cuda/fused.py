@@ -9,11 +9,11 @@ from torch import Tensor
 
 try:
     from abcd_ns.engine.render.cuda import between as _between
+    from abcd_ns.engine.render.cuda import by_gaussian as _by_gaussian
     from abcd_ns.engine.render.cuda import photometric as _loss
-    from abcd_ns.engine.render.cuda import statistics as _statistics
     from abcd_ns.engine.render.cuda import windowed as _windowed
 except ImportError:  # Triton comes with torch for Linux
-    _between = _loss = _statistics = _windowed = None
+    _between = _loss = _by_gaussian = _windowed = None
 
 
 class Fused:
@@ -59,8 +59,7 @@ def _is_of_the_device(error: Exception) -> bool:
 
 
 photometric = Fused("The loss", _loss and _loss.photometric)
-statistics = Fused("The statistics of density control", _statistics and _statistics.statistics)
-shade = Fused("The colours", _statistics and _statistics.shade)
-skips = Fused("The look at gradients", _statistics and _statistics.skips)
+shade = Fused("The colours", _by_gaussian and _by_gaussian.shade)
+skips = Fused("The look at gradients", _by_gaussian and _by_gaussian.skips)
 between = Fused("Compositing", _between and _between.between)
 windowed = Fused("The windows", _windowed and _windowed.windowed)

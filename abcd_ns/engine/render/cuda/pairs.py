@@ -19,6 +19,7 @@ from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.kinds import Kind
 from abcd_ns.engine.render.cuda.projection import Cameras, Projected
 from abcd_ns.engine.render.projection import Splats
+from abcd_ns.engine.render.residual_sums import SUMS, about, moments
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.render.z_window import ZWindow, ends_of, showing
 from abcd_ns.engine.types import Crop, Layer
@@ -183,7 +184,6 @@ class Drawing:
         """
         sheet = Sheet(tuple(crops), windowed)
         # Shifting the principal point instead would change the picture: the projection's clamp depends on it.
-        # By 0 too: a view would hold on to what it is of, which holds on to this (see _forward_absgrad).
         corners = cameras.corners(sheet.tiled, splats.means2d)
         corners = corners if len(crops) == 1 else corners.index_select(0, splats.cameras)
         means2d, shapes = splats.means2d - corners, kind.moved(splats.shapes, corners)
@@ -256,12 +256,10 @@ class Drawing:
         counts = of_cameras.sum(1).tolist()
         return [own[:count] for own, count in zip(ids, counts, strict=True)]
 
-    def rasterized(self, absgrad: bool = False) -> tuple[Float[Tensor, "c h w 4"], Float[Tensor, "c h w 1"]]:
+    def rasterized(self) -> tuple[Float[Tensor, "c h w 4"], Float[Tensor, "c h w 1"]]:
         """Features and alphas of the whole sheet."""
         splats = self.splats
-        return self._rasterize(
-            self.means2d, self.shapes, splats.features, splats.opacities, self.owners, absgrad
-        )
+        return self._rasterize(self.means2d, self.shapes, splats.features, splats.opacities, self.owners)
 
     def layers(self) -> list[Layer]:
         """What each crop looks like."""
@@ -301,6 +299,25 @@ class Drawing:
             (found,) = torch.autograd.grad(torch.stack(shown).sum(), dark)
         return found[:, 0]
 
+    def residual_sums(
+        self, middles: Float[Tensor, "c n 2"], residuals: Sequence[Float[Tensor, "_h _w 4"]]
+    ) -> Float[Tensor, "c n 10"]:
+        """See ResidualSums: gradients by features, which stand for them, of the first splats, c n in all.
+
+        Args:
+            middles: of these on screen, px of the images.
+        """
+        parts = (self.means2d, self.shapes, self.splats.opacities)
+        means2d, shapes, opacities = (part.detach() for part in parts)
+        dark = means2d.new_zeros((len(means2d), SUMS)).requires_grad_()
+        with torch.enable_grad():
+            pictures, _ = self._rasterize(means2d, shapes, dark, opacities, self.owners)
+        upstream = torch.zeros_like(pictures)
+        for one, part, crop, residual in zip(upstream, self.parts, self.sheet.crops, residuals, strict=True):
+            one[part] = moments(residual, crop)
+        (found,) = torch.autograd.grad(pictures, dark, upstream)
+        return about(found[: middles[..., 0].numel()].view(*middles.shape[:2], SUMS), middles)
+
     def _rasterize(
         self,
         means2d: Float[Tensor, "p 2"],
@@ -308,7 +325,6 @@ class Drawing:
         features: Float[Tensor, "p f"],
         opacities: Float[Tensor, "p"],
         owners: Int[Tensor, "q"],
-        absgrad: bool = False,
     ) -> tuple[Tensor, Tensor]:
         cameras, rows, cols = self.sheet.shape
         return self.kind.draw(
@@ -323,7 +339,6 @@ class Drawing:
             # Not only for speed: gsplat's backward pass reads a list to its end, though no pixel asks for it.
             masks=self.sheet.drawn(means2d.device),
             packed=True,
-            absgrad=absgrad,
         )
 
     @property

@@ -1,15 +1,14 @@
 """Growing and pruning the active block, on the block's own clock.
 
-The default strategy is 3DGS's, judged by AbsGS's gradients, but for how one Gaussian becomes two (see
-`growing`); MCMC is gsplat's own. gsplat's strategies keep a schedule in absolute steps of one global run.
+The default strategy splits what is worth it (see `worth`) and takes out what fills little (see `shedding`);
+MCMC is gsplat's own. gsplat's strategies keep a schedule in absolute steps of one global run.
 Here the schedule is in shares of the run and in the block's own steps, so it is kept in this file.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import reduce
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -17,8 +16,7 @@ from gsplat.strategy import MCMCStrategy
 from gsplat.strategy import ops as gsplat_ops
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
-from abcd_ns.engine.render.cuda import fused
+from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.render.primitive import SPLATS, Primitive
 from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.density.clock import DensityClock
@@ -27,20 +25,18 @@ from abcd_ns.engine.train.density.relocation import binomials, compute_relocatio
 from abcd_ns.engine.train.density.shedding import (
     FAINT,
     LAST,
-    WEIGHED,
     are_weighed,
     fills,
     haze,
-    may_grow,
     risen,
     weigh,
 )
+from abcd_ns.engine.train.density.worth import WORTH, Judged, asked_for, worth
+from abcd_ns.engine.types import Gaussians
 
 GATHER, REFINE = 1, 6
 """Step numbers as gsplat's MCMC sees them; it refines on multiples of the second."""
 
-GRADIENTS = ("grad2d", "count")
-"""What gsplat's default strategy adds up for each Gaussian, under its names."""
 REFINE_UNTIL, RESET_UNTIL = 0.5, 0.4
 """Share of a visit among others after which none is refined; of a warm-up after which no opacity is reset."""
 WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
@@ -49,8 +45,6 @@ or so many views if these are more, or all of the scene's: also a short one is t
 every view asks for."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
-PLAIN_GRADIENT = 0.25
-"""Thresholds of gradients, as a share of those of absolute ones: 0.0002 (3DGS, 2DGS) of 0.0008 (AbsGS)."""
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 MCMC_NOISE_LR = 5e5
@@ -68,7 +62,7 @@ class DensityConfig:
     """When and how the number of Gaussians changes. Thresholds are splatfacto's but that of opacities."""
 
     strategy: Literal["default", "mcmc", "off"] = "default"
-    """`default`: make two of one by gradient, and prune. `mcmc`: relocate, and add up to a limit."""
+    """`default`: split what is worth it, and prune. `mcmc`: relocate, and add up to a limit."""
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
@@ -82,15 +76,13 @@ class DensityConfig:
     (`default` strategy); 0 means never."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
-    densify_grad_thresh: float = 0.0008
-    """Mean norm of the screen-space gradient over which a Gaussian becomes two."""
-    use_absgrad: bool = True
-    """Judge by the sum of absolute per-pixel gradients (AbsGS) rather than by their sum. Surfels have no such
-    sums: they are judged by a quarter of the threshold."""
+    split_pixels: float = 8.0
+    """A Gaussian is split where that would remove as much squared error, in all views of its block together,
+    as so many pixels have in the mean; at most a tenth of a block's in a refinement (`default` strategy)."""
     price: float = 8.0
     """Pixels that a Gaussian must fill (sum of alpha T) in all views of its block together, once growth ends;
-    those that fill less go, and those that fill less than four times as many do not grow (`default`
-    strategy). 0 keeps everything, haze too, and whatever a complete run could spare (`mcmc` as well)."""
+    those that fill less go (`default` strategy). 0 keeps everything, haze too, and whatever a complete run
+    could spare (`mcmc` as well)."""
     max_gaussians: int = 0
     """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
     to begin with, a random choice of them begins."""
@@ -103,36 +95,16 @@ class DensityConfig:
         return MCMC_DEFAULT_CAP if self.strategy == "mcmc" else None
 
 
-def for_primitive(config: DensityConfig, primitive: Primitive) -> DensityConfig:
-    """The options where Gaussians are of a primitive."""
-    if not config.use_absgrad or primitive.has_absgrad:
-        return config
-    plain = config.densify_grad_thresh * PLAIN_GRADIENT
-    return replace(config, use_absgrad=False, densify_grad_thresh=plain)
-
-
 class DensityControl:
     """Applies the configured strategy to the live block."""
 
     def __init__(self, config: DensityConfig, primitive: Primitive = SPLATS) -> None:
-        self.config, self._axes = for_primitive(config, primitive), primitive.axes
-        self._binomials = binomials()
-
-    @property
-    def absgrad(self) -> bool:
-        """Whether the rasterizer must leave `absgrad` on `means2d`."""
-        return self.config.strategy == "default" and self.config.use_absgrad
+        self.config, self._axes, self._binomials = config, primitive.axes, binomials()
 
     @property
     def weighs(self) -> bool:
         """Whether the rasterizer must leave `weights`."""
         return self.config.strategy == "default" and self.config.price > 0
-
-    def before_backward(self, infos: Infos) -> None:
-        """Keep the gradient of the projected means, by which the default strategy judges."""
-        for info in infos:
-            if self.config.strategy == "default" and info["means2d"].requires_grad and not self.absgrad:
-                info["means2d"].retain_grad()
 
     def regularisation(self, params: Params, scene_gaussians: int) -> Tensor:
         """The terms which `mcmc` adds to the loss: means over the scene, of which the block is a part."""
@@ -161,13 +133,23 @@ class DensityControl:
             return False
         return clock.steps - clock.refined >= every
 
-    def refines(self, clock: DensityClock, infos: Infos) -> bool:
-        """Whether this step refines: it is due, and where gradients decide there are any.
+    def refines(self, clock: DensityClock, growth: Mapping[str, Tensor]) -> bool:
+        """Whether this step refines: it is due, and by default there is something to judge by.
 
         Args:
-            infos: of the step's drawings, after backward.
+            growth: the block's statistics, this step's included.
         """
-        return self.is_due(clock) and (self.config.strategy != "default" or bool(self._with_gradient(infos)))
+        return self.is_due(clock) and (self.config.strategy != "default" or WORTH in growth)
+
+    def asks(self, progress: float, first: bool) -> bool:
+        """Whether growth is still to come, so that residuals are to be summed.
+
+        Args:
+            progress: share of the run that is done.
+            first: whether a block among others is in its first visit.
+        """
+        ends = self.config.refine_stop
+        return self.config.strategy == "default" and progress < (max(ends, LAST) if first else ends)
 
     def resets(self, clock: DensityClock) -> bool:
         """Whether this step resets opacities (`default` strategy); that needs no gradients. Among others
@@ -178,63 +160,18 @@ class DensityControl:
         alone = clock.refined is None or clock.warm_up
         return alone and clock.spent <= RESET_UNTIL and clock.reached(every)
 
-    def count(self, means: Tensor, infos: Infos, views: int) -> dict[str, Tensor]:
-        """What drawings add to a block's statistics, after backward; by name, each [n].
-
-        Args:
-            means: of the block, [n, 3].
-            views: that the block is trained on.
-        """
-        if self.config.strategy != "default":
-            return {}
-        with_gradient = self._with_gradient(infos)
-        if not with_gradient or len(means) == 0:
-            return {}
-        drawings = [each for info in with_gradient for each in zip(*self._norms(info), strict=True)]
-        norms, seen = (reduce(torch.add, parts) for parts in zip(*drawings, strict=True))
-        return {**dict(zip(GRADIENTS, (norms, seen), strict=True)), **weigh(with_gradient, views)}
-
     def _gathered(
-        self, growth: dict[str, Tensor], means: Tensor, infos: Infos, views: int
+        self,
+        growth: dict[str, Tensor],
+        gaussians: Gaussians,
+        infos: Infos,
+        judged: Sequence[Judged],
+        views: int,
     ) -> dict[str, Tensor]:
-        """Statistics with those of more drawings, see `count`; on CUDA in one kernel for each of `infos`."""
-        names = (*GRADIENTS, *WEIGHED)
-        if not self.weighs or any("weights" not in i or i["weights"].grad is None for i in infos):
-            return added(growth, self.count(means, infos, views))
-        for info in infos:
-            sums = [growth[name] if name in growth else torch.zeros_like(means[:, 0]) for name in names]
-            weights = info["weights"].grad
-            drawn = self._gradient(info), info["radii"], weights
-            scale, share = self._scale(info), len(weights) / views
-            of_one_size = not isinstance(scale[0], Tensor)
-            found = fused.statistics(*drawn, sums, scale, share) if of_one_size else None
-            if found is None:
-                return added(growth, self.count(means, infos, views))
-            growth = {**growth, **dict(zip(names, found, strict=True))}
-        return growth
-
-    def _gradient(self, info: dict[str, Any]) -> Tensor | None:
-        means2d = info["means2d"]
-        return getattr(means2d, "absgrad", None) if self.absgrad else means2d.grad
-
-    def _with_gradient(self, infos: Infos) -> Infos:
-        return tuple(info for info in infos if self._gradient(info) is not None)
-
-    @staticmethod
-    def _scale(info: dict[str, Any]) -> tuple[float | Tensor, float | Tensor]:
-        """Of a gradient, along both axes: from pixels to halves of the image, for the sum of drawings; [v, 1]
-        where views have several sizes."""
-        return tuple(info[side] / 2.0 * info["n_cameras"] for side in ("width", "height"))
-
-    def _norms(self, info: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """What DefaultStrategy._update_state adds up: norms of the gradients in each view, and 1 where there
-        is one, [v, n]. It picks rows, whose number the host has to wait for; here the others are 0.
-        """
-        gradient, (width, height) = self._gradient(info), self._scale(info)
-        norms = torch.stack((gradient[..., 0] * width, gradient[..., 1] * height), dim=-1).norm(dim=-1)
-        # An accelerator may have skipped the step that these are of.
-        seen = (info["radii"] > 0) & norms.isfinite()
-        return torch.where(seen, norms, 0.0), seen.to(norms.dtype)
+        """Statistics with those of more drawings."""
+        for picture in judged:
+            growth = added(growth, {WORTH: asked_for(gaussians, self._axes, picture)})
+        return added(growth, weigh(infos, views))
 
     def after_step(
         self,
@@ -242,13 +179,15 @@ class DensityControl:
         optimizers: Optimizers,
         growth: dict[str, Tensor],
         infos: Infos,
+        judged: Sequence[Judged],
         clock: DensityClock,
     ) -> dict[str, Tensor]:
         """Gather statistics and, when it is time, refine. Call after Adam's step.
 
         Args:
-            growth: the block's statistics so far, each [n].
+            growth: the block's statistics so far, each [n, ...].
             infos: of the step's drawings, after backward.
+            judged: those of the step's pictures whose residuals were summed.
 
         Returns:
             The block's statistics from now on. The global random generator is left as it was.
@@ -256,9 +195,11 @@ class DensityControl:
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth
         if self.config.strategy == "default":
-            infos = self._with_gradient(infos)
-            growth = self._gathered(growth, params["means"], infos, clock.views)
-            if not (self.refines(clock, infos) or self.resets(clock)):
+            gaussians = live_gaussians(params).detach()
+            growth = self._gathered(growth, gaussians, infos, judged, clock.views)
+            if not self.asks(clock.progress, clock.first):
+                growth = {name: value for name, value in growth.items() if name != WORTH}
+            if not (self.refines(clock, growth) or self.resets(clock)):
                 return growth
         device = params["means"].device
         cuda = [device] if device.type == "cuda" else []
@@ -267,7 +208,7 @@ class DensityControl:
             if self.config.strategy == "mcmc":
                 self._step_mcmc(params, optimizers, clock)
                 return {}
-            return self._step_default(params, optimizers, growth, infos, clock)
+            return self._step_default(params, optimizers, growth, clock)
 
     def shed(
         self,
@@ -293,22 +234,15 @@ class DensityControl:
         return growth
 
     def _step_default(
-        self,
-        params: Params,
-        optimizers: Optimizers,
-        growth: dict[str, Tensor],
-        infos: Infos,
-        clock: DensityClock,
+        self, params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clock: DensityClock
     ) -> dict[str, Tensor]:
         config = self.config
-        if self.refines(clock, infos):
-            gradients = growth["grad2d"] / growth["count"].clamp_min(1)
-            wanted = torch.where(gradients > config.densify_grad_thresh, gradients, 0.0)
+        if self.refines(clock, growth):
+            wanted, axis = worth(growth, clock.views, config.split_pixels)
             most = math.ceil(MOST_NEW * len(wanted))
             room = most if clock.room is None else min(most, clock.room)
-            which = chosen(torch.where(may_grow(growth, config.price), wanted, 0.0), room)
-            growth = halve(params, optimizers, growth, which, self._axes)
-            growth |= {name: torch.zeros_like(growth[name]) for name in GRADIENTS}
+            growth = halve(params, optimizers, growth, chosen(wanted, room), axis)
+            growth[WORTH] = torch.zeros_like(growth[WORTH])
             faint = torch.sigmoid(params["opacities"][:, 0]) < config.cull_alpha_thresh
             if bool(faint.any()):
                 gsplat_ops.remove(params, optimizers, growth, faint)

@@ -1,9 +1,8 @@
-"""Growing: where views ask for more, one Gaussian becomes two, side by side along its longest axis.
+"""Growing: one Gaussian becomes two, side by side along one of its axes.
 
 3DGS (Kerbl et al., 2023) puts a copy onto a small one, whose picture is then as of two, and draws at random
 where the halves of a large one go: either upsets the picture, for tens of steps. Here the two have together
-the optical depth, the middle and the variance of the one. To cut the longest axis is Deng et al.'s (2025,
-arXiv:2508.12313).
+the optical depth, the middle and the variance of the one.
 """
 
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from gsplat.strategy import ops as gsplat_ops
 from gsplat.utils import normalized_quat_to_rotmat
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params
@@ -46,14 +45,14 @@ def halve(
     optimizers: Optimizers,
     growth: Mapping[str, Tensor],
     which: Bool[Tensor, "n"],
-    axes: int,
+    axis: Int64[Tensor, "n"],
 ) -> dict[str, Tensor]:
     """Make two of each. The others come first, in their order, then one half of each, then the other; their
     moments begin anew.
 
     Args:
-        growth: statistics by name, [n] each; both halves inherit them, and half of the weight.
-        axes: along which Gaussians extend, the first of three: a surfel's third scale is nothing.
+        growth: statistics by name, [n, ...] each; both halves inherit them, and half of the weight.
+        axis: of each, along which its halves are to lie.
 
     Returns:
         The statistics afterwards.
@@ -63,11 +62,11 @@ def halve(
         return found
     means, opacities = params["means"][rows], torch.sigmoid(params["opacities"][rows])
     scales = torch.exp(params["scales"][rows])
-    longest = scales[:, :axes].argmax(dim=1, keepdim=True)
-    along = torch.zeros_like(scales).scatter_(1, longest, scales.gather(1, longest))
+    axis = axis[rows][:, None]
+    along = torch.zeros_like(scales).scatter_(1, axis, scales.gather(1, axis))
     turned = normalized_quat_to_rotmat(F.normalize(params["quats"][rows], dim=1))
     offset = APART * torch.einsum("nij,nj->ni", turned, along)
-    narrow = scales.scatter(1, longest, NARROWED * scales.gather(1, longest))
+    narrow = scales.scatter(1, axis, NARROWED * scales.gather(1, axis))
     # Its own halves, drawn at random, are overwritten: the rows of parameters, moments and statistics stay.
     gsplat_ops.split(params, optimizers, found, which)
     both = slice(-2 * len(rows), None)

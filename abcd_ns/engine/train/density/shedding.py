@@ -5,7 +5,7 @@ before its block included: so many pixels it fills. Drawings that train it tell 
 Added up over the views of its block it says what would be missing without it, as RadSplat (Niemeyer et al.,
 2024) and LightGaussian (Fan et al., NeurIPS 2024) prune by the largest and by the sum of such weights when
 training ends. Here they go while it goes on, at a price that rises as growth comes to its end: those that
-remain take their place, and each step costs less. Nor do those grow that could not pay for two.
+remain take their place, and each step costs less.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,8 +27,6 @@ FULL_PASS = 0.999
 """Of a pass, in sums that are rounded."""
 LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
-GROWS = 4.0
-"""Times its price that a Gaussian fills before it becomes two: more than both halves must."""
 FAINT, FAINTER = 0.1, 0.25
 """Who fills more than most is haze with an opacity under the first, and under this share of the median: after
 a reset of opacities all are faint."""
@@ -94,14 +92,7 @@ def fills(growth: Mapping[str, Tensor]) -> Float[Tensor, "n"]:
     return torch.where(passes >= FULL_PASS, weight / passes, torch.nan)
 
 
-def may_grow(growth: Mapping[str, Tensor], price: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians fill GROWS prices, as far as is known by now; those never weighed may grow."""
-    unknown = torch.zeros_like(growth["grad2d"])
-    weight, passes = (growth.get(name, unknown) for name in WEIGHED)
-    return weight >= GROWS * price * passes
-
-
-def faded(growth: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "n"]]:
+def faded(growth: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The statistics when all have been judged: what is seen from now on soon counts for more."""
     if not are_weighed(growth):
         return dict(growth)

@@ -93,6 +93,13 @@ class Sample:
         front, back = (None, None) if self.layers is None else (self.layers.front, self.layers.back)
         return Frame(front, back, self.background, weigh / self.share)
 
+    def residual(
+        self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w c"]
+    ) -> Float[Tensor, "h w 4"]:
+        """Photo less picture as the block sees it, and what of it shows; see ResidualSums."""
+        shows = torch.ones_like(picture[..., :1]) if self.in_front is None else self.in_front[..., None]
+        return torch.cat(((photo[..., :3] - picture) * shows, shows), dim=-1)
+
     @property
     def weight(self) -> float:
         """Of this picture's loss, in expectation, in that of the whole image, by pixels."""

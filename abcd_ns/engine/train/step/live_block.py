@@ -1,6 +1,7 @@
 """The block that is being trained: its way in and out of the optimizers, its growth, and its clocks."""
 
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 from torch import Tensor
@@ -14,6 +15,7 @@ from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
 from abcd_ns.engine.train.density.shedding import faded
 from abcd_ns.engine.train.density.splitting import is_full
+from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
@@ -82,16 +84,16 @@ class LiveBlock:
         """A visit has ended."""
         self.clocks = replace(self.clocks, visits=self.clocks.visits + 1)
 
-    def refine(self, infos: Infos, clock: DensityClock) -> None:
+    def refine(self, infos: Infos, judged: Sequence[Judged], clock: DensityClock) -> None:
         """Grow and prune, where it is time for that.
 
         Args:
             infos: of the step's drawings; none where its gradients were no numbers.
+            judged: likewise, see DensityControl.after_step.
         """
         run = self._run
-        refines = run.density.refines(clock, infos)
-        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, clock)
-        if refines:
+        self.growth = run.density.after_step(run.params, run.optimizers, self.growth, infos, judged, clock)
+        if run.density.refines(clock, self.growth):
             self.clocks = replace(self.clocks, refined=clock.steps)
             self.hold_back_giants()
 

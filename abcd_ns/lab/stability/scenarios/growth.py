@@ -40,7 +40,7 @@ def noise(lab: Lab) -> Finding:
     stage, said, numbers, passed = make_stage(views=ring(12), points=2 * CAP), {}, {}, True
     draw = {"generator": torch.Generator().manual_seed(5)}
     photos = {index: torch.rand(photo.shape, **draw) for index, photo in stage.photos.items()}
-    density = DensityConfig(max_gaussians=CAP, refine_start=0.0, refine_stop=1.0, densify_grad_thresh=1e-5)
+    density = DensityConfig(max_gaussians=CAP, refine_start=0.0, refine_stop=1.0, split_pixels=0.0)
     for method in PAIR:
         options = {"budget": lab.views_drawn(300), "blocks": 4, "density": density}
         trained = lab.train(replace(stage, photos=photos), method, **options)

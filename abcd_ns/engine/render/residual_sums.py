@@ -1,0 +1,63 @@
+"""What a drawing's residual says of each Gaussian: sums over pixels, by which growth decides."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.types import Crop
+
+SUMS = 10
+"""Of a Gaussian in a picture."""
+
+
+@runtime_checkable
+class ResidualSums(Protocol):
+    """For each Gaussian of a drawing the sums over pixels of w f, w r, w r x and w r y.
+
+    There w = alpha T is its weight, r the residual by channel, f how much the pixel counts, and (x, y) the
+    pixel's middle less the Gaussian's, px.
+    """
+
+    values: Float[Tensor, "v n 10"] | None
+    """After the drawing's backward pass; None where nobody has asked."""
+
+    def ask(self, residuals: Sequence[Float[Tensor, "_h _w 4"]]) -> None:
+        """Call before the backward pass.
+
+        Args:
+            residuals: of each picture r, then f.
+        """
+        ...
+
+
+class SumsApart(ResidualSums):
+    """Sums that are found at once, apart from the drawing's gradients.
+
+    Args:
+        find: the values for residuals.
+    """
+
+    def __init__(self, find: Callable[[Sequence[Tensor]], Float[Tensor, "v n 10"]]) -> None:
+        self.values, self._find = None, find
+
+    def ask(self, residuals: Sequence[Float[Tensor, "_h _w 4"]]) -> None:
+        """See ResidualSums."""
+        self.values = self._find(residuals)
+
+
+def moments(residual: Float[Tensor, "h w 4"], crop: Crop) -> Float[Tensor, "h w 10"]:
+    """f, r, r x and r y of each pixel, with x and y in the image."""
+    r, f = residual[..., :3], residual[..., 3:]
+    x = torch.arange(crop.width, device=r.device, dtype=r.dtype)[:, None] + (crop.x + 0.5)
+    y = torch.arange(crop.height, device=r.device, dtype=r.dtype)[:, None, None] + (crop.y + 0.5)
+    return torch.cat((f, r, r * x, r * y), dim=-1)
+
+
+def about(sums: Float[Tensor, "*n 10"], middle: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 10"]:
+    """Sums of `moments`, with x and y counted from the Gaussians' middles."""
+    f, r, x, y = sums.split((1, 3, 3, 3), dim=-1)
+    middle = torch.where(f == 0, 0.0, middle)  # gsplat gives none of who is not drawn
+    return torch.cat((f, r, x - middle[..., :1] * r, y - middle[..., 1:] * r), dim=-1)

@@ -1,0 +1,105 @@
+"""What a split is worth: the squared error that two halves of a Gaussian could remove by differing in colour.
+
+For a Gaussian and one of its axes let s be a standard deviation along it on screen, Q the inverse covariance
+there, d a pixel's offset from the middle, w = alpha T the weight in it and r = photo - picture. Halves that
+differ by h change the picture by h phi, with phi = w (Q s . d). Over some views let b be the sum of phi r, by
+channel, and A that of phi^2: then h = b / A removes b^2 / A of squared error.
+
+That is what these views ask for; others may not. So views are in two halves: h is found by one and tried on
+the other, 2 h b - h^2 A, and the other way round. What only some views ask for is worth less than nothing.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from gsplat.utils import normalized_quat_to_rotmat
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from abcd_ns.engine.render.splat_kernels import EPS_2D
+from abcd_ns.engine.types import Gaussians, View
+
+WORTH = "worth"
+"""The statistic's name, see `asked_for`."""
+BY_CHANNEL, BY_AXIS = 9, 3
+"""Numbers of b and of A."""
+TINY = 1e-8
+"""Added to A, which may be 0."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One picture of a step, of which the residual is known."""
+
+    view: View
+    sums: Float[Tensor, "n 10"]
+    """See ResidualSums, of the block's Gaussians."""
+    error: Float[Tensor, ""]
+    """The mean squared one of a pixel, over its channels."""
+    share: float = 1.0
+    """Of the pixels that might have been drawn, those that are."""
+
+
+def half_of(view: int) -> int:
+    """The half that a view is in, by the sequence of Thue and Morse: of three in a row never all are in one,
+    and it is in step with no rig of cameras."""
+    return view.bit_count() & 1
+
+
+@torch.no_grad()
+def asked_for(gaussians: Gaussians, axes: int, picture: Judged) -> Float[Tensor, "n 26"]:
+    """What a picture adds to WORTH: of each half of the views b [axis, channel] and A [axis], then the error
+    of a pixel, then 1.
+
+    Args:
+        axes: along which Gaussians extend.
+    """
+    view, means = picture.view, gaussians.means
+    turn, shift, K = (part.to(means) for part in (view.viewmat[:3, :3], view.viewmat[:3, 3], view.K))
+    x, y, z = (means @ turn.T + shift).T[..., None].unbind(0)
+    z = z.clamp_min(view.near)
+    axis = normalized_quat_to_rotmat(F.normalize(gaussians.quats, dim=1)) * gaussians.scales.exp()[:, None]
+    along_x, along_y, along_z = (turn @ axis).unbind(1)  # a standard deviation of each axis, [n, 3]
+    right, down = K[0, 0] * (along_x - x / z * along_z) / z, K[1, 1] * (along_y - y / z * along_z) / z
+    xx, xy, yy = ((p * q).sum(1, keepdim=True) for p, q in ((right, right), (right, down), (down, down)))
+    xx, yy = xx + EPS_2D, yy + EPS_2D
+    det = xx * yy - xy * xy
+    q_x, q_y = (yy * right - xy * down) / det, (xx * down - xy * right) / det
+    weight, _, r_x, r_y = picture.sums.split((1, 3, 3, 3), dim=1)
+    b = q_x[..., None] * r_x[:, None] + q_y[..., None] * r_y[:, None]
+    # As if nothing lay before any part of it: phi^2 integrates to this over a Gaussian of its weight.
+    a = weight.square() * (q_x * right + q_y * down) / (8 * math.pi * det.sqrt())
+    b[:, axes:], a[:, axes:] = 0.0, 0.0
+    found = torch.cat((b.flatten(1), a), dim=1) / picture.share
+    # An accelerator may have skipped a step that was no number.
+    found = torch.where((weight > 0) & found.isfinite().all(dim=1, keepdim=True), found, 0.0)
+    halves = [torch.zeros_like(found), torch.zeros_like(found)]
+    halves[half_of(view.index)] = found
+    error = picture.error.to(means).nan_to_num(0.0).expand_as(weight)
+    return torch.cat((*halves, error, torch.ones_like(weight)), dim=1)
+
+
+def worth(
+    growth: Mapping[str, Tensor], views: int, pixels: float
+) -> tuple[Float[Tensor, "n"], Int64[Tensor, "n"]]:
+    """Squared error that the best split of each would remove in all views, 0 where that is too little; and
+    the axis to split along.
+
+    Args:
+        growth: with WORTH.
+        views: that the block is trained on.
+        pixels: with the mean error, that a split must remove as much of as they have.
+    """
+    *halves, error, pictures = growth[WORTH].split((BY_CHANNEL, BY_AXIS) * 2 + (1, 1), dim=1)
+    sums = [(halves[k].view(-1, BY_AXIS, 3), halves[k + 1][..., None]) for k in (0, 2)]
+    gain = torch.zeros_like(sums[0][0])
+    for (b, a), (others_b, others_a) in (sums, sums[::-1]):
+        h = b / (a + TINY)
+        gain += 2 * h * others_b - h * h * others_a
+    seen = (sums[0][1] > 0) & (sums[1][1] > 0)
+    best, axis = torch.where(seen, gain, 0.0).sum(dim=2).max(dim=1)
+    best, per_pixel = best * (views / pictures[:, 0].clamp_min(1)), error[:, 0] / pictures[:, 0].clamp_min(1)
+    return torch.where(best > pixels * per_pixel, best, 0.0), axis
