@@ -214,7 +214,7 @@ class ExactTrainer(Trainer):
             grid = self.run.rasterizer.window_grid(sample.crop)
             window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
-        options = {"sh_degree": self._degree, "antialiased": self.config.antialiased}
+        options = {"sh_degree": self._degree, "antialiased": self.config.antialiased, "judge": self._asks}
         return self.run.rasterizer.draw(gaussians, [shot], **options)[0]
 
     def _in_order(self, place: int) -> list[Layer]:
@@ -227,7 +227,7 @@ class ExactTrainer(Trainer):
         layers, own = self._in_order(place), self._layers_of[place][block]
         at = next(k for k, layer in enumerate(layers) if layer is own)
         front, back = fold(layers[:at], like=own), fold(layers[at + 1 :], like=own)
-        if self.run.density.asks(self.progress, first=False) and "sums" in raster.info:
+        if "sums" in raster.info:
             shows = front.transmittance[..., None]
             raster.info["sums"].ask([torch.cat((self._residuals[place] * shows, shows), dim=-1)])
         picture = sandwich(front, raster.layer, back, self._batch.samples[place].background)
@@ -258,9 +258,13 @@ class ExactTrainer(Trainer):
         attach(stepped[:0].to(self.device), self.params, self.optimizers)
         return stepped
 
+    @property
+    def _asks(self) -> bool:
+        return self.run.density.asks(self._batch.step, self.progress, first=False)
+
     def _judged(self, sums: Float[Tensor, "v m 10"]) -> list[Judged]:
         """What a step's pictures ask of one block's Gaussians."""
-        if not self.run.density.asks(self.progress, first=False):
+        if not self._asks:
             return []
         return [
             Judged(sample.view, own.to(self.device), residual.square().sum(dim=-1).mean(), sample.share)

@@ -32,7 +32,9 @@ def train_plain(
         for name, rate in LEARNING_RATES.items():
             decay = exponential_decay(taken / steps, config.means_lr_decay) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * share
-        raster = draw(Gaussians(**{name: params[name] for name in PARAM_NAMES}), view, sh_degree=degree)
+        raster = draw(
+            Gaussians(**{name: params[name] for name in PARAM_NAMES}), view, sh_degree=degree, judge=True
+        )
         seed = random.Random(f"background {config.seed} {taken} 0").getrandbits(62)
         background = torch.rand(3, generator=torch.Generator().manual_seed(seed))
         picture = torch.addcmul(raster.color, raster.transmittance[..., None], background).clamp(0, 1)
@@ -52,7 +54,7 @@ def train_plain(
         seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
         clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed)
         judged = Judged(view, raster.info["sums"].values[0], residual.square().sum(dim=-1).mean())
-        judged = [judged] if density.asks(taken / steps, first=False) else []
+        judged = [judged] if density.asks(taken, taken / steps, first=False) else []
         growth = density.after_step(params, adam, growth, (raster.info,), judged, clock)
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 

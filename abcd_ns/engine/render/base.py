@@ -28,8 +28,8 @@ class Raster:
     """Sum of weight x camera z. Expected depth is depth / (1 - transmittance)."""
     info: dict[str, Any]
     """gsplat 1.4.0's `info` for the Gaussians that take gradients, from v cameras: means2d [v, n, 2], radii
-    [v, n], width, height, n_cameras, gaussian_ids. Of the full image, not the crop. And `sums`, ResidualSums,
-    where there are Gaussians."""
+    [v, n], width, height, n_cameras, gaussian_ids. Of the full image, not the crop. And `sums`, where asked
+    for."""
 
     @property
     def layer(self) -> Layer:
@@ -122,6 +122,7 @@ class Rasterizer(Protocol):
         sh_degree: int,
         antialiased: bool = False,
         weigh: bool = False,
+        judge: bool = False,
     ) -> tuple[Raster, ...]:
         """Draw `gaussians` for each shot, sorted by depth with what is frozen there.
 
@@ -133,6 +134,7 @@ class Rasterizer(Protocol):
             weigh: give zeros for depths, from a leaf `info["weights"]` [v, n] that every Gaussian's depth is
                 taken from: after backward its gradient is the sum of the Gaussian's weights alpha T, each
                 times the gradient of the pixel's depth; and that changes no other gradient.
+            judge: take residuals, by `info["sums"]`: ResidualSums.
 
         Raises:
             ValueError: a window is of another crop, or of tiles that are no multiples of the rasterizer's; or
@@ -150,6 +152,7 @@ class Rasterizer(Protocol):
         frozen: Gaussians | None = None,
         z_window: ZWindow | None = None,
         antialiased: bool = False,
+        judge: bool = False,
     ) -> Raster:
         """`draw` for a single view and, without `crop`, all of its image."""
         crop = crop or view.full
@@ -157,7 +160,7 @@ class Rasterizer(Protocol):
         if frozen is not None:
             seen = self.project(frozen, view, sh_degree=sh_degree, antialiased=antialiased)
         shot = Shot(view, crop, seen, z_window)
-        options = {"sh_degree": sh_degree, "antialiased": antialiased}
+        options = {"sh_degree": sh_degree, "antialiased": antialiased, "judge": judge}
         return self.draw(gaussians, [shot], **options)[0]
 
     def cuts(

@@ -41,11 +41,11 @@ class SumsApart(ResidualSums):
     """
 
     def __init__(self, find: Callable[[Sequence[Tensor]], Float[Tensor, "v n 10"]]) -> None:
-        self.values, self._find = None, find
+        self.values, self._find = None, find  # which holds on to all that was drawn
 
     def ask(self, residuals: Sequence[Float[Tensor, "_h _w 4"]]) -> None:
         """See ResidualSums."""
-        self.values = self._find(residuals)
+        self.values, self._find = self._find(residuals), None
 
 
 def moments(residual: Float[Tensor, "h w 4"], crop: Crop) -> Float[Tensor, "h w 10"]:

@@ -117,7 +117,7 @@ def values_and_gradients(
     own, frozen = gaussians[: COUNT - case.frozen], gaussians[COUNT - case.frozen :]
     leaves = {name: value.clone().requires_grad_() for name, value in own.items()}
     shots = case.shots(rasterizer, frozen, view)
-    options = {"antialiased": case.antialiased, "weigh": case.weighs}
+    options = {"antialiased": case.antialiased, "weigh": case.weighs, "judge": True}
     rasters = rasterizer.draw(Gaussians(**leaves), shots, sh_degree=case.sh_degree, **options)
     infos = list({id(raster.info): raster.info for raster in rasters}.values())
     means2d = [info["means2d"] for info in infos]

@@ -40,7 +40,7 @@ from abcd_ns.engine.train.step.batch import (
 )
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.normal_consistency import BEGINS, normal_consistency
-from abcd_ns.engine.train.step.residuals import ASKED_EVERY, Residuals
+from abcd_ns.engine.train.step.residuals import Residuals
 from abcd_ns.engine.types import Crop, View
 
 
@@ -141,8 +141,7 @@ class VisitTraining:
         the samples', plus what surfels and the density strategy ask for."""
         run = self.run
         pictures, photos = self._visits.compared(batch, pictures, photos)
-        if self._asks:
-            self._residuals.ask(self._rendered, batch.samples, pictures, photos)
+        self._residuals.ask(self._rendered, batch.samples, pictures, photos)
         losses = batch.losses(pictures, photos, run.config)
         loss = losses[0] if len(losses) == 1 else sum(losses[1:], start=losses[0]) / len(losses)
         run.health.note(
@@ -159,8 +158,7 @@ class VisitTraining:
     @property
     def _asks(self) -> bool:
         run = self.run
-        every = 1 if run.device.type == "cpu" else ASKED_EVERY
-        return run.state.step % every == 0 and run.density.asks(run.share, self.live.clocks.visits == 0)
+        return run.density.asks(run.state.step, run.share, self.live.clocks.visits == 0)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.
@@ -275,6 +273,7 @@ class VisitTraining:
             sh_degree=self.degree,
             antialiased=run.config.antialiased,
             weigh=run.density.weighs,
+            judge=self._asks,
         )
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         lights = [None if run.light is None else run.light.of(sample.view.index) for sample in samples]

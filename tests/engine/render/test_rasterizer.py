@@ -147,7 +147,7 @@ def test_residuals_are_summed_by_weight_and_place(with_frozen):
         )
 
     shot = Shot(VIEW, crop, None if frozen is None else EAGER.project(frozen, VIEW, sh_degree=0))
-    (raster,) = EAGER.draw(as_leaves(gaussians), [shot], sh_degree=1)
+    (raster,) = EAGER.draw(as_leaves(gaussians), [shot], sh_degree=1, judge=True)
     raster.info["sums"].ask([residual])
     raster.color.sum().backward()
     assert raster.info["sums"].values.shape == (1, 6, 10)

@@ -80,9 +80,9 @@ def test_the_near_plane_is_the_views(backend):
 @pytest.mark.parametrize("with_frozen", [False, True])
 def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen):
     frozen = random_gaussians(15, seed=3) if with_frozen else None
-    raster = backend(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen)
+    raster = backend(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, judge=True)
     expected = torch_twin(backend)(
-        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen
+        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, judge=True
     )
     size = raster.transmittance.shape
     for drawing in (raster, expected):
@@ -186,7 +186,7 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
             as_leaves(random_gaussians(40)),
             several_shots(torch_twin(backend, TILE), windowed, with_frozen),
         )
-        rasters = draws.draw(leaves, shots, sh_degree=2)
+        rasters = draws.draw(leaves, shots, sh_degree=2, judge=True)
         infos = {id(raster.info): raster.info for raster in rasters}
         assert {info["n_cameras"] for info in infos.values()} == {len(shots)}
         for info in infos.values():
@@ -295,7 +295,7 @@ def test_a_loss_of_nothing_has_a_gradient(backend):
     """A block whose last Gaussian was pruned is drawn until its visit ends."""
     leaves = as_leaves(Gaussians.empty())
     shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2
-    rasters = backend.draw(leaves, shots, sh_degree=3)
+    rasters = backend.draw(leaves, shots, sh_degree=3, judge=True)
     sum(stacked(raster).sum() for raster in rasters).backward()
     assert leaves.means.grad.shape == (0, 3)
     assert "sums" not in rasters[0].info

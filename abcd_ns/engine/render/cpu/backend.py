@@ -94,6 +94,7 @@ class TorchRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool = False,
         weigh: bool = False,
+        judge: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One pass for all shots: overheads are paid once."""
         planes = self._project(gaussians, [shot.view for shot in shots], sh_degree, antialiased)
@@ -108,12 +109,14 @@ class TorchRasterizer(Rasterizer):
             parts = [native.Part(own, k, shots[k].frozen is None) for k, own in enumerate(planes)]
             parts += [native.Part(others, k, True) for k, others in frozen]
             lists = native.Lists(parts, crops, self.primitive, windows, weighs=weigh)
-            info["sums"] = native.Drawing(lists)
-            drawn = iter(native.Composite.apply(planes, means2d, weights, info["sums"]))
+            drawing = native.Drawing(lists)
+            info |= {"sums": drawing} if judge else {}
+            drawn = iter(native.Composite.apply(planes, means2d, weights, drawing))
             return tuple(
                 Raster(color, left, depth, info) for color, left, depth in zip(*[drawn] * 3, strict=True)
             )
-        images, info["sums"] = self._composited_in_torch(planes, shots, means2d, weights)
+        images, sums = self._composited_in_torch(planes, shots, means2d, weights)
+        info |= {"sums": sums} if judge else {}
         return tuple(Raster(image[1:4].permute(1, 2, 0), image[0], image[4], info) for image in images)
 
     def _composited_in_torch(

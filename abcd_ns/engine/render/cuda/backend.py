@@ -76,6 +76,7 @@ class GsplatRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool = False,
         weigh: bool = False,
+        judge: bool = False,
     ) -> tuple[Raster, ...]:
         """See Rasterizer.draw. One call of gsplat for all shots whose images are of one size."""
         check_degree(gaussians, sh_degree)
@@ -84,7 +85,7 @@ class GsplatRasterizer(Rasterizer):
         kinds = [(s.view.width, s.view.height, s.view.near, s.frozen is None) for s in shots]
         for places in _alike(kinds):
             alike = [shots[k] for k in places]
-            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, weigh)
+            drawn = self._draw_alike(gaussians, alike, sh_degree, antialiased, weigh, judge)
             rasters.update(zip(places, drawn, strict=True))
         for raster in rasters.values():
             raster.info["n_cameras"] = len(shots)
@@ -138,6 +139,7 @@ class GsplatRasterizer(Rasterizer):
         sh_degree: int,
         antialiased: bool,
         weigh: bool,
+        judge: bool,
     ) -> list[Raster]:
         views, crops = [shot.view for shot in shots], [shot.crop for shot in shots]
         frozen = [
@@ -154,7 +156,8 @@ class GsplatRasterizer(Rasterizer):
             always = 0 if shots[0].frozen is None else own.radii.numel()
             drawing = drawing.windowed(windows, always)
         info = _info(own, views[0]) | ({"weights": own.weights} if weigh else {})
-        info["sums"] = SumsApart(partial(drawing.residual_sums, own.centers.detach()))
+        if judge:
+            info["sums"] = SumsApart(partial(drawing.residual_sums, own.centers.detach()))
         sheet = drawing.rasterized()
         return [Drawn(*sheet, k, part, info) for k, part in enumerate(drawing.parts)]
 

@@ -309,14 +309,16 @@ class Drawing:
         """
         parts = (self.means2d, self.shapes, self.splats.opacities)
         means2d, shapes, opacities = (part.detach() for part in parts)
-        dark = means2d.new_zeros((len(means2d), SUMS)).requires_grad_()
-        with torch.enable_grad():
-            pictures, _ = self._rasterize(means2d, shapes, dark, opacities, self.owners)
-        upstream = torch.zeros_like(pictures)
-        for one, part, crop, residual in zip(upstream, self.parts, self.sheet.crops, residuals, strict=True):
-            one[part] = moments(residual, crop)
-        (found,) = torch.autograd.grad(pictures, dark, upstream)
-        return about(found[: middles[..., 0].numel()].view(*middles.shape[:2], SUMS), middles)
+        asked, found = [moments(*pair) for pair in zip(residuals, self.sheet.crops, strict=True)], []
+        for channels in (slice(0, 4), slice(4, 7), slice(7, SUMS)):  # a few at a time, for the memory
+            dark = means2d.new_zeros((len(means2d), channels.stop - channels.start)).requires_grad_()
+            with torch.enable_grad():
+                pictures, _ = self._rasterize(means2d, shapes, dark, opacities, self.owners)
+            upstream = torch.zeros_like(pictures)
+            for one, part, wanted in zip(upstream, self.parts, asked, strict=True):
+                one[part] = wanted[..., channels]
+            found.append(torch.autograd.grad(pictures, dark, upstream)[0][: middles[..., 0].numel()])
+        return about(torch.cat(found, dim=1).view(*middles.shape[:2], SUMS), middles)
 
     def _rasterize(
         self,

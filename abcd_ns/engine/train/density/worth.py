@@ -20,6 +20,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from abcd_ns.engine.render.splat_kernels import EPS_2D
+from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
 WORTH = "worth"
@@ -58,12 +59,14 @@ def asked_for(gaussians: Gaussians, axes: int, picture: Judged) -> Float[Tensor,
         axes: along which Gaussians extend.
     """
     view, means = picture.view, gaussians.means
-    turn, shift, K = (part.to(means) for part in (view.viewmat[:3, :3], view.viewmat[:3, 3], view.K))
-    x, y, z = (means @ turn.T + shift).T[..., None].unbind(0)
+    camera = torch.cat((view.viewmat[:3].flatten(), view.K.diagonal())).detach().to(means.dtype)
+    pose, focal = upload(camera, means.device).split((12, 3))
+    turn, shift = pose.view(3, 4).split((3, 1), dim=1)
+    x, y, z = (means @ turn.T + shift.T).T[..., None].unbind(0)
     z = z.clamp_min(view.near)
     axis = normalized_quat_to_rotmat(F.normalize(gaussians.quats, dim=1)) * gaussians.scales.exp()[:, None]
     along_x, along_y, along_z = (turn @ axis).unbind(1)  # a standard deviation of each axis, [n, 3]
-    right, down = K[0, 0] * (along_x - x / z * along_z) / z, K[1, 1] * (along_y - y / z * along_z) / z
+    right, down = (along_x - x / z * along_z) * focal[0] / z, (along_y - y / z * along_z) * focal[1] / z
     xx, xy, yy = ((p * q).sum(1, keepdim=True) for p, q in ((right, right), (right, down), (down, down)))
     xx, yy = xx + EPS_2D, yy + EPS_2D
     det = xx * yy - xy * xy

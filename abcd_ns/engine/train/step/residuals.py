@@ -9,10 +9,6 @@ from torch import Tensor
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.step.batch import Pictures, Rendered, Sample
 
-ASKED_EVERY = 4
-"""Steps on a device, of which one is asked: sums take a drawing of their own there, and so some thirty views
-are in those of a refinement."""
-
 
 class Residuals:
     """Those of the step that is under way."""
