@@ -43,7 +43,6 @@ static inline V vmin(V a, V b) {
   return a < b ? a : b;
 #endif
 }
-static inline V vabs(V a) { return (V)((I)a & 0x7fffffff); }
 static inline V only(I mask, V a) { return (V)(mask & (I)a); }  // a where the mask holds, else 0
 
 static inline V load(const float* from) {
