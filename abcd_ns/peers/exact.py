@@ -260,7 +260,7 @@ class ExactTrainer(Trainer):
 
     @property
     def _asks(self) -> bool:
-        return self.run.density.asks(self._batch.step, self.progress, first=False)
+        return self.run.density.asks(self.progress, first=False)
 
     def _judged(self, sums: Float[Tensor, "v m 10"]) -> list[Judged]:
         """What a step's pictures ask of one block's Gaussians."""

@@ -54,7 +54,7 @@ def train_plain(
         seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
         clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed)
         judged = Judged(view, raster.info["sums"].values[0], residual.square().sum(dim=-1).mean())
-        judged = [judged] if density.asks(taken, taken / steps, first=False) else []
+        judged = [judged] if density.asks(taken / steps, first=False) else []
         growth = density.after_step(params, adam, growth, (raster.info,), judged, clock)
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 

@@ -158,7 +158,7 @@ class VisitTraining:
     @property
     def _asks(self) -> bool:
         run = self.run
-        return run.density.asks(run.state.step, run.share, self.live.clocks.visits == 0)
+        return run.density.asks(run.share, self.live.clocks.visits == 0)
 
     def after_step(self, rendered: Rendered, errors: Sequence[Tensor] = ()) -> None:
         """Call after the optimizers stepped: grows and prunes.

@@ -45,8 +45,6 @@ or so many views if these are more, or all of the scene's: also a short one is t
 every view asks for."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
-LEAST_JUDGED = 25
-"""Views that tell a refinement what splits are worth, at least."""
 MCMC_MIN_OPACITY = 0.005
 MCMC_DEFAULT_CAP = 1_000_000
 MCMC_NOISE_LR = 5e5
@@ -143,19 +141,13 @@ class DensityControl:
         """
         return self.is_due(clock) and (self.config.strategy != "default" or WORTH in growth)
 
-    def asks(self, step: int, progress: float, first: bool) -> bool:
-        """Whether a step's residuals are to be summed. All would take a third more time, and tell no more.
+    def asks(self, progress: float, first: bool) -> bool:
+        """Whether growth is still to come, so that residuals are to be summed.
 
         Args:
-            step: of the run.
             progress: share of the run that is done.
             first: whether a block among others is in its first visit.
         """
-        every = max(self.config.refine_every // LEAST_JUDGED, 1)
-        return step % every == 0 and self.still_grows(progress, first)
-
-    def still_grows(self, progress: float, first: bool) -> bool:
-        """Whether growth is still to come; see `asks`."""
         ends = self.config.refine_stop
         return self.config.strategy == "default" and progress < (max(ends, LAST) if first else ends)
 
@@ -205,7 +197,7 @@ class DensityControl:
         if self.config.strategy == "default":
             gaussians = live_gaussians(params).detach()
             growth = self._gathered(growth, gaussians, infos, judged, clock.views)
-            if not self.still_grows(clock.progress, clock.first):
+            if not self.asks(clock.progress, clock.first):
                 growth = {name: value for name, value in growth.items() if name != WORTH}
             if not (self.refines(clock, growth) or self.resets(clock)):
                 return growth
