@@ -37,7 +37,15 @@ from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import endless_order, exponential_decay, views_per_step
-from abcd_ns.engine.train.step.batch import COMING, Batch, Rendered, Sample, background, part_to_draw
+from abcd_ns.engine.train.step.batch import (
+    COMING,
+    Batch,
+    Rendered,
+    Sample,
+    background,
+    part_to_draw,
+    seen_behind,
+)
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, Layer
 
@@ -228,8 +236,7 @@ class ExactTrainer(Trainer):
         at = next(k for k, layer in enumerate(layers) if layer is own)
         front, back = fold(layers[:at], like=own), fold(layers[at + 1 :], like=own)
         if "sums" in raster.info:
-            shows = front.transmittance[..., None]
-            raster.info["sums"].ask([torch.cat((self._residuals[place] * shows, shows), dim=-1)])
+            raster.info["sums"].ask([seen_behind(self._residuals[place], front.transmittance)])
         picture = sandwich(front, raster.layer, back, self._batch.samples[place].background)
         picture.backward(self._pictures[place].grad)
 
@@ -263,7 +270,7 @@ class ExactTrainer(Trainer):
         return self.run.density.asks(self.progress, first=False)
 
     def _judged(self, sums: Float[Tensor, "v m 10"]) -> list[Judged]:
-        """What a step's pictures ask of one block's Gaussians."""
+        """What a step's pictures say of one block's Gaussians."""
         if not self._asks:
             return []
         return [

@@ -191,6 +191,7 @@ def rasterize_to_pixels(
     """
     assert backgrounds is None
     assert packed
+    assert not absgrad
     assert means2d.shape == (len(opacities), 2)
     assert conics.shape[:2] == (len(opacities), 3)
     assert len(colors) == len(opacities)
@@ -201,7 +202,7 @@ def rasterize_to_pixels(
     size = image_width, image_height, tile_size
     splats = (tensor.contiguous() for tensor in (means2d, conics, colors, opacities))
     tensors = *splats, isect_offsets, flatten_ids
-    return _Rasterize.apply(size, absgrad, *tensors, *(() if masks is None else (masks,)))
+    return _Rasterize.apply(size, *tensors, *(() if masks is None else (masks,)))
 
 
 def rasterize_to_pixels_2dgs(
@@ -257,10 +258,8 @@ class _Rasterize(torch.autograd.Function):
     """Composites tiles, some of them at a time, and does so again for the gradient."""
 
     @staticmethod
-    def forward(
-        ctx: Any, size: tuple[int, int, int], absgrad: bool, *tensors: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        ctx.size, ctx.absgrad = size, absgrad
+    def forward(ctx: Any, size: tuple[int, int, int], *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.size = size
         ctx.save_for_backward(*tensors)
 
         def _rasterize(*tensors: Tensor) -> tuple[Tensor, Tensor]:
@@ -275,12 +274,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> Any:
-        means2d = ctx.saved_tensors[0]
         upstream = [gradient.contiguous() for gradient in upstream]
-        *gradients, absolute = kernel(partial(_gradients, ctx.size), *upstream, *ctx.saved_tensors)
-        if ctx.absgrad:
-            means2d.absgrad = absolute
-        return None, None, *gradients, *[None] * (len(ctx.saved_tensors) - len(gradients))
+        gradients = kernel(partial(_gradients, ctx.size), *upstream, *ctx.saved_tensors)
+        return None, *gradients, *[None] * (len(ctx.saved_tensors) - len(gradients))
 
 
 def _with_masks(tensors: Sequence[Tensor]) -> Sequence[Tensor]:
@@ -357,19 +353,19 @@ def _by_tiles(image: Tensor, offsets: Tensor, side: int) -> Tensor:
 
 
 def _gradients(size: tuple[int, int, int], *tensors: Tensor) -> list[Tensor]:
-    """Of means2d, conics, colours and opacities, and the sum of the means' absolute ones over pixels."""
+    """Of means2d, conics, colours and opacities."""
     by_color, by_alpha, *tensors = tensors
     *inputs, offsets, flatten_ids, masks = _with_masks(tensors)
     lists = _drawn_lists(offsets, flatten_ids, masks, size)
     upstream = _by_tiles(torch.cat((by_color, by_alpha), dim=-1), offsets, size[2]).double()
-    sums = [torch.zeros_like(x, dtype=torch.float64) for x in (*inputs, inputs[0])]
+    sums = [torch.zeros_like(x, dtype=torch.float64) for x in inputs]
     for tiles, starts in _parts(*lists):
         with torch.enable_grad():
             picture, values, rows = _tiles(tiles, starts, (*inputs, *lists), size[2], wants_gradient=True)
             found = torch.autograd.grad(picture, values, upstream[tiles.start : tiles.stop])
-        for total, part in zip(sums, (found[0].sum(1), *found[1:], found[0].abs().sum(1)), strict=True):
+        for total, part in zip(sums, (found[0].sum(1), *found[1:]), strict=True):
             total.index_add_(0, rows, part)
-    return [total.to(x) for total, x in zip(sums, (*inputs, inputs[0]), strict=True)]
+    return [total.to(x) for total, x in zip(sums, inputs, strict=True)]
 
 
 @contextmanager

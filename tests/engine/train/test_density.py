@@ -12,7 +12,7 @@ from abcd_ns.engine.train.density import control as control_module
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.density.relocation import binomials, compute_relocation
-from abcd_ns.engine.train.density.worth import WORTH, Judged, asked_for
+from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture
 from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE, wider_than
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.errors import UserError
@@ -85,7 +85,10 @@ def test_between_refinements_statistics_add_up():
     pictures = [Judged(view, torch.rand(8, 10), torch.tensor(0.5)) for view in ring_of_views(3)]
     for picture in pictures:
         growth = control.after_step(params, optimizers, growth, (), [picture], clock(steps=7))
-    assert torch.equal(growth[WORTH], sum(asked_for(gaussians, 3, picture) for picture in pictures))
+    expected = {}
+    for picture in pictures:
+        add_picture(expected, gaussians, 3, picture)
+    assert torch.equal(growth[WORTH], expected[WORTH])
     assert growth[WORTH][:, 24:].tolist() == [[1.5, 3.0]] * 8
     assert len(params["means"]) == 8
 

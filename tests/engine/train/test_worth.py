@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gsplat.utils import normalized_quat_to_rotmat
 from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.render import Shot, TorchRasterizer
 from abcd_ns.engine.train.density.growing import APART, NARROWED
-from abcd_ns.engine.train.density.worth import WORTH, Judged, asked_for, half_of, worth
+from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, half_of, worth
 from abcd_ns.engine.types import Gaussians
 from tests.reference.scenes import random_gaussians, ring_of_views
 
@@ -31,8 +32,6 @@ def one(opacity: float = 0.0) -> Gaussians:
 
 def two_colours(gaussians: Gaussians, axis: int, difference: float) -> Gaussians:
     """The halves that it would become along an axis, the one lighter and the other darker."""
-    from gsplat.utils import normalized_quat_to_rotmat
-
     turned = normalized_quat_to_rotmat(torch.nn.functional.normalize(gaussians.quats, dim=1))
     along = turned[:, :, axis] * gaussians.scales.exp()[:, axis : axis + 1]
     scales = gaussians.scales.clone()
@@ -46,7 +45,7 @@ def two_colours(gaussians: Gaussians, axis: int, difference: float) -> Gaussians
 
 def judged(gaussians: Gaussians, photo_of, draw=DRAW) -> torch.Tensor:
     """Statistics of all views."""
-    found = torch.zeros(len(gaussians), 26)
+    growth = {}
     for view in VIEWS:
         leaves = Gaussians(**{name: value.clone().requires_grad_() for name, value in gaussians.items()})
         (raster,) = draw.draw(leaves, [Shot(view, view.full)], sh_degree=0, judge=True)
@@ -54,8 +53,8 @@ def judged(gaussians: Gaussians, photo_of, draw=DRAW) -> torch.Tensor:
         raster.info["sums"].ask([torch.cat((residual, torch.ones_like(residual[..., :1])), dim=-1)])
         raster.color.sum().backward()
         error = residual.square().sum(dim=-1).mean()
-        found += asked_for(gaussians, 3, Judged(view, raster.info["sums"].values[0], error))
-    return found
+        add_picture(growth, gaussians, 3, Judged(view, raster.info["sums"].values[0], error))
+    return growth[WORTH]
 
 
 def squared_error(gaussians: Gaussians, photo_of) -> float:
@@ -109,7 +108,8 @@ def test_the_native_library_and_torch_ask_for_the_same():
 def test_what_is_no_number_counts_for_nothing():
     sums = torch.ones(4, 10)
     sums[1, 4], sums[2, 0] = torch.nan, 0.0
-    found = asked_for(random_gaussians(4), 2, Judged(VIEWS[0], sums, torch.tensor(torch.inf)))
+    add_picture(growth := {}, random_gaussians(4), 2, Judged(VIEWS[0], sums, torch.tensor(torch.inf)))
+    found = growth[WORTH]
     assert bool(found.isfinite().all())
     assert found[1:3, :24].abs().max() == 0
     assert found[0, :24].abs().max() > 0

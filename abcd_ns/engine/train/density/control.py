@@ -31,8 +31,7 @@ from abcd_ns.engine.train.density.shedding import (
     risen,
     weigh,
 )
-from abcd_ns.engine.train.density.worth import WORTH, Judged, asked_for, worth
-from abcd_ns.engine.types import Gaussians
+from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, worth
 
 GATHER, REFINE = 1, 6
 """Step numbers as gsplat's MCMC sees them; it refines on multiples of the second."""
@@ -59,7 +58,7 @@ Infos = tuple[dict[str, Any], ...]
 
 @dataclass
 class DensityConfig:
-    """When and how the number of Gaussians changes. Thresholds are splatfacto's but that of opacities."""
+    """When and how the number of Gaussians changes."""
 
     strategy: Literal["default", "mcmc", "off"] = "default"
     """`default`: split what is worth it, and prune. `mcmc`: relocate, and add up to a limit."""
@@ -116,10 +115,7 @@ class DensityControl:
 
     def is_due(self, clock: DensityClock) -> bool:
         """Whether this step refines."""
-        begins, ends = self.config.refine_start, self.config.refine_stop
-        if clock.first and begins < ends:
-            ends = max(ends, LAST)
-        if not begins <= clock.progress < ends:
+        if not (self.config.refine_start <= clock.progress and self._grows(clock.progress, clock.first)):
             return False
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
         every = max(self.config.refine_every, views, 1)
@@ -142,14 +138,17 @@ class DensityControl:
         return self.is_due(clock) and (self.config.strategy != "default" or WORTH in growth)
 
     def asks(self, progress: float, first: bool) -> bool:
-        """Whether growth is still to come, so that residuals are to be summed.
+        """Whether growth is under way or to come: residuals are summed for it.
 
         Args:
             progress: share of the run that is done.
             first: whether a block among others is in its first visit.
         """
-        ends = self.config.refine_stop
-        return self.config.strategy == "default" and progress < (max(ends, LAST) if first else ends)
+        return self.config.strategy == "default" and self._grows(progress, first)
+
+    def _grows(self, progress: float, first: bool) -> bool:
+        begins, ends = self.config.refine_start, self.config.refine_stop
+        return progress < (max(ends, LAST) if first and begins < ends else ends)
 
     def resets(self, clock: DensityClock) -> bool:
         """Whether this step resets opacities (`default` strategy); that needs no gradients. Among others
@@ -159,19 +158,6 @@ class DensityControl:
             return False
         alone = clock.refined is None or clock.warm_up
         return alone and clock.spent <= RESET_UNTIL and clock.reached(every)
-
-    def _gathered(
-        self,
-        growth: dict[str, Tensor],
-        gaussians: Gaussians,
-        infos: Infos,
-        judged: Sequence[Judged],
-        views: int,
-    ) -> dict[str, Tensor]:
-        """Statistics with those of more drawings."""
-        for picture in judged:
-            growth = added(growth, {WORTH: asked_for(gaussians, self._axes, picture)})
-        return added(growth, weigh(infos, views))
 
     def after_step(
         self,
@@ -185,7 +171,7 @@ class DensityControl:
         """Gather statistics and, when it is time, refine. Call after Adam's step.
 
         Args:
-            growth: the block's statistics so far, each [n, ...].
+            growth: the block's statistics so far, each [n, ...]; WORTH is changed in place.
             infos: of the step's drawings, after backward.
             judged: those of the step's pictures whose residuals were summed.
 
@@ -195,10 +181,11 @@ class DensityControl:
         if self.config.strategy == "off" or len(params["means"]) == 0:
             return growth
         if self.config.strategy == "default":
-            gaussians = live_gaussians(params).detach()
-            growth = self._gathered(growth, gaussians, infos, judged, clock.views)
+            growth = added(growth, weigh(infos, clock.views))
+            for picture in judged:
+                add_picture(growth, live_gaussians(params).detach(), self._axes, picture)
             if not self.asks(clock.progress, clock.first):
-                growth = {name: value for name, value in growth.items() if name != WORTH}
+                growth.pop(WORTH, None)
             if not (self.refines(clock, growth) or self.resets(clock)):
                 return growth
         device = params["means"].device

@@ -24,9 +24,10 @@ from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
 
 WORTH = "worth"
-"""The statistic's name, see `asked_for`."""
-BY_CHANNEL, BY_AXIS = 9, 3
-"""Numbers of b and of A."""
+"""Name of the statistic, [n, 26]: b [axis, channel] and A [axis] of each half of the views, then sums over
+pictures of the error of a pixel and of 1."""
+BY_CHANNEL, BY_AXIS, COLUMNS = 9, 3, 26
+"""Columns of b, of A, and in all."""
 TINY = 1e-8
 """Added to A, which may be 0."""
 
@@ -39,7 +40,7 @@ class Judged:
     sums: Float[Tensor, "n 10"]
     """See ResidualSums, of the block's Gaussians."""
     error: Float[Tensor, ""]
-    """The mean squared one of a pixel, over its channels."""
+    """Squared error of a pixel, summed over channels: the mean of the picture's."""
     share: float = 1.0
     """Of the pixels that might have been drawn, those that are."""
 
@@ -51,9 +52,8 @@ def half_of(view: int) -> int:
 
 
 @torch.no_grad()
-def asked_for(gaussians: Gaussians, axes: int, picture: Judged) -> Float[Tensor, "n 26"]:
-    """What a picture adds to WORTH: of each half of the views b [axis, channel] and A [axis], then the error
-    of a pixel, then 1.
+def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, picture: Judged) -> None:
+    """Add what a picture says to WORTH, in place; it begins with zeros.
 
     Args:
         axes: along which Gaussians extend.
@@ -79,10 +79,13 @@ def asked_for(gaussians: Gaussians, axes: int, picture: Judged) -> Float[Tensor,
     found = torch.cat((b.flatten(1), a), dim=1) / picture.share
     # An accelerator may have skipped a step that was no number.
     found = torch.where((weight > 0) & found.isfinite().all(dim=1, keepdim=True), found, 0.0)
-    halves = [torch.zeros_like(found), torch.zeros_like(found)]
-    halves[half_of(view.index)] = found
-    error = picture.error.to(means).nan_to_num(0.0).expand_as(weight)
-    return torch.cat((*halves, error, torch.ones_like(weight)), dim=1)
+    if WORTH not in growth:
+        growth[WORTH] = means.new_zeros((len(means), COLUMNS))
+    sums, columns = growth[WORTH], found.shape[1]
+    start = columns * half_of(view.index)
+    sums[:, start : start + columns] += found
+    sums[:, -2] += picture.error.to(means).nan_to_num(0.0, 0.0, 0.0)
+    sums[:, -1] += 1
 
 
 def worth(

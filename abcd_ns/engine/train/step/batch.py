@@ -97,8 +97,10 @@ class Sample:
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w c"]
     ) -> Float[Tensor, "h w 4"]:
         """Photo less picture as the block sees it, and what of it shows; see ResidualSums."""
-        shows = torch.ones_like(picture[..., :1]) if self.in_front is None else self.in_front[..., None]
-        return torch.cat(((photo[..., :3] - picture) * shows, shows), dim=-1)
+        residual = photo[..., :3] - picture
+        return seen_behind(
+            residual, torch.ones_like(residual[..., 0]) if self.in_front is None else self.in_front
+        )
 
     @property
     def weight(self) -> float:
@@ -119,6 +121,12 @@ class Sample:
             pixel_loss=config.recipe.pixel_loss,
         )
         return found if self.share == 1 else found / self.share
+
+
+def seen_behind(residual: Float[Tensor, "h w 3"], in_front: Float[Tensor, "h w"]) -> Float[Tensor, "h w 4"]:
+    """A picture's residual as ResidualSums take it, of what lies behind something of this transmittance."""
+    shows = in_front[..., None]
+    return torch.cat((residual * shows, shows), dim=-1)
 
 
 def _mean_of_squares(pixels: Float[Tensor, "_h _w c"], by: int) -> Float[Tensor, "h w c"]:
