@@ -262,7 +262,6 @@ class Dispatcher(Coordinator):
         block, sweep = active.geometry.block, lent.lease.task.sweep
         state.in_flight.remove(active)
         state.step += outcome.done
-        state.count_drawn(outcome.trained, outcome.frozen)
         if outcome.shown:
             state.influence[block].update(outcome.shown)
         state.health[block] = outcome.health

@@ -58,8 +58,6 @@ class VisitOutcome:
     """On the CPU; Gaussians that left the cell are still among them."""
     done: int
     """Steps taken."""
-    trained: int
-    frozen: int
     """Gaussians of the block and around it, when the visit began."""
     shown: dict[int, float]
     """The influence that the block has on views that were doubtful."""

@@ -120,8 +120,6 @@ class VisitWorker:
         return VisitOutcome(
             training.finish(),
             active.done,
-            run.state.trained,
-            run.state.frozen,
             run.state.influence[block],
             run.state.health[block],
             active.layer_seconds,

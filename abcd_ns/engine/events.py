@@ -88,18 +88,6 @@ class Mended:
 
 
 @dataclass(frozen=True)
-class VisitUndone:
-    """A visit left its pictures worse than it found them; the block was put back. VisitEnded follows."""
-
-    visit: int
-    block: int
-    before: float
-    """Mean loss of the visit's views when they were first used."""
-    after: float
-    """The same when they were last used."""
-
-
-@dataclass(frozen=True)
 class WorkerSeen:
     """What one of the run's workers is doing."""
 
@@ -183,7 +171,6 @@ Event = (
     | SweepEnded
     | BlockSplit
     | Mended
-    | VisitUndone
     | PhotosWanted
     | WorkersSeen
     | WorkerLost

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Iterator
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -69,23 +68,23 @@ class StepNumbers:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        self._sent: deque[tuple[Any, dict[str, int], Download]] = deque()
+        self._sent: deque[tuple[dict[str, int], Download]] = deque()
 
     @property
     def are_late(self) -> bool:
         """Whether they are better not asked for in the step that they are of."""
         return event_of(self._device) is not None
 
-    def send(self, about: Any, parts: Parts) -> None:
-        """Have them copied; `about` is given back with them."""
+    def send(self, parts: Parts) -> None:
+        """Have them copied."""
         flat = [number for part in parts.values() for number in part]
         if flat:
             counts = {name: len(part) for name, part in parts.items()}
-            self._sent.append((about, counts, Download(torch.stack(flat))))
+            self._sent.append((counts, Download(torch.stack(flat))))
 
-    def read(self, all_but: int = 0) -> Iterator[tuple[Any, Numbers]]:
+    def read(self, all_but: int = 0) -> Iterator[Numbers]:
         """Those that were sent and not read yet, but for the last so many: waits until they are there."""
         while len(self._sent) > all_but:
-            about, counts, numbers = self._sent.popleft()
+            counts, numbers = self._sent.popleft()
             values = iter(numbers.read().tolist())
-            yield about, {name: [next(values) for _ in range(count)] for name, count in counts.items()}
+            yield {name: [next(values) for _ in range(count)] for name, count in counts.items()}

@@ -9,7 +9,7 @@ import torch
 from abcd_ns.data.prepare import DOWNSCALE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
-from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, fewest_blocks, free_on_gpu, levels_of
+from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, free_on_gpu, levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.errors import UserError
 from abcd_ns.units import GIB, bytes_in_words
@@ -134,7 +134,7 @@ class Demand:
     def needs(self, batch: int, crop_pixels: int, levels: int) -> DeviceNeeds:
         """What that takes with so many views in a step; see DeviceNeeds."""
         training, keeps = self.training, not self.on_cpu
-        options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive, drawings_of(training))
+        options = (training.sh_degree, crop_pixels, levels, keeps, training.primitive)
         return DeviceNeeds(self.pixels, batch, *options)
 
 
@@ -186,7 +186,7 @@ def _views_and_crop(budget: int, demand: Demand) -> tuple[int, int]:
         if demand.needs(batch, training.limits.crop_pixels, levels=0).step_bytes <= room:
             return batch, training.limits.crop_pixels
     batch = views[-1]
-    of_a_pixel = DeviceNeeds(1, batch, drawings=drawings_of(training)).step_bytes
+    of_a_pixel = DeviceNeeds(1, batch).step_bytes
     return batch, training.limits.crop_pixels or min(max(int(room / of_a_pixel), LEAST_CROP), demand.pixels)
 
 

@@ -33,7 +33,6 @@ HONOURED = {
     "random_scale",
     "rasterize_mode",
     "color_corrected_metrics",
-    "use_bilateral_grid",
 }
 """Splatfacto's model options that are flags of `ns-train abcd` too."""
 TOLERATED = {"eval_num_rays_per_chunk"}
@@ -55,7 +54,7 @@ _HALVES = "each that grows becomes two, large or small"
 _ERROR = "set --pipeline.training.density.split-pixels instead: Gaussians grow by error, not by gradients"
 _REDUCED = "set --pipeline.training.coarse, a share of the run, instead"
 _GIANTS = "--pipeline.training.heal shrinks giants"
-_GRIDS = "grids are 16 x 16 x 8, splatfacto's default, and adapt as --pipeline.training.light says"
+_GRIDS = "set --pipeline.training.light affine instead, which measured as good"
 _RAYS = "it is about rays, and Gaussians are not drawn by rays"
 UNUSED_OF_MODEL = {
     "warmup_length": "set --pipeline.training.density.refine-start, a share of the run, instead",
@@ -69,7 +68,7 @@ UNUSED_OF_MODEL = {
     **dict.fromkeys(("cull_screen_size", "stop_screen_size_at"), _GIANTS),
     "split_screen_size": "nothing is split for its size",
     **dict.fromkeys(("cull_scale_thresh", "use_scale_regularization", "max_gauss_ratio"), _GIANTS),
-    "grid_shape": _GRIDS,
+    **dict.fromkeys(("use_bilateral_grid", "grid_shape"), _GRIDS),
     "camera_optimizer": "set --pipeline.training.poses SO3xR3 instead",
     "output_depth_during_training": "no loss here needs depth; trained scenes have it",
     **dict.fromkeys(("enable_collider", "collider_params", "eval_num_rays_per_chunk"), _RAYS),
@@ -185,13 +184,6 @@ def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:
         raise UserError(_no_effect(f"pipeline.model.{name}", why))
     if model.rasterize_mode == "antialiased":
         training.antialiased = True
-    if model.use_bilateral_grid:
-        if training.light not in ("none", "bilateral"):
-            raise UserError(
-                f"--pipeline.model.use-bilateral-grid and --pipeline.training.light {training.light} are two "
-                "kinds of light: give one."
-            )
-        training.light = "bilateral"
     if training.light != "none":  # held-out photos have a light of their own, too
         model.color_corrected_metrics = True
     for name, source in MIRRORED.items():

@@ -80,7 +80,7 @@ class ExactTrainer(Trainer):
 
     def __init__(self, run: TrainingRun) -> None:
         super().__init__(run)
-        self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
+        self._pace = Pace(run.optimizers, run.config.recipe.fast_start)
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []

@@ -116,18 +116,6 @@ def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, 
         assert steady.state.to_json() | {"seconds": 0} == shaken.state.to_json() | {"seconds": 0}
 
 
-def test_who_waited_for_an_undone_visit_is_not_seen_before_the_next(make, photos, monkeypatch):
-    """As where the block is trained at home."""
-    monkeypatch.setattr("abcd_ns.engine.train.health.health.loss_rise", lambda _: (1.0, 2.0, 0.0))
-    monkeypatch.setattr("abcd_ns.engine.train.health.health.is_worse", lambda *_: True)
-    run = make(workers=2, density=STILL, scaffold=40, warmup=0.3)
-    ended = listen(run, VisitEnded)
-    while not any(event.block is not None for event in ended) and not run.finished:
-        train(run, photos, steps=1)
-    block = ended[-1].block
-    assert 0 < len(run.scene.gaussians(block)) < run.scene.count(block)
-
-
 def test_a_visit_that_is_lent_again_knows_what_time_it_is(make, photos, monkeypatch):
     run = make(workers=1, density=STILL)
     submit, wait, lent = run.workers.submit, run.workers.wait, []
@@ -311,7 +299,7 @@ def test_a_limit_on_gaussians_holds_for_all_that_are_out(make, photos):
 
 def test_workers_apply_the_light_of_the_moment_and_leave_it(make, photos):
     """So the light is what the warm-up has made of it."""
-    run = make(workers=2, lag=2, density=STILL, scaffold=40, warmup=0.3, light="bilateral")
+    run = make(workers=2, lag=2, density=STILL, scaffold=40, warmup=0.3, light="affine")
     while not run.trains_elsewhere:
         train(run, photos, steps=1)
     before = {view: run.run.light.of(view).detach() for view in run.views}

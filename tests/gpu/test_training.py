@@ -81,7 +81,7 @@ def test_steps_on_the_device_make_the_photos_more_alike(tmp_path, begin, views, 
     assert mean_error(coordinator, views, photos) < 0.9 * before
 
 
-@pytest.mark.parametrize("light", ["exposure", "affine", "bilateral"])
+@pytest.mark.parametrize("light", ["exposure", "affine"])
 def test_light_is_found_on_the_device(tmp_path, begin, photos, light):
     coordinator = begin(tmp_path, blocks=1, light=light, density=DensityConfig(strategy="off"))
     train(coordinator, photos)

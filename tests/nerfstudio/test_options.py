@@ -116,16 +116,7 @@ def test_the_antialiased_mode_of_splatfacto_is_ours():
     assert pipeline.model.rasterize_mode == "antialiased"
 
 
-def test_the_bilateral_grids_of_splatfacto_are_ours():
-    pipeline = parsed("--pipeline.model.use-bilateral-grid", "True").pipeline
-    mirror(pipeline.training, pipeline.model)
-    assert pipeline.training.light == "bilateral"
-    pipeline.training.light = "affine"
-    with pytest.raises(UserError, match="two kinds of light"):
-        mirror(pipeline.training, pipeline.model)
-
-
-@pytest.mark.parametrize("kind", ["none", "exposure", "affine", "bilateral"])
+@pytest.mark.parametrize("kind", ["none", "exposure", "affine"])
 def test_where_light_is_compensated_held_out_pictures_are_corrected_too(kind):
     pipeline = parsed("--pipeline.training.light", kind).pipeline
     mirror(pipeline.training, pipeline.model)
@@ -155,7 +146,7 @@ def test_where_light_is_compensated_held_out_pictures_are_corrected_too(kind):
             r"density.cull-alpha-thresh must be 0.0020 or more where opacities are reset",
         ),
         (lambda c: setattr(c.pipeline.training, "visit_views", 0), "visit-views must be above 0"),
-        (lambda c: setattr(c.pipeline.training, "first_passes", 0), "first-passes must be above 0"),
+        (lambda c: setattr(c.pipeline.training, "passes", 0), "passes must be above 0"),
         (lambda c: setattr(c.pipeline, "cluster", "10.0.0.1:6379"), "how many workers"),
     ],
 )

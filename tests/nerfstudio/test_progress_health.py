@@ -2,7 +2,7 @@
 
 import pytest
 
-from abcd_ns.engine.events import Mended, StepTaken, VisitBegan, VisitUndone
+from abcd_ns.engine.events import Mended, StepTaken, VisitBegan
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Stopwatch
 from abcd_ns.nerfstudio.run import progress
@@ -27,16 +27,14 @@ def test_no_time_is_left_before_a_step_tells_how_long_it_takes(coordinator, caps
     assert after.endswith(" left")
 
 
-def test_what_is_no_number_and_what_is_undone_is_said_at_once(coordinator, capsys):
+def test_what_is_no_number_is_said_at_once(coordinator, capsys):
     report = ProgressReport(coordinator)
     report(Mended(4, 1, "gradients", 12))
     report(Mended(4, None, "values", 1))
     report(Mended(4, 1, "transparent", 5))
-    report(VisitUndone(5, 2, before=0.1, after=0.125))
     assert capsys.readouterr().out.splitlines() == [
         "block 2: 12 gradients that were no numbers set to zero",
         "warm-up: 1 Gaussians that were no numbers replaced",
-        "block 3: visit undone, it raised the loss of its views by 25%",
     ]
 
 

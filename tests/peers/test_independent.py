@@ -143,7 +143,7 @@ def test_training_improves_every_photo_of_a_scene_with_surfaces(tmp_path, views)
     photos = Photos(truth, views)
     start = dataclasses.replace(truth, features_dc=torch.zeros_like(truth.features_dc))
     # Gentle steps: by themselves, blocks of so small a scene overshoot where photos say little.
-    coordinator = independent(tmp_path, start, views, steps=80, density=STILL, batch_power=0.75)
+    coordinator = independent(tmp_path, start, views, steps=80, density=STILL, batch=1)
 
     def errors() -> list[float]:
         scene = whole_scene(coordinator)

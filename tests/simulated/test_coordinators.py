@@ -104,7 +104,7 @@ def test_a_mask_is_waited_for_once(start, simulated_gsplat):
     assert simulated_gsplat.waited == before + 1
 
 
-@pytest.mark.parametrize("light", ["exposure", "bilateral"])
+@pytest.mark.parametrize("light", ["exposure", "affine"])
 @pytest.mark.parametrize("together", [0, 1])
 def test_poses_are_refined_by_pictures_of_one_unit_and_of_several(
     tmp_path, start, views, photos, together, light, monkeypatch

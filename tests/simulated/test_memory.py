@@ -12,11 +12,10 @@ import pytest
 from abcd_ns.engine.layers.layer_store import LayerStore
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
-from abcd_ns.engine.train import visit_training
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.memory import DeviceNeeds, drawings_of, levels_of, projected_bytes
+from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, projected_bytes
 from abcd_ns.engine.train.training_loop import train
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, training_config
+from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
 
 LAVISH = 4.0
@@ -45,8 +44,7 @@ def peak_of_steps(counts, folder, **options) -> tuple[int, int]:
     return counts.peak_bytes, coordinator.count()
 
 
-PLAIN, LIT = {"density": STILL}, {"density": STILL, "light": "bilateral"}
-CONSISTENT = {"density": STILL, "primitive": "2dgs", "normal_consistency": 0.05}
+PLAIN, LIT = {"density": STILL}, {"density": STILL, "light": "affine"}
 
 
 @pytest.fixture(autouse=True)
@@ -56,30 +54,27 @@ def _uncompiled(simulated_gsplat, monkeypatch):  # noqa: ARG001 - which lends th
         monkeypatch.setattr(fused, name, fused.Fused(name, None))
 
 
-@pytest.mark.parametrize(("batch", "given"), [(1, PLAIN), (2, PLAIN), (1, LIT), (1, CONSISTENT)])
-def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, monkeypatch, batch, given):
-    monkeypatch.setattr(visit_training, "BEGINS", 0.0)
+@pytest.mark.parametrize(("batch", "given"), [(1, PLAIN), (2, PLAIN), (1, LIT)])
+def test_what_a_pixel_takes_in_a_step(tmp_path, simulated_gsplat, batch, given):
     options = {"gaussians": 40, "batch": batch, **given}
     (small, _), (large, _) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(w), width=w, **options) for w in (48, 96)
     )
-    drawings = drawings_of(training_config(**given))
-    model = [DeviceNeeds(w**2, batch, levels=0, drawings=drawings).step_bytes for w in (48, 96)]
+    model = [DeviceNeeds(w**2, batch, levels=0).step_bytes for w in (48, 96)]
     assert large - small <= model[1] - model[0] <= LAVISH * (large - small)
 
 
 GROWING_SURFELS = {"density": GROWING, "primitive": "2dgs"}
 
 
-@pytest.mark.parametrize("given", [PLAIN, {"density": GROWING}, GROWING_SURFELS, CONSISTENT])
-def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, monkeypatch, given):
-    monkeypatch.setattr(visit_training, "BEGINS", 0.0)
+@pytest.mark.parametrize("given", [PLAIN, {"density": GROWING}, GROWING_SURFELS])
+def test_what_a_gaussian_takes(tmp_path, simulated_gsplat, given):
     options = {"width": 32, "batch": 1, **given}
     (small, few), (large, many) = (
         peak_of_steps(simulated_gsplat, tmp_path / str(n), gaussians=n, **options) for n in (300, 1200)
     )
-    needs = {"primitive": given.get("primitive", "3dgs"), "drawings": drawings_of(training_config(**given))}
-    model = DeviceNeeds(32**2, 1, levels=0, **needs).gaussian_bytes * (many - few)
+    primitive = given.get("primitive", "3dgs")
+    model = DeviceNeeds(32**2, 1, levels=0, primitive=primitive).gaussian_bytes * (many - few)
     assert large - small <= model <= LAVISH * (large - small)
 
 

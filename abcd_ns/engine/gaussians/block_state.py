@@ -25,7 +25,7 @@ class Clocks:
     """Views' worth of decay that is in Adam's moments, which corrects their bias: a step of n views lets them
     forget as n steps of one would."""
     visits: int = 0
-    """Visits that have ended, but for those that were undone."""
+    """Visits that have ended."""
     refined: int = 0
     """`steps` when it was last refined."""
 

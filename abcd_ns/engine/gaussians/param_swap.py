@@ -118,29 +118,27 @@ class Pace:
     """Learning rates and memories of the optimizers, as they were given for steps of one view each.
 
     Args:
-        power: of a step's views, with which the rates grow.
         fast_start: they are larger while a block has had few steps, see `rates_of_young`.
     """
 
-    def __init__(self, optimizers: Optimizers, power: float, fast_start: bool) -> None:
+    def __init__(self, optimizers: Optimizers, fast_start: bool) -> None:
         groups = {name: optimizer.param_groups[0] for name, optimizer in optimizers.items()}
-        self._optimizers, self._power, self._fast_start = optimizers, power, fast_start
+        self._optimizers, self._fast_start = optimizers, fast_start
         self._given = {name: (group["lr"], group["betas"]) for name, group in groups.items()}
 
     def set(self, batch: int, trained: int, means_decay: float, damping: float = 1.0) -> None:
         """For a step of `batch` views on a block that was trained on so many, with the means' rate at a share
         of what was given, and all of them damped.
 
-        Moments forget as many views' worth a step. With rates that grow with the square root, Adam then
-        follows the path of single views as far as gradients are noise (Malladi et al. 2022, "On the SDEs and
-        scaling rules for adaptive gradient algorithms"; Zhao et al. 2024 use it for Gaussian Splatting); as
-        far as they agree, with rates in proportion.
+        Rates grow in proportion to the views, as a block's views agree on it, and moments forget as many
+        views' worth a step (Malladi et al. 2022, "On the SDEs and scaling rules for adaptive gradient
+        algorithms", have the square root, for gradients that are noise).
         """
         share = damping * (rates_of_young(trained, batch) if self._fast_start else 1.0)
         for name, (rate, betas) in self._given.items():
             group = self._optimizers[name].param_groups[0]
             decay = means_decay if name == "means" else 1.0
-            group["lr"] = rate * decay * batch**self._power * share
+            group["lr"] = rate * decay * batch * share
             group["betas"] = tuple(beta**batch for beta in betas)
 
 

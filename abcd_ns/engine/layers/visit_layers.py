@@ -118,11 +118,6 @@ class VisitLayers:
         return replace(layers, inside=kept.interleaved), window
 
     @property
-    def frozen(self) -> int:
-        """Gaussians that are drawn for each view."""
-        return sum(self._loaded.values())
-
-    @property
     def nbytes(self) -> int:
         """Of the layers that are kept."""
         return self._store.nbytes

@@ -44,16 +44,16 @@ class TrainingConfig:
     the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this
     share of what it weighs there alone. 1 takes all views and pixels that it may touch."""
     coarse: float = 0.2
-    """Share of the run that is trained on reduced pictures: its first half at a quarter of their width, then
-    at a half, where no side is below 100 pixels then. 0 for none."""
+    """Share of the run in which the warm-up, or a scene of one block, is trained on reduced pictures: first
+    at a quarter of their width, then at half, where no side is below 100 pixels then. 0 for none."""
     visit_views: int = 64
     """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
-    first_passes: int = 8
-    """Uses of each of these views in a visit of the first sweep, where they are 32 or fewer; in proportion
-    fewer uses where they are more."""
+    passes: int = 8
+    """Uses of each of these views in a visit, where they are 32 or fewer; in proportion fewer uses where they
+    are more."""
     heal: bool = True
-    """Where blocks are trained within layers: undo a visit that left its pictures worse than it found them,
-    shrink giants. Values that are no numbers are mended in any case."""
+    """Shrink oversized Gaussians where blocks are trained within layers. Values that are no numbers are
+    repaired in any case."""
     commit_seconds: float = 60.0
     """A kill loses at most so many seconds of the run; what happens is written to disk beside the training.
     0 commits at the end of every visit, which waits for the disk."""
@@ -61,18 +61,14 @@ class TrainingConfig:
     """Highest degree of spherical harmonics."""
     ssim_lambda: float = 0.2
     """Weight of 1 - SSIM in the loss; the rest is the difference of pixels."""
-    normal_consistency: float = 0.0
-    """Weight of 2DGS's normal consistency in the loss of surfels, from 7/30 of the run on: smoother
-    surfaces, worse pictures. 2DGS has 0.05; 0 for none."""
     antialiased: bool = False
     """Scale opacities by gsplat's compensation for its low-pass filter."""
     background: Literal["random", "black", "white"] = "random"
     """What lies behind the scene while training."""
     light: LightKind = "none"
-    """Makes good for photos that were taken in different light, by a colour transform of each finished
-    picture. exposure: a gain for each channel. affine: a matrix, 3 x 4. bilateral: a grid of 16 x 16 x 8 of
-    these, for what differs within a photo. Their mean over the photos is the identity, in which held-out
-    views are drawn; these are scored as `cc_psnr`, too."""
+    """Colour transform of each finished picture, for photos taken in different light. exposure: a gain for
+    each channel. affine: a 3 x 4 matrix. The mean over the photos is the identity, in which held-out views
+    are drawn; these are scored as `cc_psnr`, too."""
     poses: PosesKind = "off"
     """Refines where photos were taken from, by whole pictures in the warm-up and between visits. SO3xR3: how
     each camera turns and where it is. Held-out views keep the poses that were given. With `workers` poses are
@@ -108,12 +104,11 @@ class TrainingConfig:
             ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
             ("sh-degree", 0 <= self.sh_degree <= MAX_SH_DEGREE, f"from 0 to {MAX_SH_DEGREE}"),
             ("influence-share", self.influence_share > 0, "above 0"),
-            ("normal-consistency", self.normal_consistency >= 0, "0 or more"),
             ("window-weight", 0 <= self.window_weight < 1, "from 0 to below 1"),
             ("batch", self.batch >= 0, "0 or more"),
             ("visit-views", self.visit_views > 0, "above 0"),
             ("means-lr-decay", 0 < self.means_lr_decay < math.inf, "above 0 and finite"),
-            ("first-passes", self.first_passes > 0, "above 0"),
+            ("passes", self.passes > 0, "above 0"),
         ):
             if not fits:
                 value = getattr(self, name.replace("-", "_"))
@@ -127,11 +122,6 @@ class TrainingConfig:
         if self.primitive == "2dgs" and (self.antialiased or self.poses != "off"):
             name = "antialiased" if self.antialiased else "poses"
             raise UserError(f"--pipeline.training.{name} is for 3dgs: gsplat's surfels do not have it.")
-        if self.normal_consistency > 0 and (self.primitive == "3dgs" or recipe.exact):
-            raise UserError(
-                "--pipeline.training.normal-consistency is for surfels that are trained by visits: set "
-                "--pipeline.training.primitive 2dgs, and take another method than abcd-exact."
-            )
         if self.light != "none" and recipe.exact:
             raise UserError("--pipeline.training.light is for methods that train by visits, not abcd-exact.")
         if self.poses != "off" and (recipe.exact or recipe.overlap > 0):

@@ -11,10 +11,10 @@ TOO_FEW_VIEWS = 2
 
 @dataclass
 class BlockHealth:
-    """Of one block, since the run began. All but `damping` are counts or facts of its last visit."""
+    """Of one block, since the run began: counts, and facts of its last visit."""
 
     visits: int = 0
-    """That ended, undone ones included."""
+    """That ended."""
     gradients: int = 0
     """Rows of gradients that were no numbers and were set to zero. On an accelerator the first steps that
     have any are skipped, and count as a row each."""
@@ -27,10 +27,6 @@ class BlockHealth:
     """Gaussians that were shrunk."""
     shed: int = 0
     """Gaussians that filled too little of their views and were taken out."""
-    undone: int = 0
-    """Visits that were undone, as they left the loss of their views too high."""
-    damping: float = 1.0
-    """Learning rates of the next visit, as a share of what they would be."""
     hidden: bool = False
     """In the last visit no picture showed the block."""
 
@@ -51,8 +47,6 @@ def standing(block: int, record: BlockHealth | None, views: Mapping[int, int]) -
         return "not visited yet"
     if record.hidden:
         return "hidden behind others, passed over"
-    if record.undone >= record.visits:
-        return "every visit undone"
     if views.get(block, TOO_FEW_VIEWS + 1) <= TOO_FEW_VIEWS:
         return "seen by 1 view only" if views[block] == 1 else f"seen by {views[block]} views only"
     return "trained"
@@ -82,7 +76,6 @@ MENDED = {
     "values": "Gaussians that were no numbers replaced",
     "giants": "giants shrunk",
     "shed": "Gaussians taken out that filled too little of their views",
-    "undone": "visits undone that made their pictures worse",
 }
 """What the counts of a BlockHealth say."""
 

@@ -51,14 +51,13 @@ class LayerSource:
         run, config = self._run, self._run.config
         if active.is_alone or run.scene.tree.num_blocks == 1 or not config.recipe.layers:
             return None
-        views_in_use = run.views_at(active.reduction)
-        painted = list(views_in_use.values())
+        painted = list(run.views.values())
         layers = VisitLayers(
             painter_of(run, self._around(), painted),
             LayerStore(run.device, self.room.device, self.room.ram),
             active.geometry,
             run.scene.gaussians_at_rest(active.geometry.block),
-            views_in_use,
+            run.views,
             PaintSettings(active.sh_degree, config.antialiased),
             window_weight=config.window_weight,
             parts_bytes=parts_bytes(run, painted, blocks=2),

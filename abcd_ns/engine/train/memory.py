@@ -50,7 +50,6 @@ class DeviceNeeds:
         keeps: whether layers and photos are kept on the device, too. Not where it is the CPU, whose RAM has a
             budget of its own for them.
         primitive: what a Gaussian is.
-        drawings: of each view in a step; see `drawings_of`.
     """
 
     pixels: int
@@ -60,7 +59,6 @@ class DeviceNeeds:
     levels: int = 2
     keeps: bool = True
     primitive: PrimitiveName = "3dgs"
-    drawings: int = 1
 
     @property
     def parameter_bytes(self) -> int:
@@ -71,13 +69,13 @@ class DeviceNeeds:
     def gaussian_bytes(self) -> int:
         """Of one Gaussian in training: parameters, gradient, two moments; three of them once more while the
         block is refined; and what its views' drawings hold."""
-        return 7 * self.parameter_bytes + self.batch * self.drawings * projected_bytes(self.primitive)
+        return 7 * self.parameter_bytes + self.batch * projected_bytes(self.primitive)
 
     @property
     def step_bytes(self) -> int:
         """Of a step's pictures."""
         drawn = min(self.crop_pixels or self.pixels, self.pixels)
-        return self.batch * self.drawings * drawn * PIXEL_FLOATS * FLOAT
+        return self.batch * drawn * PIXEL_FLOATS * FLOAT
 
     @property
     def drawing_bytes(self) -> int:
@@ -141,13 +139,8 @@ def scaffold_size(config: TrainingConfig, block: int, pixels: int) -> int:
 def needs_of(config: TrainingConfig, pixels: int, blocks: int) -> DeviceNeeds:
     """What a visit takes in a run on images of so many pixels at most, in one block or several."""
     batch = views_per_step(config.batch, blocks, config.limits.batch_limit)
-    options = {"primitive": config.primitive, "drawings": drawings_of(config)}
-    return DeviceNeeds(pixels, batch, config.sh_degree, config.limits.crop_pixels, **options)
-
-
-def drawings_of(config: TrainingConfig) -> int:
-    """How often a step draws each of its views."""
-    return 2 if config.normal_consistency > 0 else 1
+    crop, primitive = config.limits.crop_pixels, config.primitive
+    return DeviceNeeds(pixels, batch, config.sh_degree, crop, primitive=primitive)
 
 
 def levels_of(blocks: int) -> int:

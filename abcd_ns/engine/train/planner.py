@@ -17,9 +17,7 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
 from abcd_ns.engine.train.schedule import (
     VisitPlan,
-    passes_at_once,
-    passes_for_layers,
-    passes_of_sweep,
+    passes_of_visit,
     plan_sweep,
     views_per_step,
     views_per_visit,
@@ -89,7 +87,7 @@ class Planner(Visits):
     def __init__(self, run: TrainingRun) -> None:
         self._run = run
         self._config, self._budget, self._scene = run.config, run.budget, run.scene
-        self._culling: dict[int, tuple[dict[int, View], Frusta, Optics]] = {}
+        self._culling: tuple[dict[int, View], Frusta, Optics] | None = None
 
     def begin(self, at_once: int = 1) -> ActiveVisit:
         """The warm-up, or a visit to the next block that some view sees; blocks that none sees any more are
@@ -125,15 +123,14 @@ class Planner(Visits):
     def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:
         while True:
             plan = self._next_plan(state, at_once)
-            reduction = self._run.reduction  # of this moment: time may run on
-            views = self._may_see(plan.block, reduction)
+            views = self._may_see(plan.block)
             # Where nothing is known, or what shows the block has changed, all views are asked.
             known = self._known_to_show(state, plan.block, views)
             active = self._visit(state, plan, views, known, sh_degree) or self._visit(
                 state, plan, views, self._survey(plan.block, views).views, sh_degree
             )
             if active is not None:
-                active.began, active.reduction = began, reduction
+                active.began = began
                 return active
 
     def _visit(
@@ -156,8 +153,7 @@ class Planner(Visits):
             return None
         if self._scene.tree.num_blocks == 1:
             return self._sole_visit(state, block, showing, sh_degree)
-        record = state.health.get(block, BlockHealth())  # of undone visits, too, unlike clocks
-        used, earlier = self._views_used(state, len(showing)), record.visits
+        used, earlier = self._views_used(state, len(showing)), state.health.get(block, BlockHealth()).visits
         doubtful = tuple(sorted(views.keys() - set(showing)))
         chosen = visit_views(showing, used, earlier, seed)
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
@@ -218,12 +214,9 @@ class Planner(Visits):
         if not any(state.views.values()):
             raise NothingSeenError("no training view sees any Gaussian: check the poses and the points")
         remaining = None if self._budget.steps is None else self._budget.steps - state.planned
-        last = config.recipe.last_passes or passes_for_layers(state.trained, state.frozen)
-        state.trained = state.frozen = 0
         used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
-        passes = passes_of_sweep(state.sweep, config.first_passes, last, max(used.values()))
         blocks = self._scene.tree.num_blocks
-        passes = passes_at_once(passes, at_once, blocks)
+        passes = passes_of_visit(config.passes, max(used.values()), at_once, blocks)
         if state.sweep % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
@@ -247,24 +240,23 @@ class Planner(Visits):
         return views
 
     def _views_that_see(self, block: int) -> int:
-        return len(self._survey(block, self._may_see(block, 1)).views)
+        return len(self._survey(block, self._may_see(block)).views)
 
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
         most = max(state.views.values())
         return views_per_visit(seen, most, self._config.visit_views) if most else 0
 
-    def _may_see(self, block: int, reduction: int) -> dict[int, View]:
+    def _may_see(self, block: int) -> dict[int, View]:
         """The views whose frusta meet the block's bounds, by index."""
         bounds = self._scene.bounds(block)
         if bounds is None:
             return {}
-        found = self._run.views_at(reduction)
-        if reduction not in self._culling or self._culling[reduction][0] is not found:  # or poses moved
+        found = self._run.views
+        if self._culling is None or self._culling[0] is not found:  # poses moved
             views, slack = list(found.values()), self._run.rasterizer.slack
-            frusta = Frusta(((v, v.full) for v in views), slack)
-            self._culling[reduction] = found, frusta, Optics(views, slack)
-        _, frusta, optics = self._culling[reduction]
+            self._culling = found, Frusta(((v, v.full) for v in views), slack), Optics(views, slack)
+        _, frusta, optics = self._culling
         (shows,) = frusta.may_show([optics.drawn_within(bounds)]).tolist()
         return {index: view for (index, view), may in zip(found.items(), shows, strict=True) if may}
 

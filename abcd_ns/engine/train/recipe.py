@@ -23,9 +23,6 @@ class Recipe:
     visit_steps: int = 0
     """Steps of every visit, whatever the views that see its block, as the paper has; 0 shares steps out by
     views."""
-    last_passes: int = 0
-    """Uses of each view in a visit of late sweeps; one more with each sweep until then. 0 takes as many as
-    leave a tenth of the time for drawing layers, by the Gaussians of a block and around it."""
     keep_moments: bool = True
     """A block keeps Adam's moments and densification's statistics from visit to visit. Off, as in the paper,
     every visit begins with new ones."""
@@ -39,9 +36,6 @@ class Recipe:
     """Share of the run over which the degree rises from 0 to the highest."""
     pixel_loss: Literal["l1", "l2"] = "l1"
     """Mean absolute difference, as 3DGS, or mean squared difference, as the paper with `ssim_lambda` 0."""
-    batch_power: float = 1.0
-    """Learning rates grow with this power of the views in a step: 0.5 suits gradients that are noise, 1 such
-    as agree. A scene's views show different Gaussians, but a block's all show the same ones."""
     fast_start: bool = True
     """Learning rates are larger while a block was trained on few views, see `param_swap.rates_of_young`, and
     fall at the end of the run, see `schedule.settling`."""

@@ -76,10 +76,10 @@ class TrainingRun:
 
     @property
     def reduction(self) -> int:
-        """By how much pictures are reduced in the visit that is under way, or if one began now."""
+        """By how much pictures are reduced: only where all of the scene is in training."""
         active = self.state.active
         if active is not None and not active.is_all:
-            return active.reduction
+            return 1
         return reduction_at(self.progress, self.config.coarse, self._shortest)
 
     @property

@@ -64,9 +64,6 @@ class ActiveVisit:
     cut."""
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
-    reduction: int = 1
-    """Of the pictures, from the visit's first step to its last: its layers are as large. What is trained as a
-    whole has none, and changes to larger pictures at any step."""
     began: float = 0.0
     """Training time when the visit began."""
     since: float = 0.0
@@ -75,8 +72,6 @@ class ActiveVisit:
     """Share of the run at which the visit ends, whatever its steps."""
     shown: bool = False
     """Whether any picture has shown the block so far."""
-    objective: dict[int, list[float]] = field(default_factory=dict)
-    """By view, its loss when the visit first used it and, from its second use on, when it last did."""
 
     @property
     def trained_on(self) -> tuple[int, ...]:
@@ -124,10 +119,6 @@ class RunState:
     """By block, how many views were worth training it on when last looked at; 0 means that none is."""
     influence: Influence = field(default_factory=dict)
     """As far as known; blocks that are missing are trained on all views that see them."""
-    trained: int = 0
-    """Gaussians of the blocks that were visited in this sweep, when their visits began."""
-    frozen: int = 0
-    """Gaussians that were drawn around them."""
     poses: dict[str, str] = field(default_factory=dict)
     """See Poses, at rest; empty where all are as they were given."""
     uses: float = 0.0
@@ -150,17 +141,13 @@ class RunState:
         """Steps taken, and those that workers are to take."""
         return self.step + sum(visit.steps for visit in self.in_flight)
 
-    def count_drawn(self, trained: int, frozen: int) -> None:
-        """A visit has drawn its layers."""
-        self.trained, self.frozen = self.trained + trained, self.frozen + frozen
-
     def inherit(self, new: int, parent: int) -> None:
         """`new` was a part of `parent`: what is known of that holds for it too; it is visited next to it."""
         for known in (self.views, self.influence):
             if parent in known:
                 known[new] = copy.copy(known[parent])
         if (record := self.health.get(parent)) is not None:  # what was mended is counted once
-            self.health[new] = BlockHealth(visits=record.visits, damping=record.damping)
+            self.health[new] = BlockHealth(visits=record.visits)
         places = [place for place, plan in enumerate(self.queue) if plan.block == parent]
         for place in reversed(places):
             self.queue.insert(place + 1, self.queue[place]._replace(block=new))

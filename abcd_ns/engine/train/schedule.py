@@ -2,8 +2,7 @@
 
 There is one step budget for the whole scene. A sweep visits every block that some view sees; what its steps
 draw is proportional to the number of those views, as in joint training (docs/design.md: blocks that few
-views see overfit otherwise). Visits are short at first, while the neighbours are still blobs, and
-grow longer, so that drawing the frozen layers is paid for by more steps.
+views see overfit otherwise).
 """
 
 import math
@@ -32,16 +31,12 @@ LEAST_SIDE = 100
 
 FEW_VIEWS = 32
 """Of a visit: with more, a visit uses each less often, and is as long."""
-LAYER_TIME = 0.1
-"""Of a visit's time, for its layers, where visits are as long as they should be."""
 SHORTER = 4
 """Visits are so many times shorter where all blocks are trained at once: each begins sooner from what the
 others have made of themselves meanwhile."""
 SETTLES, SETTLED, SETTLING_VIEWS = 0.6, 0.1, 1000
 """From this share of a run on learning rates fall, to this share of them where a block was trained on so many
 views, the warm-up's included: one that saw fewer is on its way yet."""
-FROZEN_COST, WINDOW_COST = 0.3, 0.4
-"""Of drawing a Gaussian into a layer, and of finding its block's window; a training step draws one for 1."""
 
 
 class VisitPlan(NamedTuple):
@@ -73,42 +68,17 @@ def warmed(progress: float, uses: float, share: float, waiting: int) -> float:
     return max(done, uses / SCAFFOLD_PASSES) if waiting else done
 
 
-def passes_of_sweep(sweep: int, first: int, last: int, used: int) -> int:
-    """How often each view of a block is used in a visit of this sweep: from `first` up by one to `last`.
+def passes_of_visit(passes: int, used: int, at_once: int, blocks: int) -> float:
+    """How often a visit uses each of its views.
 
     Args:
-        first: where a visit uses FEW_VIEWS or fewer.
+        passes: where one block is trained after the other, and a visit uses FEW_VIEWS or fewer.
         used: views that a visit to the block uses that most views see.
+        at_once: visits that are in flight at the same time: they are shorter, by the share of other blocks.
     """
-    first = math.ceil(first * min(1.0, FEW_VIEWS / max(used, 1)))
-    return min(first + sweep, max(first, last))
-
-
-def passes_for_layers(trained: int, frozen: int) -> int:
-    """Uses of each view in a visit such that its layers take LAYER_TIME of the visit's time.
-
-    A step draws a block forward and backward. A layer draws what is around the block forward, and its window
-    needs the weights of the block. What these cost was measured (docs/performance.md); it is counted in
-    Gaussians, not in seconds, so that a run is the same on every machine.
-
-    Args:
-        trained, frozen: Gaussians of blocks, and around them, over some visits.
-    """
-    if trained == 0:
-        return 0
-    layers = FROZEN_COST * frozen / trained + WINDOW_COST
-    return math.ceil(layers * (1 - LAYER_TIME) / LAYER_TIME)
-
-
-def passes_at_once(passes: int, at_once: int, blocks: int) -> float:
-    """Uses of each view in a visit, of `passes` where one block is trained after the other: fewer, by the
-    share of the other blocks that are out at the same time.
-
-    Args:
-        at_once: visits that are out at once.
-    """
+    alone = math.ceil(passes * min(1.0, FEW_VIEWS / max(used, 1)))
     unseen = min((at_once - 1) / max(blocks - 1, 1), 1.0)
-    return passes / (1 + (SHORTER - 1) * unseen)
+    return alone / (1 + (SHORTER - 1) * unseen)
 
 
 def plan_sweep(

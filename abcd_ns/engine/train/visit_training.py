@@ -14,7 +14,7 @@ from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cuda.drawn import pictures_of
 from abcd_ns.engine.space.influence import InfluenceTable, share_shown
 from abcd_ns.engine.store.special_blocks import RESERVE
-from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, Use, gradients_of
+from abcd_ns.engine.train.capture.light import AMONG_OTHERS, LAST_RATE, gradients_of
 from abcd_ns.engine.train.density.shedding import PASSES, weighed
 from abcd_ns.engine.train.health.health_rules import share_of_picture
 from abcd_ns.engine.train.layer_source import LayerSource
@@ -39,7 +39,6 @@ from abcd_ns.engine.train.step.batch import (
     part_to_draw,
 )
 from abcd_ns.engine.train.step.live_block import LiveBlock
-from abcd_ns.engine.train.step.normal_consistency import BEGINS, normal_consistency
 from abcd_ns.engine.train.step.residuals import Residuals
 from abcd_ns.engine.types import Crop, View
 
@@ -65,7 +64,7 @@ class VisitTraining:
         self.layers: VisitLayers | None = None
         self.influence: InfluenceTable | None = None
         """In the warm-up: what its drawings show of every block."""
-        self._pace = Pace(run.optimizers, run.config.recipe.batch_power, run.config.recipe.fast_start)
+        self._pace = Pace(run.optimizers, run.config.recipe.fast_start)
         self._backgrounds = Backgrounds(run.config, run.device)
         self._order: tuple[int, ...] = ()
         self._rendered: Rendered | None = None
@@ -97,8 +96,6 @@ class VisitTraining:
         self._order = view_order(active.views, taken, active.number, run.config.seed)
         self.layers = self._source.draw(active, self._order[active.done * self.batch :])
         active.layer_seconds += run.stopwatch.seconds - before
-        if active.done == 0 and self.layers is not None:
-            state.count_drawn(gaussians, self.layers.frozen)
         if active.done == 0 and active.looked_at:
             state.influence[block].update(self._shown_in(active.looked_at))
 
@@ -120,7 +117,7 @@ class VisitTraining:
         # A first visit, perhaps the only one, has all.
         settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views
-        damping = run.health.damping * (settling(run.progress, trained) if settles else 1.0)
+        damping = settling(run.progress, trained) if settles else 1.0
         self._pace.set(self.batch, trained, decay, damping)
         step, first = run.state.step, run.active.done * self.batch
         views = self._views_of(range(first, first + self.batch + COMING))
@@ -138,19 +135,12 @@ class VisitTraining:
 
     def loss(self, batch: Batch, pictures: Pictures, photos: Pictures) -> Float[Tensor, ""]:
         """The loss of a step: photometric over what of the crops says something about the block, the mean of
-        the samples', plus what surfels and the density strategy ask for."""
+        the samples', plus what the density strategy adds."""
         run = self.run
         pictures, photos = self._visits.compared(batch, pictures, photos)
         self._residuals.ask(self._rendered, batch.samples, pictures, photos)
         losses = batch.losses(pictures, photos, run.config)
         loss = losses[0] if len(losses) == 1 else sum(losses[1:], start=losses[0]) / len(losses)
-        run.health.note(
-            [(s.view.index, found.detach()) for s, found in zip(batch.samples, losses, strict=True)]
-        )
-        if run.config.normal_consistency > 0 and run.share >= BEGINS:
-            surfels = live_gaussians(run.params)
-            off = normal_consistency(surfels, batch.samples, run.rasterizer)
-            loss = loss + run.config.normal_consistency * off
         if run.config.density.strategy == "mcmc":
             loss = loss + run.density.regularisation(run.params, run.count())
         return loss
@@ -234,7 +224,7 @@ class VisitTraining:
     def whole(self, view: int) -> Sample:
         """All that a view shows of the block in this visit."""
         run, active = self.run, self.run.active
-        seen, crop = run.views_at(active.reduction)[view], active.geometry.crops[view]
+        seen, crop = run.views_at(run.reduction)[view], active.geometry.crops[view]
         return self._sample_of(seen, crop, 0, run.state.step)
 
     @property
@@ -278,7 +268,7 @@ class VisitTraining:
         infos = tuple({id(raster.info): raster.info for raster in rasters}.values())
         lights = [None if run.light is None else run.light.of(sample.view.index) for sample in samples]
         uses = [
-            Use(sample.view.index, transform, sample.weight / self.batch)
+            (sample.view.index, transform)
             for sample, transform in zip(samples, lights, strict=True)
             if transform is not None
         ]

@@ -19,7 +19,6 @@ from abcd_ns.engine.events import (
     SweepEnded,
     VisitBegan,
     VisitEnded,
-    VisitUndone,
     WorkerLost,
     WorkerSeen,
     WorkersSeen,
@@ -82,11 +81,6 @@ class ProgressReport:
                 self._print(f"{_block(event.block)}: lost its worker, trained again: {event.why}")
             case Mended() if event.what in ALARMING:
                 self._print(f"{_block(event.block)}: {event.count:,} {MENDED[event.what]}")
-            case VisitUndone():
-                rise = event.after / event.before - 1
-                self._print(
-                    f"{_block(event.block)}: visit undone, it raised the loss of its views by {rise:.0%}"
-                )
 
     def scalars(self) -> dict[str, float]:
         """Where the training stands, by name, for TensorBoard, wandb and comet.

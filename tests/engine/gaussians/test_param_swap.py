@@ -1,6 +1,5 @@
 """Learning rates of steps of several views."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -23,12 +22,12 @@ from abcd_ns.engine.types import PARAM_NAMES
 from tests.reference.scenes import random_gaussians
 
 
-def travelled(power: float, views: int, steps: int) -> dict[str, float]:
+def travelled(views: int, steps: int) -> dict[str, float]:
     """How far each parameter comes where all views ask for the same."""
     params, adam = nothing_live(sh_degree=1)
     attach(BlockState.fresh(random_gaussians(1)), params, adam)
     pace, before = (
-        Pace(adam, power, fast_start=False),
+        Pace(adam, fast_start=False),
         {name: params[name].detach().clone() for name in PARAM_NAMES},
     )
     for _ in range(steps):
@@ -41,15 +40,8 @@ def travelled(power: float, views: int, steps: int) -> dict[str, float]:
 
 @given(views=st.integers(1, 16))
 def test_views_that_agree_come_as_far_together_as_one_by_one(views):
-    together, one_by_one = travelled(1.0, views, steps=1), travelled(1.0, 1, steps=views)
+    together, one_by_one = travelled(views, steps=1), travelled(1, steps=views)
     assert together == pytest.approx(one_by_one, rel=1e-2)
-
-
-@given(views=st.integers(1, 16), power=st.sampled_from([0.5, 0.75, 1.0]))
-def test_a_step_grows_with_the_power_of_its_views(views, power):
-    single = travelled(power, 1, steps=1)
-    expected = {name: far * math.pow(views, power) for name, far in single.items()}
-    assert travelled(power, views, steps=1) == pytest.approx(expected, rel=1e-2)
 
 
 @given(views=st.integers(0, 10**6), more=st.integers(0, 10**6), batch=st.integers(1, 8))
@@ -65,7 +57,7 @@ def test_rates_fall_from_four_times_to_what_was_given(views, more, batch):
 def test_a_block_that_has_had_few_steps_takes_larger_ones(views, batch, times):
     _, adam = nothing_live(sh_degree=0)
     given = {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES}
-    Pace(adam, 1.0, fast_start=True).set(batch, views, means_decay=0.5)
+    Pace(adam, fast_start=True).set(batch, views, means_decay=0.5)
     expected = {name: times * rate * (0.5 if name == "means" else 1.0) for name, rate in given.items()}
     assert {name: adam[name].param_groups[0]["lr"] for name in PARAM_NAMES} == pytest.approx(expected)
 
@@ -87,7 +79,7 @@ def stepped_in(batches: list[tuple[int, int]]) -> Iterator[tuple[float, float]]:
         batches: (views in a step, steps); the block is taken out and put back in between.
     """
     params, adam = nothing_live(sh_degree=0)
-    pace, rest = Pace(adam, 0.5, fast_start=False), BlockState.fresh(random_gaussians(2))
+    pace, rest = Pace(adam, fast_start=False), BlockState.fresh(random_gaussians(2))
     for batch, steps in batches:
         attach(rest, params, adam, batch=batch)
         clocks = rest.clocks

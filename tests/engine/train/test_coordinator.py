@@ -353,22 +353,6 @@ def test_a_giant_is_trained_where_it_reaches_out_of_its_cell(tmp_path, views, st
     assert seen > 0
 
 
-def test_visits_count_what_their_layers_cost_and_a_new_sweep_begins_anew(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=60, warmup=0.0, first_passes=1)
-    found = []
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        state = coordinator.state
-        if state.active is not None and state.active.done == 1:
-            found.append((state.sweep, len(state.queue), state.trained, state.frozen))
-    first, second = found[:2]
-    assert (first[0], second[0]) == (0, 0)
-    assert first[2] + first[3] == len(start)  # each block is all that is around the other
-    assert second[2] + second[3] > len(start) + first[2]
-    assert found[2][0] == 1
-    assert found[2][2] < second[2]
-
-
 def test_layers_show_what_earlier_visits_made_of_the_other_blocks(tmp_path, views, photos, start):
     """Invariant 6: whenever a visit begins, its pictures are those of the whole scene as it is by then."""
     coordinator = make_coordinator(tmp_path, start, views, blocks=4, window_weight=0.0, visit_steps=2)

@@ -6,17 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from abcd_ns.engine.events import Mended, VisitBegan, VisitEnded, VisitUndone
+from abcd_ns.engine.events import Mended, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
-from abcd_ns.engine.store.settle import with_mail
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
-from abcd_ns.engine.train.health.health_rules import is_worse, loss_rise, stand_ins, unsound
+from abcd_ns.engine.train.health.health_rules import stand_ins, unsound
 from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room, live_bytes
-from abcd_ns.engine.train.run_state import ActiveVisit, RunState
+from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from tests.reference.scenes import equal, listen, make_coordinator, random_gaussians, whole_scene
@@ -47,7 +46,7 @@ def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, sta
         folder.mkdir()
         options = {"blocks": 2, "steps": 18, "density": GROWING, "scaffold": 120}
         coordinator = make_coordinator(folder, start, views, heal=watched, **options)
-        told = listen(coordinator, Mended | VisitUndone)
+        told = listen(coordinator, Mended)
         train(coordinator, photos)
         results.append(whole_scene(coordinator))
         assert told == []
@@ -121,115 +120,6 @@ def test_moments_that_are_no_numbers_are_set_to_zero(tmp_path, views, photos, st
     assert torch.equal(adam["exp_avg_sq"][1], kept)
 
 
-def darkened(coordinator, photos, visit: int) -> None:
-    """Train on, and make every Gaussian of the block all but transparent in the midst of one visit."""
-    done = False
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        active = coordinator.state.active
-        if active is not None and active.number == visit and 2 * active.done > active.steps and not done:
-            done = True
-            with torch.no_grad():
-                coordinator.params["opacities"].fill_(-4.0)
-    assert done
-
-
-def test_a_visit_that_made_its_pictures_worse_is_undone(tmp_path, views, photos, start):
-    options = {"blocks": 2, "steps": 60, "density": STILL, "background": "black", "batch": 1}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
-    undone, states = listen(coordinator, VisitUndone), []
-
-    def remember(event) -> None:
-        if isinstance(event, VisitEnded):
-            states.append([with_mail(coordinator.scene, b) for b in range(2)])
-
-    coordinator.announce.subscribe(remember)
-    darkened(coordinator, photos, visit=2)
-    assert [event.visit for event in undone] == [2]
-    block, (before, after) = undone[0].block, (states[1], states[2])
-    assert undone[0].after > undone[0].before
-    assert equal(before[block].gaussians, after[block].gaussians)
-    assert equal(before[block].exp_avg, after[block].exp_avg)
-    assert after[block].clocks == before[block].clocks
-    record = coordinator.state.health[block]
-    assert (record.undone, record.damping) == (1, 0.5)
-
-
-def test_who_waited_for_an_undone_visit_is_not_seen_before_the_next(
-    tmp_path, views, photos, start, monkeypatch
-):
-    """Untrained, they would be fog to all other blocks."""
-    monkeypatch.setattr("abcd_ns.engine.train.health.health.loss_rise", lambda _: (1.0, 2.0, 0.0))
-    monkeypatch.setattr("abcd_ns.engine.train.health.health.is_worse", lambda *_: True)
-    options = {"blocks": 2, "steps": 60, "scaffold": 60, "warmup": 0.25, "density": STILL}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
-    undone, scene = listen(coordinator, VisitUndone), coordinator.scene
-    while not undone and not coordinator.finished:
-        train(coordinator, photos, steps=1)
-    (event,) = undone
-    assert 0 < len(scene.gaussians(event.block)) < scene.count(event.block)
-
-
-def test_a_first_visit_that_was_undone_is_to_come_yet_on_other_views(
-    tmp_path, views, photos, start, monkeypatch
-):
-    monkeypatch.setattr("abcd_ns.engine.train.health.health.loss_rise", lambda _: (1.0, 2.0, 0.0))
-    monkeypatch.setattr("abcd_ns.engine.train.health.health.is_worse", lambda *_: True)
-    options = {"blocks": 2, "steps": 60, "density": STILL, "visit_views": 2, "warmup": 0.0}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
-    visits: dict[int, dict[int, ActiveVisit]] = {0: {}, 1: {}}
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        if (active := coordinator.state.active) is not None:
-            visits[active.geometry.block][active.number] = active
-            assert coordinator.visit.live.density_clock(1, coordinator.batch, None).first
-    for first, second, *_ in (list(of_block.values()) for of_block in visits.values()):
-        assert not set(first.views) & set(second.views)
-
-
-def test_the_visit_after_an_undone_one_is_damped(tmp_path, views, photos, start):
-    options = {"blocks": 2, "steps": 60, "density": STILL, "batch": 1}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
-    train_step(coordinator, photos)
-    block = coordinator.state.active.geometry.block
-    rates = {name: o.param_groups[0]["lr"] for name, o in coordinator.optimizers.items()}
-    coordinator.state.health[block] = BlockHealth(visits=1, undone=1, damping=0.5)
-    coordinator.next_batch()
-    assert coordinator.optimizers["scales"].param_groups[0]["lr"] == 0.5 * rates["scales"]
-    while coordinator.state.active is not None:
-        train_step(coordinator, photos)
-    assert coordinator.state.health[block].damping == 1.0
-
-
-def test_off_nothing_is_undone(tmp_path, views, photos, start):
-    options = {"blocks": 2, "steps": 60, "density": STILL, "background": "black", "batch": 1}
-    coordinator = make_coordinator(tmp_path, start, views, heal=False, **options)
-    undone = listen(coordinator, VisitUndone)
-    darkened(coordinator, photos, visit=2)
-    assert undone == []
-
-
-def test_a_run_with_an_undone_visit_can_be_resumed_within_it(tmp_path, views, photos, start):
-    options = {"blocks": 2, "steps": 60, "density": STILL, "background": "black", "batch": 1}
-    results = []
-    for stops in (False, True):
-        folder = tmp_path / str(stops)
-        folder.mkdir()
-        coordinator = make_coordinator(folder, start, views, **options)
-        train(coordinator, photos, steps=25)
-        with torch.no_grad():
-            coordinator.params["opacities"].fill_(-4.0)
-        if stops:
-            coordinator.save()
-            coordinator.scene.store.close()
-            coordinator = make_coordinator(folder, start, views, resume=True, **options)
-        undone = listen(coordinator, VisitUndone)
-        train(coordinator, photos)
-        assert len(undone) == 1
-        results.append(whole_scene(coordinator))
-    assert equal(*results)
-
-
 @pytest.mark.parametrize("blocks", [1, 2])
 def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, photos, start, blocks):
     coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=30)
@@ -275,14 +165,6 @@ def test_no_visit_leaves_a_giant(tmp_path, views, photos, start, blocks):
     assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.001 * health_rules.GIANT_ANGLE
 
 
-def test_losses_that_scatter_are_no_rise():
-    noisy = [[1.0, 1.5], [1.0, 0.6], [1.0, 1.4], [1.0, 0.9]]
-    assert not is_worse(*loss_rise(noisy))
-    assert is_worse(*loss_rise([[1.0, 1.1], [1.0, 1.12], [1.0, 1.11], [2.0, 2.2]]))
-    assert not is_worse(*loss_rise([[1.0, 1.01]] * 5))
-    assert loss_rise([[1.0, 2.0]] * 3 + [[1.0]] * 5) is None
-
-
 def test_stand_ins_are_numbers_even_among_none():
     for sound in (random_gaussians(7), Gaussians.empty(1)):
         made = stand_ins(sound, 3)
@@ -298,9 +180,7 @@ def test_every_parameter_is_looked_at(name):
 
 
 def test_the_record_survives_json():
-    state = RunState(
-        health={WHOLE: BlockHealth(gradients=3), 4: BlockHealth(visits=2, damping=0.25, hidden=True)}
-    )
+    state = RunState(health={WHOLE: BlockHealth(gradients=3), 4: BlockHealth(visits=2, hidden=True)})
     again = RunState.from_json(state.to_json())
     assert again.health == state.health
 
@@ -310,7 +190,7 @@ def test_how_blocks_stand_is_said_in_words():
         0: BlockHealth(visits=3),
         1: BlockHealth(visits=2),
         2: BlockHealth(visits=1, hidden=True),
-        4: BlockHealth(visits=2, undone=2, gradients=1200),
+        4: BlockHealth(visits=2, gradients=1200),
     }
     views = {0: 9, 1: 1, 2: 8, 3: 0, 4: 7, 5: 6}
     words = [standing(block, ledger.get(block), views) for block in range(6)]
@@ -319,12 +199,12 @@ def test_how_blocks_stand_is_said_in_words():
         "seen by 1 view only",
         "hidden behind others, passed over",
         "seen by no view, left as it was",
-        "every visit undone",
+        "trained",
         "not visited yet",
     ]
     lines = summary(6, ledger, views)
     assert "block 4: seen by no view, left as it was" in lines
-    assert lines[-1].startswith("1,200 gradients that were no numbers set to zero, 2 visits undone")
+    assert lines[-1].startswith("1,200 gradients that were no numbers set to zero")
     assert summary(2, {0: BlockHealth(visits=1), 1: BlockHealth(visits=1)}, {0: 5, 1: 5}) == [
         "all 2 blocks: trained"
     ]

@@ -119,17 +119,6 @@ def test_a_block_looks_at_a_doubtful_view_that_sees_it(tmp_path, views, photos, 
     assert active.looked_at == (3,)
 
 
-def test_a_visit_trains_in_the_size_that_its_crops_are_of_though_time_runs_on(
-    tmp_path, views, photos, start, monkeypatch
-):
-    coordinator = grown(tmp_path, start, views)
-    train(coordinator, photos, steps=12)
-    sizes, asked = iter((2, 1, 1, 1)), asked_of(coordinator, monkeypatch)
-    monkeypatch.setattr(type(coordinator.run), "reduction", property(lambda _: next(sizes)))
-    active = coordinator.visits.begin()
-    assert {view.width for few in asked for view in few} == {views[0].reduced(active.reduction).width}
-
-
 def test_influence_survives_a_save(tmp_path, views, photos, start):
     coordinator = grown(tmp_path, start, views, influence_share=0.6)
     train(coordinator, photos, steps=12)

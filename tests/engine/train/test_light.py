@@ -6,11 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
-from abcd_ns.engine.train.capture import bilateral_grid
-from abcd_ns.engine.train.capture.light import Light, Use, gradients_of, lit
+from abcd_ns.engine.train.capture.light import Light, lit
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
-from abcd_ns.engine.types import PARAM_NAMES, Crop
+from abcd_ns.engine.types import PARAM_NAMES
 from abcd_ns.errors import UserError
 from tests.reference.scenes import (
     Photos,
@@ -35,18 +34,6 @@ class Drifting(Photos):
 
 
 IDENTITY = {"affine": torch.eye(3, 4), "exposure": torch.eye(3, 4)}
-IDENTITY["bilateral"] = torch.eye(3, 4).view(12, 1, 1, 1).expand(12, *bilateral_grid.SHAPE)
-
-
-class Shaded(Photos):
-    """Photos that are brighter towards one side each, and darker towards the other."""
-
-    TOWARDS = ((1, 0), (0, 1), (-1, 0), (0, -1), (1, 0), (-1, 0))
-
-    def __call__(self, index, crop):
-        photo, (right, down) = self.images[index], self.TOWARDS[index]
-        x, y = (torch.linspace(-0.5, 0.5, size) for size in (photo.shape[1], photo.shape[0]))
-        return (photo * (1 + 0.7 * (right * x + down * y[:, None]))[..., None]).clamp(0, 1)[crop.slices]
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +77,7 @@ def transforms(light: Light) -> torch.Tensor:
     return torch.stack([light.of(view).detach() for view in sorted(light._rows)])
 
 
-@given(st.integers(0, 10**6), st.integers(1, 6), st.sampled_from(["exposure", "affine", "bilateral"]))
+@given(st.integers(0, 10**6), st.integers(1, 6), st.sampled_from(["exposure", "affine"]))
 def test_the_mean_transform_is_the_identity_whatever_the_gradients(seed, steps, kind):
     generator, light = torch.Generator().manual_seed(seed), Light(kind, range(5))
     for _ in range(steps):
@@ -127,7 +114,7 @@ def test_layers_and_cuts_are_those_of_a_run_without_it(make):
             assert torch.equal(a.color, b.color)
             assert torch.equal(a.transmittance, b.transmittance)
         whole = ((plain > 0) & (plain < 1)).all(dim=-1)  # the others were clamped
-        expected = lit(plain, made.run.light.of(other.view.index), other.crop, other.view).clamp(0, 1)
+        expected = lit(plain, made.run.light.of(other.view.index)).clamp(0, 1)
         assert whole.any()
         assert torch.allclose(changed[whole], expected[whole], atol=1e-6)
         assert not torch.allclose(changed, plain, atol=1e-2)
@@ -145,80 +132,7 @@ def test_drifting_light_costs_next_to_nothing_once_it_is_compensated(
     assert left < 0.5 * cost
 
 
-@pytest.mark.parametrize(("blocks", "steps"), [(1, 200), (4, 120)])
-def test_grids_make_good_for_light_that_differs_within_a_photo(error, ring, blocks, steps):
-    """A matrix for each photo cannot."""
-    options, shaded = {"blocks": blocks, "steps": steps}, Shaded(TRUTH, ring)
-    steady = error("steady", Photos(TRUTH, ring), "none", **options)
-    cost = error("shaded", shaded, "none", **options) - steady
-    with_matrices = error("matrices", shaded, "affine", **options) - steady
-    with_grids = error("grids", shaded, "bilateral", **options) - steady
-    assert cost > steady
-    assert with_matrices > 0.9 * cost
-    assert with_grids < 0.7 * cost
-
-
-def test_a_part_of_a_picture_has_its_part_of_the_grid(ring):
-    """And a reduced picture has the same at the same places."""
-    generator = torch.Generator().manual_seed(0)
-    grid = IDENTITY["bilateral"] + 0.2 * torch.randn(IDENTITY["bilateral"].shape, generator=generator)
-    view, part = ring[0], Crop(16, 8, 21, 13)
-    picture = torch.rand(view.height, view.width, 3, generator=generator)
-    whole = lit(picture, grid, view.full, view)
-    assert torch.allclose(lit(picture[part.slices], grid, part, view), whole[part.slices], atol=1e-6)
-    assert not torch.allclose(lit(picture[part.slices], grid, part.within(part), view), whole[part.slices])
-    *_, rows, columns = bilateral_grid.SHAPE
-    slope = torch.linspace(0, 1, rows)[:, None] + torch.linspace(0, 0.5, columns)
-    flat, half = torch.full_like(picture, 0.4), view.reduced(2)
-    of_half = lit(flat[::2, ::2], slope * IDENTITY["bilateral"], half.full, half)
-    of_whole = lit(flat, slope * IDENTITY["bilateral"], view.full, view)
-    of_squares = of_whole.unflatten(0, (-1, 2)).unflatten(2, (-1, 2)).mean(dim=(1, 3))
-    assert torch.allclose(of_half, of_squares, atol=1e-6)
-    assert float(of_half.max() - of_half.min()) > 0.4
-
-
-def test_a_grid_is_read_between_its_transforms(ring):
-    """As a loop over pixels reads it, linearly, from the eight around a place."""
-    generator, view = torch.Generator().manual_seed(1), ring[0]
-    grid = torch.randn(12, *bilateral_grid.SHAPE, generator=generator, dtype=torch.float64)
-    picture = torch.rand(view.height, view.width, 3, generator=generator, dtype=torch.float64)
-    found = lit(picture, grid, view.full, view)
-    for row, column in ((0, 0), (17, 23), (35, 47), (9, 40)):
-        color = picture[row, column]
-        luma = 0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
-        place = (float(luma), (row + 0.5) / view.height, (column + 0.5) / view.width)
-        matrix = torch.zeros(12, dtype=torch.float64)
-        at = [share * (size - 1) for share, size in zip(place, bilateral_grid.SHAPE, strict=True)]
-        for corner in range(8):
-            cell = [int(a) + (corner >> k & 1) for k, a in enumerate(at)]
-            weight = 1.0
-            for k, a in enumerate(at):
-                weight *= 1 - abs(a - cell[k])
-            if weight > 0:
-                matrix += weight * grid[:, cell[0], cell[1], cell[2]]
-        matrix = matrix.view(3, 4)
-        assert torch.allclose(found[row, column], matrix[:, :3] @ color + matrix[:, 3], atol=1e-12)
-
-
-def test_grids_are_held_smooth_by_what_a_picture_is_of_its_whole():
-    grid = torch.randn(12, *bilateral_grid.SHAPE, generator=torch.Generator().manual_seed(2))
-    variation = sum(float((grid.diff(dim=dim) ** 2).mean()) for dim in (1, 2, 3))
-    assert float(bilateral_grid.total_variation(grid)) == pytest.approx(variation)
-    leaf = grid.clone().requires_grad_()
-    leaf.grad = torch.zeros_like(leaf)
-    ((view, gradient),) = gradients_of([Use(3, leaf, weight=0.25)])
-    assert view == 3
-    step = 1e-3 * gradient / gradient.norm()
-    fell = bilateral_grid.total_variation(grid) - bilateral_grid.total_variation(grid - step)
-    expected = 10 * 0.25 * float(fell) / 1e-3
-    assert float(gradient.norm()) == pytest.approx(expected, rel=1e-2)
-
-
-def test_a_step_changes_and_a_commit_writes_the_grids_of_its_views_alone():
-    light = Light("bilateral", range(40))
-    light.step([(7, torch.ones(12, *bilateral_grid.SHAPE)), (31, torch.ones(12, *bilateral_grid.SHAPE))])
-    assert sorted(light.changed()) == ["light-0", "light-31", "light-7"]  # the first has what all share
-    assert light.changed() == {}
+def test_a_commit_writes_what_steps_changed_alone():
     assert sorted(Light("affine", range(40)).changed()) == []
     small = Light("affine", range(40))
     small.step([(39, torch.ones(3, 4))])
@@ -231,10 +145,10 @@ def test_a_run_goes_on_with_its_own_kind_of_light_alone(make, drifting):
     made.save()
     made.scene.store.close()
     with pytest.raises(UserError, match=r"begun with --pipeline\.training\.light affine"):
-        make("run", steps=12, light="bilateral", resume=True)
+        make("run", steps=12, light="exposure", resume=True)
 
 
-@pytest.mark.parametrize("kind", ["affine", "bilateral"])
+@pytest.mark.parametrize("kind", ["exposure", "affine"])
 @pytest.mark.parametrize("blocks", [1, 4])
 def test_a_run_that_stops_goes_on_with_its_transforms_and_moments(make, drifting, blocks, kind):
     options = {"blocks": blocks, "steps": 30, "light": kind}

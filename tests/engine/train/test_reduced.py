@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.schedule import reduction_at
 from abcd_ns.engine.train.step.batch import Sample
@@ -77,36 +76,17 @@ def test_alpha_and_masks_are_reduced_with_what_they_stand_for():
     assert sample.reduced_mask(None) is None
 
 
-@pytest.mark.parametrize("blocks", [1, 4])
-def test_samples_grow_with_the_run(tmp_path, blocks, small_pictures):  # noqa: ARG001 - a fixture
+def test_samples_grow_with_the_run(tmp_path, small_pictures):  # noqa: ARG001 - a fixture
     views = ring_of_views(4)
     photos = Photos(random_gaussians(40, seed=1, size=0.2), views)
     start = random_gaussians(60, seed=2)
-    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=60, coarse=0.6)
+    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=60, coarse=0.6)
     seen = []
     while not coordinator.finished:
         train_step(coordinator, photos)
         seen.append(coordinator.run.reduction)
     assert {1, 2, 4} == set(seen)
     assert seen == sorted(seen, reverse=True)
-
-
-def test_layers_are_as_large_as_the_pictures_between_them(tmp_path, small_pictures):  # noqa: ARG001
-    """Composited equals merged at every size."""
-    views = ring_of_views(4, dtype=torch.float64)
-    start = random_gaussians(60, seed=2, dtype=torch.float64)
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=4, steps=60, coarse=0.6, window_weight=0.0, background="black"
-    )
-    batch = coordinator.next_batch()
-    assert coordinator.run.reduction == 4
-    rendered, scene = coordinator.render(batch), whole_scene(coordinator)
-    for sample, picture in zip(batch.samples, rendered.pictures, strict=True):
-        assert sample.view.width == 12
-        with torch.no_grad():
-            degree = coordinator.state.active.sh_degree
-            whole = TorchRasterizer()(scene, sample.view, crop=sample.crop, sh_degree=degree)
-        torch.testing.assert_close(picture.detach(), whole.color.clamp(0, 1), rtol=1e-3, atol=2e-3)
 
 
 def test_a_run_goes_on_with_the_pictures_it_stopped_at(tmp_path, small_pictures):  # noqa: ARG001
@@ -116,7 +96,7 @@ def test_a_run_goes_on_with_the_pictures_it_stopped_at(tmp_path, small_pictures)
     for stop in (None, 17):
         folder = tmp_path / str(stop)
         folder.mkdir()
-        options = {"blocks": 3, "steps": 40, "coarse": 0.7}
+        options = {"blocks": 1, "steps": 40, "coarse": 0.7}
         coordinator = make_coordinator(folder, random_gaussians(60, seed=2), views, **options)
         if stop:
             train(coordinator, photos, stop)

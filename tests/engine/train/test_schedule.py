@@ -7,15 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.train.schedule import (
-    FROZEN_COST,
-    LAYER_TIME,
     SHORTER,
-    WINDOW_COST,
     YOUNG,
     exponential_decay,
-    passes_at_once,
-    passes_for_layers,
-    passes_of_sweep,
+    passes_of_visit,
     plan_sweep,
     settling,
     sh_degree_at,
@@ -90,30 +85,16 @@ def test_orders_differ_between_visits_and_seeds():
     assert len({view_order(views, 20, visit, seed) for visit in range(3) for seed in range(3)}) == 9
 
 
-def test_passes_grow_by_one_a_sweep():
-    assert [passes_of_sweep(sweep, 1, 4, used=5) for sweep in range(6)] == [1, 2, 3, 4, 4, 4]
-    assert passes_of_sweep(0, 3, 1, used=5) == 3
-
-
-def test_a_first_visit_is_about_as_long_with_many_views_as_with_few():
-    assert [passes_of_sweep(0, 8, 23, used) for used in (1, 32, 44, 64)] == [8, 8, 6, 4]
-    assert passes_of_sweep(5, 8, 23, used=64) == 9
-
-
-@pytest.mark.parametrize("frozen", [0, 500, 7_000, 63_000])
-def test_passes_leave_a_tenth_of_the_time_for_layers(frozen):
-    passes, trained = passes_for_layers(1_000, frozen), 1_000
-    layers = FROZEN_COST * frozen + WINDOW_COST * trained
-    assert layers / (layers + passes * trained) <= LAYER_TIME < layers / (layers + (passes - 1) * trained)
-    assert passes_for_layers(0, 0) == 0
+def test_a_visit_is_about_as_long_with_many_views_as_with_few():
+    assert [passes_of_visit(8, used, 1, 8) for used in (1, 32, 44, 64)] == [8, 8, 6, 4]
 
 
 @given(passes=st.integers(1, 60), at_once=st.integers(1, 40), blocks=st.integers(1, 30))
 def test_visits_are_the_shorter_the_more_are_out_at_once(passes, at_once, blocks):
-    found = passes_at_once(passes, at_once, blocks)
-    assert passes_at_once(passes, 1, blocks) == passes
-    assert passes / SHORTER <= passes_at_once(passes, at_once + 1, blocks) <= found <= passes
-    assert blocks == 1 or passes_at_once(passes, blocks, blocks) == passes / SHORTER
+    found, longest = (passes_of_visit(passes, 20, n, blocks) for n in (at_once, 1))
+    assert longest == passes
+    assert passes / SHORTER <= passes_of_visit(passes, 20, at_once + 1, blocks) <= found <= passes
+    assert blocks == 1 or passes_of_visit(passes, 20, blocks, blocks) == passes / SHORTER
 
 
 def test_learning_rate_decays_exponentially():

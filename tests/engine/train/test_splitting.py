@@ -71,11 +71,11 @@ def test_a_part_is_visited_next_to_the_block_it_came_from():
 
 
 def test_a_part_has_had_the_visits_of_the_block_it_came_from():
-    state = RunState(health={0: BlockHealth(visits=3, undone=1, shed=7, damping=0.5)})
+    state = RunState(health={0: BlockHealth(visits=3, shed=7)})
     state.inherit(2, 0)
     state.inherit(3, 1)
     assert state.health.keys() == {0, 2}
-    assert state.health[2] == BlockHealth(visits=3, damping=0.5)  # what was shed is told once
+    assert state.health[2] == BlockHealth(visits=3)  # what was shed is told once
     assert standing(2, state.health[2], {}) == "trained"
 
 

@@ -1,9 +1,8 @@
-"""Notices what goes wrong in the live block, counts it, tells it, and mends what can be mended.
+"""Notices what goes wrong in the live block, counts it, and repairs what can be repaired.
 
 In any run: gradients, moments and values that are no numbers (in exact joint training gradients alone). Where
-blocks are trained within layers: giants, and, where there are others that have to live with the result,
-visits that left their pictures worse than they found them. A run in which nothing goes wrong is the same with
-or without all this, on a CPU bit for bit: healthy tensors are read, never written.
+blocks are trained within layers: oversized Gaussians. A run in which nothing goes wrong is the same with or
+without all this, on a CPU bit for bit: healthy tensors are read, never written.
 """
 
 import math
@@ -14,18 +13,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import Announcer, Mended, VisitUndone
+from abcd_ns.engine.events import Announcer, Mended
 from abcd_ns.engine.gaussians.block_state import MOMENTS, BlockState
 from abcd_ns.engine.gaussians.param_swap import Optimizers, Params, live_gaussians
 from abcd_ns.engine.render.loss import decibels
 from abcd_ns.engine.store.scene import VisitScene
-from abcd_ns.engine.store.settle import state_for_visit, with_mail
+from abcd_ns.engine.store.settle import state_for_visit
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health.health_rules import (
     GIANT_ANGLE,
     HIDDEN,
-    is_worse,
-    loss_rise,
     stand_ins,
     unsound,
     wider_than,
@@ -38,8 +35,6 @@ from abcd_ns.engine.types import Gaussians, View
 
 LATE_AFTER = 16
 """Steps without a fault after which an accelerator's gradients are looked at a step late, without a wait."""
-LEAST_DAMPING = 1 / 16
-"""Of learning rates, however often a block's visits were undone."""
 
 
 class Health:
@@ -48,7 +43,7 @@ class Health:
     Hooks into the optimizers, so that no caller can forget to ask: what they step with is numbers.
 
     Args:
-        may_act: also hold back giants and, where there are several blocks, undo visits.
+        may_act: also shrink oversized Gaussians.
     """
 
     def __init__(
@@ -67,23 +62,12 @@ class Health:
         self._attached: Tensor | None = None
         self._resumed = False
         self._bad: Tensor | None = None
-        self._losses: list[tuple[int, Tensor]] = []
         self._shares: list[Tensor] = []
         self._numbers = StepNumbers(params["means"].device)
         self._guard = StepGuard(optimizers) if self._numbers.are_late else None
         self._clean, self._psnr = LATE_AFTER, math.nan
         for optimizer in optimizers.values():
             optimizer.register_step_pre_hook(self._clean_gradients)
-
-    @property
-    def undoes(self) -> bool:
-        """Whether visits are undone."""
-        return self._may_act and self._scene.tree.num_blocks > 1
-
-    @property
-    def damping(self) -> float:
-        """Share of the learning rates that the visit under way is given."""
-        return self._record.damping if self._active is not None else 1.0
 
     def begin_visit(self, active: ActiveVisit, ledger: Ledger) -> None:
         """A block was attached.
@@ -99,10 +83,6 @@ class Health:
     def see(self, share: Float[Tensor, ""]) -> None:
         """Take note of how large a part of a picture the live block was, while none has shown it."""
         self._shares.append(share)
-
-    def note(self, losses: Sequence[tuple[int, Float[Tensor, ""]]]) -> None:
-        """Remember the loss of each view in this step: (view, loss) pairs."""
-        self._losses = list(losses) if self.undoes else []
 
     def end_step(self, errors: Sequence[Float[Tensor, ""]] = ()) -> tuple[bool, float]:
         """Call after the optimizers stepped.
@@ -143,10 +123,7 @@ class Health:
         self.count("giants", len(rows))
 
     def end_visit(self, active: ActiveVisit, detach: Callable[[], BlockState]) -> BlockState:
-        """What the visit leaves behind: the live block, mended, or the block as it was before.
-
-        What is put back has its old clocks, so that a first visit is to come yet; but the same is not tried
-        again: rates are lower, and other views have their turn.
+        """What the visit leaves behind: the live block, repaired.
 
         Args:
             detach: takes the live block out.
@@ -157,12 +134,6 @@ class Health:
         if active.done:  # else time ran out before anybody could see
             record.hidden = not active.shown
         self._active = self._attached = None
-        if not self.undoes or active.is_whole:
-            return state
-        rise = loss_rise(list(active.objective.values()))
-        if rise is not None and is_worse(*rise):
-            return self._undo(active, rise, record)
-        record.damping = min(2 * record.damping, 1.0)
         return state
 
     def count(self, what: str, count: int) -> None:
@@ -178,12 +149,6 @@ class Health:
         """Mend all that is no number in the live block; call when a visit ends, and before saving."""
         self._read()
         self._mend()
-
-    def _undo(self, active: ActiveVisit, rise: tuple[float, float, float], record: BlockHealth) -> BlockState:
-        record.undone += 1
-        record.damping = max(record.damping / 2, LEAST_DAMPING)
-        self._announce(VisitUndone(active.number, active.geometry.block, rise[0], rise[1]))
-        return with_mail(self._scene, active.geometry.block)  # who has waited waits for the next visit
 
     # -- numbers -------------------------------------------------------------------------------------
 
@@ -248,17 +213,15 @@ class Health:
 
     def _send(self, errors: Sequence[Float[Tensor, ""]]) -> None:
         """All that the step tells, as one small tensor."""
-        losses, self._losses = self._losses, []
         shares, self._shares = self._shares, []
-        parts = {"losses": [loss for _, loss in losses], "shares": shares, "errors": list(errors)}
+        parts = {"shares": shares, "errors": list(errors)}
         if self._guard is not None:
             parts["bad"], self._guard.found = self._guard.found, []
-        self._numbers.send([view for view, _ in losses], parts)
+        self._numbers.send(parts)
 
     def _read(self, all_but: int = 0) -> None:
         """Take note of what steps told, but for the last so many."""
-        for views, numbers in self._numbers.read(all_but):
-            self._note_losses(views, numbers["losses"])
+        for numbers in self._numbers.read(all_but):
             if self._active is not None and not self._active.shown and numbers["shares"]:
                 self._active.shown = float(torch.tensor(numbers["shares"]).max()) > HIDDEN
             psnrs = [decibels(error) for error in numbers["errors"]]
@@ -268,11 +231,6 @@ class Health:
                 self._clean = 0
                 self._mend()
             self.count("gradients", skipped)
-
-    def _note_losses(self, views: Sequence[int], losses: Sequence[float]) -> None:
-        for view, loss in zip(views, losses, strict=True):
-            if math.isfinite(loss):  # kept are the first and the last
-                self._active.objective[view] = [*self._active.objective.get(view, ())[:1], loss]
 
     @property
     def _record(self) -> BlockHealth:

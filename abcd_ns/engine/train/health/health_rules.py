@@ -1,4 +1,4 @@
-"""What counts as ill: pure functions of Gaussians and of losses."""
+"""What counts as ill: pure functions of Gaussians."""
 
 import math
 from collections.abc import Iterable
@@ -21,12 +21,6 @@ HIDDEN = 1e-4
 """A block that is no larger share of any picture is hidden: rasterizers stop at so little light."""
 DISTANCES_AT_ONCE = 1 << 22
 """Between Gaussians and cameras."""
-RISE = 0.1
-"""A visit is undone if the loss of its views rose by more than this share ..."""
-SURE = 3.0
-"""... and by more than this many standard errors: with random backgrounds losses scatter."""
-FEWEST_VIEWS = 4
-"""Fewer than these say nothing about a rise."""
 
 
 def unsound(gaussians: Gaussians) -> Bool[Tensor, "n"]:
@@ -86,22 +80,3 @@ def stand_ins(sound: Gaussians, count: int) -> Gaussians:
     values["quats"][:, 0] = 1.0
     values["opacities"] += STAND_IN_OPACITY
     return Gaussians(**values)
-
-
-def loss_rise(uses: list[list[float]]) -> tuple[float, float, float] | None:
-    """(before, after, standard error of the difference) of the mean loss; None if too little is known.
-
-    Args:
-        uses: by view, the losses when it was first and last used in the visit; [first] where used once.
-    """
-    pairs = [use for use in uses if len(use) == 2]
-    if len(pairs) < FEWEST_VIEWS:
-        return None
-    first, last = torch.tensor(pairs, dtype=torch.float64).unbind(dim=1)
-    error = float((last - first).std()) / math.sqrt(len(pairs))
-    return float(first.mean()), float(last.mean()), error
-
-
-def is_worse(before: float, after: float, error: float) -> bool:
-    """Whether the loss rose by more than is allowed, and more than chance would have it."""
-    return after - before > max(RISE * before, SURE * error)

@@ -86,7 +86,7 @@ class Sample:
             rgb = composite(raster.layer, self.background)
         else:
             rgb = sandwich(self.layers.front, raster.layer, self.layers.back, self.background)
-        return (rgb if light is None else lit(rgb, light, self.crop, self.view)).clamp(0, 1)
+        return (rgb if light is None else lit(rgb, light)).clamp(0, 1)
 
     def frame(self, weigh: bool) -> Frame:
         """What the rasterizer's drawing is shown in; with `weigh` as in `weighed`."""
@@ -101,11 +101,6 @@ class Sample:
         return seen_behind(
             residual, torch.ones_like(residual[..., 0]) if self.in_front is None else self.in_front
         )
-
-    @property
-    def weight(self) -> float:
-        """Of this picture's loss, in expectation, in that of the whole image, by pixels."""
-        return self.crop.pixels / self.share / self.view.full.pixels
 
     def loss(
         self, picture: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], config: TrainingConfig

@@ -53,6 +53,6 @@ class WholeViews:
         sample = Sample(view, view.full, None, None, shown.new_zeros(3))
         photo, counts = self._target(sample)
         light = self._run.light
-        seen = shown if light is None else lit(shown, light.of(view.index).detach(), view.full, view)
+        seen = shown if light is None else lit(shown, light.of(view.index).detach())
         counted = torch.ones_like(seen[..., :1]) if counts is None else counts.to(seen)
         return seen, photo.to(seen), counted

@@ -7,7 +7,6 @@ from itertools import pairwise
 from abcd_ns.engine.events import VisitEnded
 from abcd_ns.engine.space.partition import build_grid
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.lab.stability.lab import BUDGET, STILL, Lab, Stage, make_stage
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.stability.scenarios.stale import stale_coordinator
@@ -50,9 +49,8 @@ def train_stale(lab: Lab, stage: Stage, every: int, *, damping: float = 1.0) -> 
         blocks=SWEEP,
         warmup=0.0,
         density=STILL,
-        heal=False,  # a visit that is undone raises nothing
-        first_passes=2,
-        recipe=Recipe(last_passes=2),
+        heal=False,
+        passes=2,
         kind=partial(stale_coordinator, every=every, damping=damping),
     )
     rising = share_rising(objectives(lab, stage, coordinator))

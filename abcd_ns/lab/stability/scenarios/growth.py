@@ -11,14 +11,14 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
-from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_step, views_per_visit
+from abcd_ns.engine.train.schedule import passes_of_visit, views_per_step, views_per_visit
 from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.stability.scenarios.freshness import objectives
 from abcd_ns.lab.world.world import ring
 
 CAP = 300
-PASSES, VIEWS = TrainingConfig().first_passes, TrainingConfig().visit_views
+PASSES, VIEWS = TrainingConfig().passes, TrainingConfig().visit_views
 CAMERAS = (1, 2, 3, 10, 100, 1000, 2900, 15_000)
 EVERY = DensityConfig().refine_every
 """Steps between refinements, splatfacto's, too."""
@@ -96,11 +96,11 @@ def steps_that_left_all_faint(coordinator: Coordinator) -> list[int]:
     return found
 
 
-def refinements(cameras: int, sweep: int) -> int:
+def refinements(cameras: int) -> int:
     """How often a block that `cameras` see is refined in one visit, once it is warm."""
     control, done = DensityControl(DensityConfig()), 10 * max(cameras, 1)
     batch, used = views_per_step(0, 2, trained=done), views_per_visit(cameras, cameras, VIEWS)
-    steps = -(-passes_of_sweep(sweep, PASSES, PASSES, used) * used // batch)
+    steps = -(-int(passes_of_visit(PASSES, used, 1, 2)) * used // batch)
     drawn = steps * batch
     clocks = [  # see LiveBlock.density_clock
         DensityClock(0.2, done + batch * (k + 1), batch, cameras, None, 0, visit=drawn) for k in range(steps)
@@ -123,10 +123,10 @@ def splatfacto_refines(cameras: int, steps: int = 15_000) -> int:
 )
 def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no training
     """A7: the schedule alone, for captures of 1 to 15,000 photos."""
-    least = {cameras: min(refinements(cameras, s) for s in range(6)) for cameras in CAMERAS}
+    least = {cameras: refinements(cameras) for cameras in CAMERAS}
     never = [cameras for cameras in CAMERAS if splatfacto_refines(cameras) == 0]
     used = {cameras: views_per_visit(cameras, cameras, VIEWS) for cameras in CAMERAS}
-    too_short = [c for c, views in used.items() if passes_of_sweep(0, PASSES, PASSES, views) * views < EVERY]
+    too_short = [c for c, views in used.items() if passes_of_visit(PASSES, views, 1, 2) * views < EVERY]
     passed = all(count >= 1 for cameras, count in least.items() if cameras not in too_short)
     said = {
         "abcd": f"at least {min(c for n, c in least.items() if n not in too_short)} refinement in each visit "

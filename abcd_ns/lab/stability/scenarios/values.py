@@ -19,7 +19,6 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.health.health_rules import unsound
 from abcd_ns.engine.train.health_record import standing
 from abcd_ns.engine.train.planner import NothingSeenError
-from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
 from abcd_ns.lab.stability.lab import PAIR, SH_DEGREE, STILL, Lab, Trained, make_stage, merged
 from abcd_ns.lab.stability.outcome import Finding, db, scenario
@@ -162,8 +161,7 @@ def hidden_block(lab: Lab) -> tuple[Coordinator, int]:
         tree=tree,
         warmup=0.0,
         density=STILL,
-        first_passes=1,
-        recipe=Recipe(last_passes=1),
+        passes=1,
     )
     while coordinator.state.sweep < 2:
         lab.finish(coordinator, stage, steps=1)
