@@ -123,7 +123,7 @@ class DensityControl:
         else:
             growing = max(self.config.refine_stop - self.config.refine_start, 0.0) * clock.pace
             fewest, most = REFINEMENTS
-            every = min(max(views, growing / most), int(growing / fewest))
+            every = min(max(views, growing / most), max(int(growing / fewest), 1))
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every
