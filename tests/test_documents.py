@@ -21,7 +21,7 @@ from abcd_ns.errors import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-DOCUMENTS += [ROOT / "docs" / "results" / name for name in ("README.md", "history.md")]
+DOCUMENTS.append(ROOT / "docs" / "results" / "README.md")
 NERFSTUDIO: dict[str, Any] = {
     "ns-train": AnnotatedBaseConfigUnion,
     "ns-eval": ComputePSNR,
