@@ -59,7 +59,7 @@ _RAYS = "it is about rays, and Gaussians are not drawn by rays"
 UNUSED_OF_MODEL = {
     "warmup_length": "set --pipeline.training.density.refine-start, a share of the run, instead",
     "stop_split_at": "set --pipeline.training.density.refine-stop, a share of the run, instead",
-    "reset_alpha_every": "set --pipeline.training.density.reset-every, in views drawn, instead",
+    "reset_alpha_every": "opacities are not reset: pruning is by contribution",
     **{name: f"set --pipeline.training.density.{flag} instead" for name, flag in SAME[DensityConfig].items()},
     **dict.fromkeys(("densify_size_thresh", "n_split_samples"), _HALVES),
     **dict.fromkeys(("densify_grad_thresh", "use_absgrad"), _ERROR),

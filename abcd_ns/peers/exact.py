@@ -23,7 +23,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from abcd_ns.engine.events import PhotosWanted, StepTaken
-from abcd_ns.engine.gaussians.block_state import BlockState, join
+from abcd_ns.engine.gaussians.block_state import BlockState, Clocks, join
 from abcd_ns.engine.gaussians.param_swap import Pace, attach, detach
 from abcd_ns.engine.layers.compositing import composite, fold, sandwich
 from abcd_ns.engine.render import Raster, Shot
@@ -253,14 +253,17 @@ class ExactTrainer(Trainer):
         clocks = replace(
             state.clocks, steps=state.clocks.steps + taken, adam_views=state.clocks.adam_views + taken
         )
+        clock = self._clock_of(block, len(state), clocks, taken)
         growth = self.run.density.after_step(
             self.params,
             self.optimizers,
             {name: value.to(self.device) for name, value in state.growth.items()},
             (),
             self._judged(gradients.sums[:, rows]),
-            self._clock_of(block, len(state), clocks.steps, taken),
+            clock,
         )
+        if self.run.density.refines(clock, growth):
+            clocks = replace(clocks, refined=clock.steps)
         stepped = detach(self.params, self.optimizers, growth, clocks)
         attach(stepped[:0].to(self.device), self.params, self.optimizers)
         return stepped
@@ -278,14 +281,15 @@ class ExactTrainer(Trainer):
             for sample, own, residual in zip(self._batch.samples, sums, self._residuals, strict=True)
         ]
 
-    def _clock_of(self, block: int, gaussians: int, steps: int, taken: int) -> DensityClock:
+    def _clock_of(self, block: int, gaussians: int, clocks: Clocks, taken: int) -> DensityClock:
         limit, everything = self.config.density.limit, max(self.count(), 1)
         drawn = random.Random(f"density {self.config.seed} {self.state.step} {block}")
         return DensityClock(
             progress=self.progress,
-            steps=steps,
+            steps=clocks.steps,
             taken=taken,
             views=len(self.views),
+            refined=clocks.refined,
             room=None if limit is None else max(limit - everything, 0) * gaussians // everything,
             seed=drawn.getrandbits(62),
         )

@@ -117,7 +117,7 @@ def test_a_step_makes_the_host_wait_for_lists_and_numbers_alone(tmp_path, begin,
     """As tests/simulated counts it. Every other operation that synchronises raises."""
     if device.type != "cuda":
         pytest.skip("only CUDA tells what synchronises")
-    never = {"refine_start": 1.0, "reset_every": 0}
+    never = {"refine_start": 1.0}
     coordinator = begin(tmp_path, blocks=4, density=DensityConfig(**never), steps=200)
     train(coordinator, photos, steps=2)
 

@@ -141,10 +141,6 @@ def test_where_light_is_compensated_held_out_pictures_are_corrected_too(kind):
         (lambda c: setattr(c.pipeline.model.camera_optimizer, "mode", "SO3xR3"), "training.poses"),
         (lambda c: setattr(c.pipeline.model, "collider_params", None), "collider-params"),
         (lambda c: setattr(c.pipeline.training, "batch", -1), "batch must be 0 or more"),
-        (
-            lambda c: setattr(c.pipeline.training.density, "cull_alpha_thresh", 0.001),
-            r"density.cull-alpha-thresh must be 0.0020 or more where opacities are reset",
-        ),
         (lambda c: setattr(c.pipeline.training, "visit_views", 0), "visit-views must be above 0"),
         (lambda c: setattr(c.pipeline.training, "passes", 0), "passes must be above 0"),
         (lambda c: setattr(c.pipeline, "cluster", "10.0.0.1:6379"), "how many workers"),

@@ -25,7 +25,7 @@ def train_plain(
     adam = {
         name: Adam([params[name]], lr=LEARNING_RATES[name], eps=1e-15, fused=True) for name in PARAM_NAMES
     }
-    draw, density, growth = TorchRasterizer(), DensityControl(config.density), {}
+    draw, density, growth, refined = TorchRasterizer(), DensityControl(config.density), {}, 0
     for taken, (row, degree) in enumerate(_rows(views, steps, config)):
         view = views[row]
         share = settling(taken / steps, taken) * rates_of_young(taken, 1)
@@ -52,10 +52,11 @@ def train_plain(
         for optimizer in adam.values():
             optimizer.step()
         seed = random.Random(f"density {config.seed} {taken + 1}").getrandbits(62)
-        clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed)
+        clock = DensityClock((taken + 1) / steps, taken + 1, 1, len(views), None, seed, refined=refined)
         judged = Judged(view, raster.info["sums"].values[0], residual.square().sum(dim=-1).mean())
         judged = [judged] if density.asks(taken / steps, first=False) else []
         growth = density.after_step(params, adam, growth, (raster.info,), judged, clock)
+        refined = clock.steps if density.refines(clock, growth) else refined
     return Gaussians(**{name: params[name].detach() for name in PARAM_NAMES})
 
 

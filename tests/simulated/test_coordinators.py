@@ -23,7 +23,7 @@ from tests.reference.scenes import listen, make_coordinator, whole_scene
 from tests.reference.simulated_device import DEVICE
 
 OFTEN = {"refine_start": 0.0, "refine_stop": 1.0, "refine_every": 3}
-GROWING = DensityConfig(**OFTEN, split_pixels=0.0, reset_every=6)
+GROWING = DensityConfig(**OFTEN, split_pixels=0.0)
 MCMC = DensityConfig(**OFTEN, strategy="mcmc", max_gaussians=160)
 
 pytestmark = pytest.mark.usefixtures("simulated_gsplat")

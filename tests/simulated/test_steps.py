@@ -29,7 +29,7 @@ from tests.reference.scenes import (
 )
 from tests.reference.simulated_device import DEVICE
 
-GATHERING = DensityConfig(refine_start=1.0, refine_stop=1.0, reset_every=0)
+GATHERING = DensityConfig(refine_start=1.0, refine_stop=1.0)
 STILL = DensityConfig(strategy="off")
 
 

@@ -6,7 +6,6 @@ from typing import Literal
 
 from abcd_ns.engine.gaussians.spherical_harmonics import MAX_SH_DEGREE
 from abcd_ns.engine.render.primitive import PrimitiveName
-from abcd_ns.engine.render.splat_kernels import MIN_ALPHA
 from abcd_ns.engine.train.capture.light import Kind as LightKind
 from abcd_ns.engine.train.capture.poses import Kind as PosesKind
 from abcd_ns.engine.train.density.control import DensityConfig
@@ -113,12 +112,6 @@ class TrainingConfig:
             if not fits:
                 value = getattr(self, name.replace("-", "_"))
                 raise UserError(f"--pipeline.training.{name} must be {words}, not {value}.")
-        density = self.density
-        if density.reset_every > 0 and 2 * density.cull_alpha_thresh < MIN_ALPHA:
-            raise UserError(
-                f"--pipeline.training.density.cull-alpha-thresh must be {MIN_ALPHA / 2:.4f} or more where "
-                f"opacities are reset to twice of it, not {density.cull_alpha_thresh}: nothing would show."
-            )
         if self.primitive == "2dgs" and (self.antialiased or self.poses != "off"):
             name = "antialiased" if self.antialiased else "poses"
             raise UserError(f"--pipeline.training.{name} is for 3dgs: gsplat's surfels do not have it.")

@@ -84,7 +84,7 @@ def test_between_refinements_statistics_add_up():
     control, growth = DensityControl(DensityConfig()), {}
     pictures = [Judged(view, torch.rand(8, 10), torch.tensor(0.5)) for view in ring_of_views(3)]
     for picture in pictures:
-        growth = control.after_step(params, optimizers, growth, (), [picture], clock(steps=7))
+        growth = control.after_step(params, optimizers, growth, (), [picture], clock(steps=7, refined=7))
     expected = {}
     for picture in pictures:
         add_picture(expected, gaussians, 3, picture)
@@ -110,16 +110,6 @@ def test_without_room_nothing_is_added_but_the_transparent_go():
     control = DensityControl(DensityConfig())
     control.after_step(params, optimizers, statistics(*[99.0] * 8), (), (), clock(room=0))
     assert torch.equal(params["means"], gaussians.means[3:])
-
-
-def test_opacities_are_reset_on_the_blocks_own_clock_alone():
-    gaussians = random_gaussians(8)
-    gaussians.opacities[:] = 3.0
-    control = DensityControl(DensityConfig(reset_every=500))
-    for steps, reset in ((499, False), (500, True), (501, False), (1000, True)):
-        params, optimizers = live(gaussians)
-        control.after_step(params, optimizers, {}, (), (), clock(steps=steps))
-        assert bool((torch.sigmoid(params["opacities"]) < 0.02).all()) is reset, steps
 
 
 def test_after_the_last_refinement_nothing_changes():
@@ -159,7 +149,7 @@ def test_mcmc_noise_moves_the_transparent_and_depends_on_the_seed():
     for seed in (1, 1, 2):
         params, optimizers = live(gaussians)
         before = torch.get_rng_state()
-        control.after_step(params, optimizers, {}, (), (), clock(steps=7, seed=seed))
+        control.after_step(params, optimizers, {}, (), (), clock(steps=7, refined=7, seed=seed))
         assert torch.equal(torch.get_rng_state(), before)
         moved.append(live_gaussians(params).means.detach() - gaussians.means)
     assert torch.equal(moved[0], moved[1])
@@ -188,12 +178,12 @@ def test_relocation_keeps_the_mass_along_a_ray():
     assert mass(float(new), float(scale[0, 0]), copies) == pytest.approx(mass(opacity, sigma, 1), rel=1e-4)
 
 
-def test_what_is_large_stays_though_opacities_were_reset():
+def test_what_is_large_stays():
     """Sky and far background are; what is large for every camera is held back by angle."""
     gaussians = random_gaussians(8, size=0.01)
     gaussians.opacities[:] = 3.0
     gaussians.scales[0] = math.log(5.0)
-    control = DensityControl(DensityConfig(reset_every=500, refine_every=10))
+    control = DensityControl(DensityConfig(refine_every=10))
     params, optimizers = live(gaussians)
     control.after_step(params, optimizers, statistics(*[0.0] * 8), (), (), clock(steps=510))
     assert len(params["means"]) == 8
@@ -212,24 +202,11 @@ def test_clocks_of_older_versions_are_read():
     assert BlockState.clocks_of(meta) == Clocks(steps=2, visits=1)
 
 
-def test_a_reset_needs_no_gradients():
-    """Those of a step may be unsound."""
-    gaussians = random_gaussians(8)
-    gaussians.opacities[:] = 3.0
-    params, optimizers = live(gaussians)
-    growth = {"weight": torch.ones(8)}
-    control, due = DensityControl(DensityConfig(reset_every=500)), clock(steps=500)
-    assert control.resets(due)
-    found = control.after_step(params, optimizers, growth, (), (), due)
-    assert bool((torch.sigmoid(params["opacities"]) < 0.02).all())
-    assert found["weight"].tolist() == [1.0] * 8
-
-
 def test_refining_needs_something_to_judge_by():
     control, due = DensityControl(DensityConfig()), clock()
     assert control.refines(due, statistics(1.0))
     assert not control.refines(due, {})
-    assert not control.refines(clock(steps=101), statistics(1.0))
+    assert not control.refines(clock(refined=98), statistics(1.0))
     assert DensityControl(DensityConfig("mcmc")).refines(due, {})
 
 
@@ -239,7 +216,7 @@ def test_random_numbers_are_forked_only_where_any_are_drawn(monkeypatch):
     monkeypatch.setattr(torch.random, "fork_rng", lambda **options: forks.append(1) or fork(**options))
     params, optimizers = live(random_gaussians(8))
     control = DensityControl(DensityConfig())
-    growth = control.after_step(params, optimizers, statistics(*[1.0] * 8), (), (), clock(steps=7))
+    growth = control.after_step(params, optimizers, statistics(*[1.0] * 8), (), (), clock(steps=7, refined=7))
     assert forks == []
     control.after_step(params, optimizers, growth, (), (), clock())
     assert forks == [1]

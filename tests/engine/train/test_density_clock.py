@@ -1,12 +1,13 @@
 """When a block grows: by its own clock, and by the run's."""
 
-import math
 from itertools import pairwise
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from abcd_ns.engine.train.density.clock import DensityClock
-from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.train.density.control import REFINEMENTS, DensityConfig, DensityControl
 
 
 def clock(**changes) -> DensityClock:
@@ -15,14 +16,31 @@ def clock(**changes) -> DensityClock:
     )
 
 
-@pytest.mark.parametrize("views", [1, 3, 30, 300, 3000, 15_000])
-def test_every_number_of_views_gets_refinements(views):
-    control = DensityControl(DensityConfig(refine_every=100))
-    steps = range(1, 20 * max(views, 100) + 1)
-    due = [s for s in steps if control.is_due(clock(steps=s, views=views))]
-    assert len(due) >= 10
-    assert all(b - a >= max(100, views) for a, b in pairwise(due))
-    assert due[0] >= views
+def refinements(run: int, views: int, taken: int = 1, **changes) -> list[int]:
+    """Views after which a run that draws so many is refined."""
+    control, found = DensityControl(DensityConfig(**changes)), [0]
+    for steps in range(taken, run + 1, taken):
+        at = clock(steps=steps, progress=steps / run, views=views, taken=taken, refined=found[-1])
+        found += [steps] if control.is_due(at) else []
+    return found[1:]
+
+
+@given(st.integers(600, 30_000), st.integers(1, 15_000), st.integers(1, 4))
+@settings(max_examples=20, deadline=None)
+def test_every_run_is_refined_20_to_150_times(run, views, taken):
+    least, most = REFINEMENTS
+    assert least - 1 <= len(refinements(run, views, taken)) <= most
+
+
+@pytest.mark.parametrize(("run", "views"), [(7000, 47), (14_000, 300), (30_000, 97), (30_000, 700)])
+def test_a_block_is_refined_whenever_its_views_were_drawn(run, views):
+    found = refinements(run, views)
+    assert {b - a for a, b in pairwise(found)} == {views}
+
+
+def test_a_number_of_views_between_refinements_may_be_given():
+    assert {b - a for a, b in pairwise(refinements(3000, 20, refine_every=100))} == {100}
+    assert {b - a for a, b in pairwise(refinements(3000, 130, refine_every=100))} == {130}
 
 
 @pytest.mark.parametrize(("progress", "expected"), [(0.0, False), (0.1, True), (0.49, True), (0.5, False)])
@@ -41,7 +59,7 @@ def test_a_block_grows_in_its_first_visit_unless_that_is_in_the_last_third():
     assert not never.is_due(clock(first=True, **late))
 
 
-@pytest.mark.parametrize("steps", [17, 32, 39, 64, 250])
+@pytest.mark.parametrize("steps", [17, 32, 39, 64])
 def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
     """It was refined in the warm-up, just now perhaps; later visits count from the one before."""
     control, batch = DensityControl(DensityConfig()), 4
@@ -57,38 +75,6 @@ def test_a_first_visit_grows_though_its_views_are_drawn_about_once(steps):
 
     assert due(first=True)
     assert not due(first=False)
-
-
-@pytest.mark.parametrize(
-    ("run", "views", "every"),
-    [(1200, 26, 30), (1200, 68, 68), (3600, 26, 60), (3600, 255, 255), (30_000, 26, 100), (30_000, 255, 255)],
-)
-def test_a_warm_up_is_refined_by_its_share_of_a_short_run_but_by_all_views(run, views, every):
-    """And as one block is in a long one."""
-    control, refined, due = DensityControl(DensityConfig()), 0, []
-    for steps in range(1, int(0.35 * run) + 1):
-        at = clock(steps=steps, progress=steps / run, views=views, refined=refined, warm_up=True)
-        if control.is_due(at):
-            due.append(steps)
-            refined = steps
-    assert {b - a for a, b in pairwise(due)} == {every}
-    assert due[0] == max(every, math.ceil(run / 60))
-
-
-def test_a_warm_up_whose_run_has_no_end_is_refined_as_one_block_is():
-    control = DensityControl(DensityConfig(refine_start=0.0))
-    assert control.is_due(clock(steps=100, progress=0.0, refined=0, warm_up=True))
-    assert not control.is_due(clock(steps=99, progress=0.0, refined=0, warm_up=True))
-
-
-def test_opacities_are_reset_only_where_there_is_time_to_make_it_good():
-    control = DensityControl(DensityConfig(reset_every=500))
-    assert control.resets(clock(steps=500))
-    assert control.resets(clock(steps=500, spent=0.4))
-    assert not control.resets(clock(steps=500, spent=0.6))
-    assert not control.resets(clock(steps=500, progress=0.6))
-    assert not control.resets(clock(steps=500, refined=0))  # in a visit among others
-    assert control.resets(clock(steps=500, refined=470, warm_up=True))
 
 
 def test_a_block_among_others_refines_early_in_its_visits_and_makes_up_for_what_it_missed():

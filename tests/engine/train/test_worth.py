@@ -122,3 +122,22 @@ def test_of_a_few_views_in_a_row_both_halves_have_some(first, step):
     assert 0 < sum(halves) < 3
     many = [half_of(first + k * step) for k in range(256)]
     assert 64 < sum(many) < 192
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_the_native_library_finds_the_same(monkeypatch, axes):
+    gaussians = random_gaussians(200, size=0.3)
+    sums = torch.randn(200, 10, generator=torch.Generator().manual_seed(1))
+    sums[:, 0] = sums[:, 0].clamp_min(0)  # some have no weight
+    sums[7, 4] = torch.nan
+    found = []
+    for native in (True, False):
+        if not native:
+            monkeypatch.setattr("abcd_ns.engine.train.density.worth.suits", lambda *_: False)
+        growth = {}
+        for view in VIEWS[:2]:
+            add_picture(growth, gaussians, axes, Judged(view, sums, torch.tensor(0.5), share=0.5))
+        found.append(growth[WORTH])
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-5)
+    assert not bool(found[0][7, :24].any())
+    assert bool(found[0][:, :24].any())

@@ -6,5 +6,6 @@
 #include "photometric.h"
 #include "projection.h"
 #include "threads.h"
+#include "worth.h"
 
 extern "C" void abcd_threads(int count) { threads_in_use = count; }

@@ -19,16 +19,12 @@ class DensityClock:
     """Gaussians that may still be added to the scene; None for no limit."""
     seed: int
     """Of the random numbers drawn in this step."""
-    refined: int | None = None
-    """`steps` when the block was last refined; None where there are no others: it is then refined at the very
-    step that it is due."""
-    warm_up: bool = False
-    """Whether this is the warm-up, which trains all at once."""
+    refined: int = 0
+    """`steps` when the block was last refined."""
     first: bool = False
     """Whether a block among others is in its first visit: all it has is what the warm-up had room for."""
     spent: float = 0.0
-    """Share of the visit or of the warm-up that is done, for what is left must make good what growing and
-    resets upset before others see the block; 0 where there are no others."""
+    """Share of the visit that is done; 0 in the warm-up and where there are no other blocks."""
     visit: int | None = None
     """Views that the visit draws; None for no end. A block is refined once a visit even if thousands of views
     show it."""

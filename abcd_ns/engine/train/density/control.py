@@ -36,12 +36,11 @@ from abcd_ns.engine.train.density.worth import WORTH, Judged, add_picture, worth
 GATHER, REFINE = 1, 6
 """Step numbers as gsplat's MCMC sees them; it refines on multiples of the second."""
 
-REFINE_UNTIL, RESET_UNTIL = 0.5, 0.4
-"""Share of a visit among others after which none is refined; of a warm-up after which no opacity is reset."""
-WARM_UP_EVERY, LEAST_EVERY = 1 / 60, 30
-"""A warm-up is refined whenever this share has been drawn of the views that the run would draw at its pace,
-or so many views if these are more, or all of the scene's: also a short one is to fill its room, but by what
-every view asks for."""
+REFINE_UNTIL = 0.5
+"""Share of a visit after which a block is not refined: the rest makes good what growing upset."""
+REFINEMENTS = (20, 150)
+"""Least and most refinements of a block in a whole run. Between them it is refined once all its views have
+been drawn."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
 MCMC_MIN_OPACITY = 0.005
@@ -67,12 +66,9 @@ class DensityConfig:
     refine_stop: float = 0.5
     """Share of the run after which none becomes two; a block grows in its first visit all the same,
     unless that is in the last third. Who fills less than the `price` goes later, too."""
-    refine_every: int = 100
-    """Views drawn to train a block between its refinements; never fewer than show the block, but half of a
-    first visit's at most, and in the warm-up a sixtieth of the run's, if no fewer than show the scene."""
-    reset_every: int = 3000
-    """Views drawn between opacity resets of a block without others, and in the first part of a warm-up
-    (`default` strategy); 0 means never."""
+    refine_every: int = 0
+    """Views drawn to train a block between its refinements, at least as many as show it. 0: as many as show
+    it, but such that a run refines 20 to 150 times."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
     split_pixels: float = 8.0
@@ -117,17 +113,20 @@ class DensityControl:
         """Whether this step refines."""
         if not (self.config.refine_start <= clock.progress and self._grows(clock.progress, clock.first)):
             return False
+        return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= self._every(clock)
+
+    def _every(self, clock: DensityClock) -> float:
+        """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
-        every = max(self.config.refine_every, views, 1)
-        if clock.first and clock.visit is not None:  # what it was refined at before is the warm-up's
+        if self.config.refine_every > 0:
+            every = max(self.config.refine_every, views)
+        else:
+            growing = max(self.config.refine_stop - self.config.refine_start, 0.0) * clock.pace
+            fewest, most = REFINEMENTS
+            every = min(max(views, growing / most), max(int(growing / fewest), 1))
+        if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
-        if clock.refined is None:
-            return clock.reached(every)
-        if clock.warm_up:
-            every = min(every, max(LEAST_EVERY, views, round(WARM_UP_EVERY * clock.pace)))
-        elif clock.spent > REFINE_UNTIL:
-            return False
-        return clock.steps - clock.refined >= every
+        return every
 
     def refines(self, clock: DensityClock, growth: Mapping[str, Tensor]) -> bool:
         """Whether this step refines: it is due, and by default there is something to judge by.
@@ -149,15 +148,6 @@ class DensityControl:
     def _grows(self, progress: float, first: bool) -> bool:
         begins, ends = self.config.refine_start, self.config.refine_stop
         return progress < (max(ends, LAST) if first and begins < ends else ends)
-
-    def resets(self, clock: DensityClock) -> bool:
-        """Whether this step resets opacities (`default` strategy); that needs no gradients. Among others
-        never: shedding finds there what resets are made to find."""
-        every = self.config.reset_every
-        if self.config.strategy != "default" or every <= 0 or clock.progress >= self.config.refine_stop:
-            return False
-        alone = clock.refined is None or clock.warm_up
-        return alone and clock.spent <= RESET_UNTIL and clock.reached(every)
 
     def after_step(
         self,
@@ -186,7 +176,7 @@ class DensityControl:
                 add_picture(growth, live_gaussians(params).detach(), self._axes, picture)
             if not self.asks(clock.progress, clock.first):
                 growth.pop(WORTH, None)
-            if not (self.refines(clock, growth) or self.resets(clock)):
+            if not self.refines(clock, growth):
                 return growth
         device = params["means"].device
         cuda = [device] if device.type == "cuda" else []
@@ -224,17 +214,14 @@ class DensityControl:
         self, params: Params, optimizers: Optimizers, growth: dict[str, Tensor], clock: DensityClock
     ) -> dict[str, Tensor]:
         config = self.config
-        if self.refines(clock, growth):
-            wanted, axis = worth(growth, clock.views, config.split_pixels)
-            most = math.ceil(MOST_NEW * len(wanted))
-            room = most if clock.room is None else min(most, clock.room)
-            growth = halve(params, optimizers, growth, chosen(wanted, room), axis)
-            growth[WORTH] = torch.zeros_like(growth[WORTH])
-            faint = torch.sigmoid(params["opacities"][:, 0]) < config.cull_alpha_thresh
-            if bool(faint.any()):
-                gsplat_ops.remove(params, optimizers, growth, faint)
-        if self.resets(clock):
-            gsplat_ops.reset_opa(params, optimizers, {}, value=2 * config.cull_alpha_thresh)
+        wanted, axis = worth(growth, clock.views, config.split_pixels)
+        most = math.ceil(MOST_NEW * len(wanted))
+        room = most if clock.room is None else min(most, clock.room)
+        growth = halve(params, optimizers, growth, chosen(wanted, room), axis)
+        growth[WORTH] = torch.zeros_like(growth[WORTH])
+        faint = torch.sigmoid(params["opacities"][:, 0]) < config.cull_alpha_thresh
+        if bool(faint.any()):
+            gsplat_ops.remove(params, optimizers, growth, faint)
         return growth
 
     def _step_mcmc(self, params: Params, optimizers: Optimizers, clock: DensityClock) -> None:

@@ -9,6 +9,7 @@ That is what these views ask for; others may not. So views are in two halves: h 
 the other, 2 h b - h^2 A, and the other way round. What only some views ask for is worth less than nothing.
 """
 
+import ctypes
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from abcd_ns.engine.kernels.native import address, library, suits
 from abcd_ns.engine.render.splat_kernels import EPS_2D
 from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Gaussians, View
@@ -59,11 +61,44 @@ def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, pict
         axes: along which Gaussians extend.
     """
     view, means = picture.view, gaussians.means
-    camera = torch.cat((view.viewmat[:3].flatten(), view.K.diagonal())).detach().to(means.dtype)
-    pose, focal = upload(camera, means.device).split((12, 3))
+    if WORTH not in growth:
+        growth[WORTH] = means.new_zeros((len(means), COLUMNS))
+    table, start = growth[WORTH], (BY_CHANNEL + BY_AXIS) * half_of(view.index)
+    camera = torch.cat((view.viewmat[:3].flatten(), view.K.diagonal()[:2])).detach().to(means.dtype)
+    if suits(means, table, picture.sums):
+        _add_natively(table, start, gaussians, axes, picture, camera)
+    else:
+        table[:, start : start + BY_CHANNEL + BY_AXIS] += _asked(gaussians, axes, picture, camera)
+    table[:, -2] += picture.error.to(means).nan_to_num(0.0, 0.0, 0.0)
+    table[:, -1] += 1
+
+
+def _add_natively(
+    table: Tensor, start: int, gaussians: Gaussians, axes: int, picture: Judged, camera: Float[Tensor, "14"]
+) -> None:
+    near = camera.new_full((1,), picture.view.near)
+    given = (gaussians.means, gaussians.scales, gaussians.quats, picture.sums, torch.cat((camera, near)))
+    given = [each.contiguous() for each in given]
+    library().abcd_worth(
+        ctypes.c_int64(len(table)),
+        *(ctypes.c_void_p(address(each)) for each in given),
+        ctypes.c_int64(axes),
+        ctypes.c_float(picture.share),
+        ctypes.c_void_p(address(table)),
+        ctypes.c_int64(COLUMNS),
+        ctypes.c_int64(start),
+    )
+
+
+def _asked(
+    gaussians: Gaussians, axes: int, picture: Judged, camera: Float[Tensor, "14"]
+) -> Float[Tensor, "n 12"]:
+    """b and A of one picture."""
+    means = gaussians.means
+    pose, focal = upload(camera, means.device).split((12, 2))
     turn, shift = pose.view(3, 4).split((3, 1), dim=1)
     x, y, z = (means @ turn.T + shift.T).T[..., None].unbind(0)
-    z = z.clamp_min(view.near)
+    z = z.clamp_min(picture.view.near)
     axis = normalized_quat_to_rotmat(F.normalize(gaussians.quats, dim=1)) * gaussians.scales.exp()[:, None]
     along_x, along_y, along_z = (turn @ axis).unbind(1)  # a standard deviation of each axis, [n, 3]
     right, down = (along_x - x / z * along_z) * focal[0] / z, (along_y - y / z * along_z) * focal[1] / z
@@ -78,14 +113,7 @@ def add_picture(growth: dict[str, Tensor], gaussians: Gaussians, axes: int, pict
     b[:, axes:], a[:, axes:] = 0.0, 0.0
     found = torch.cat((b.flatten(1), a), dim=1) / picture.share
     # An accelerator may have skipped a step that was no number.
-    found = torch.where((weight > 0) & found.isfinite().all(dim=1, keepdim=True), found, 0.0)
-    if WORTH not in growth:
-        growth[WORTH] = means.new_zeros((len(means), COLUMNS))
-    sums, columns = growth[WORTH], found.shape[1]
-    start = columns * half_of(view.index)
-    sums[:, start : start + columns] += found
-    sums[:, -2] += picture.error.to(means).nan_to_num(0.0, 0.0, 0.0)
-    sums[:, -1] += 1
+    return torch.where((weight > 0) & found.isfinite().all(dim=1, keepdim=True), found, 0.0)
 
 
 def worth(

@@ -9,7 +9,6 @@ from torch import Tensor
 from abcd_ns.engine.gaussians.block_state import BlockState, Clocks
 from abcd_ns.engine.gaussians.param_swap import attach, detach
 from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
-from abcd_ns.engine.store.special_blocks import RESERVE
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
@@ -19,7 +18,6 @@ from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import ActiveVisit
-from abcd_ns.engine.train.schedule import warmed
 from abcd_ns.engine.types import Gaussians
 
 
@@ -133,10 +131,6 @@ class LiveBlock:
         run, active = self._run, self._run.active
         blocks = run.blocks
         among_others = blocks > 1 and run.config.recipe.overlap == 0
-        warming = 0.0
-        if active.is_whole:
-            uses = active.done * batch / len(active.views)
-            warming = warmed(run.progress, uses, run.config.warmup, run.scene.rows(RESERVE))
         return DensityClock(
             progress=run.share,
             steps=self.clocks.steps,
@@ -145,10 +139,9 @@ class LiveBlock:
             visit=active.steps * batch if blocks > 1 else None,
             room=room,
             seed=random.Random(f"density {run.config.seed} {run.state.step}").getrandbits(62),
-            refined=self.clocks.refined if among_others or active.is_whole else None,
-            warm_up=active.is_whole,
-            first=among_others and not active.is_whole and self.clocks.visits == 0,
-            spent=active.done / active.steps if among_others else warming,
+            refined=self.clocks.refined,
+            first=among_others and self.clocks.visits == 0,
+            spent=active.done / active.steps if among_others else 0.0,
         )
 
     @property
