@@ -142,8 +142,8 @@ def test_training_improves_every_photo_of_a_scene_with_surfaces(tmp_path, views)
     truth.opacities[:] = 4.0
     photos = Photos(truth, views)
     start = dataclasses.replace(truth, features_dc=torch.zeros_like(truth.features_dc))
-    # Gentle steps: by themselves, blocks of so small a scene overshoot where photos say little.
-    coordinator = independent(tmp_path, start, views, steps=80, density=STILL, batch=1)
+    # Small steps: by themselves, blocks of so small a scene overshoot where photos say little.
+    coordinator = independent(tmp_path, start, views, steps=300, density=STILL, batch=1)
 
     def errors() -> list[float]:
         scene = whole_scene(coordinator)
