@@ -21,7 +21,7 @@ from abcd_ns.errors import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-DOCUMENTS += [ROOT / "docs" / "results" / name for name in ("README.md", "history.md")]
+DOCUMENTS.append(ROOT / "docs" / "results" / "README.md")
 NERFSTUDIO: dict[str, Any] = {
     "ns-train": AnnotatedBaseConfigUnion,
     "ns-eval": ComputePSNR,
@@ -84,4 +84,4 @@ def test_a_wrong_one_would_be_noticed(line):
 
 def test_there_are_commands_to_look_at():
     assert {"ns-train", "abcd"} <= {shlex.split(p.values[0], comments=True)[0] for p in SHOWN}
-    assert len(SHOWN) > 40
+    assert len(SHOWN) > 20
