@@ -38,7 +38,7 @@ GATHER, REFINE = 1, 6
 
 REFINE_UNTIL = 0.5
 """Share of a visit after which a block is not refined: the rest makes good what growing upset."""
-REFINEMENTS = (20, 150)
+REFINEMENTS = (8, 150)
 """Least and most refinements of a block in a whole run. Between them it is refined once all its views have
 been drawn."""
 MOST_NEW = 0.1
@@ -68,7 +68,7 @@ class DensityConfig:
     unless that is in the last third. Who fills less than the `price` goes later, too."""
     refine_every: int = 0
     """Views drawn to train a block between its refinements, at least as many as show it. 0: as many as show
-    it, but such that a run refines 20 to 150 times."""
+    it, but such that a run refines 8 to 150 times."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
     split_pixels: float = 8.0
