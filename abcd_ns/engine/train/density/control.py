@@ -38,9 +38,8 @@ GATHER, REFINE = 1, 6
 
 REFINE_UNTIL = 0.5
 """Share of a visit after which a block is not refined: the rest makes good what growing upset."""
-REFINEMENTS = (8, 150)
-"""Least and most refinements of a block in a whole run. Between them it is refined once all its views have
-been drawn."""
+LEAST_REFINEMENTS = 4
+"""Of a block in a whole run, however many views show it."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
 MCMC_MIN_OPACITY = 0.005
@@ -66,9 +65,9 @@ class DensityConfig:
     refine_stop: float = 0.5
     """Share of the run after which none becomes two; a block grows in its first visit all the same,
     unless that is in the last third. Who fills less than the `price` goes later, too."""
-    refine_every: int = 0
-    """Views drawn to train a block between its refinements, at least as many as show it. 0: as many as show
-    it, but such that a run refines 8 to 150 times."""
+    refine_every: int = 100
+    """Views drawn to train a block between its refinements; more where more show it, fewer where a run would
+    refine it fewer than 4 times."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
     split_pixels: float = 8.0
@@ -115,15 +114,11 @@ class DensityControl:
             return False
         return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= self._every(clock)
 
-    def _every(self, clock: DensityClock) -> float:
+    def _every(self, clock: DensityClock) -> int:
         """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
-        if self.config.refine_every > 0:
-            every = max(self.config.refine_every, views)
-        else:
-            growing = max(self.config.refine_stop - self.config.refine_start, 0.0) * clock.pace
-            fewest, most = REFINEMENTS
-            every = min(max(views, growing / most), max(int(growing / fewest), 1))
+        growing = max(self.config.refine_stop - self.config.refine_start, 0.0) * clock.pace
+        every = max(min(max(self.config.refine_every, views), int(growing / LEAST_REFINEMENTS)), 1)
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every
