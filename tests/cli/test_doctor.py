@@ -15,11 +15,11 @@ from torch.utils import cpp_extension
 
 from abcd_ns.cli.doctor import command, hardware, kernels, packages
 from abcd_ns.cli.doctor.command import diagnose, doctor
-from abcd_ns.cli.doctor.facts import Facts, without_home
-from abcd_ns.cli.doctor.findings import TESTED
+from abcd_ns.cli.doctor.facts import Facts
 from abcd_ns.cli.doctor.hardware import Gpu, Hardware
 from abcd_ns.cli.doctor.kernels import Kernels, build_folder, find_extension, look_at_kernels
 from abcd_ns.cli.doctor.packages import VERSIONS, Packages, look_at_packages
+from abcd_ns.cli.doctor.rules import TESTED
 from abcd_ns.errors import UserError
 
 GIB = 2**30
@@ -186,12 +186,6 @@ def test_the_report_names_no_home(tmp_path, monkeypatch, capsys):
         assert "~/.cache/x" in said
         assert "~/lib.so" in said
     assert json.loads(text)["facts"]["kernels"]["nvcc"] == "13.0"
-
-
-def test_only_whole_names_are_the_home(monkeypatch):
-    monkeypatch.setenv("HOME", "/r")
-    given = {"/r": ["/r/x", "/rest", "/a/r/x", ("/r",)]}
-    assert without_home(given) == {"~": ["~/x", "/rest", "/a/r/x", ("~",)]}
 
 
 def test_a_report_that_cannot_be_written_is_refused_first(tmp_path):
