@@ -9,7 +9,7 @@ from rich.console import Console
 from abcd_ns.cli.doctor.facts import Facts, gather
 from abcd_ns.cli.doctor.hardware import Hardware
 from abcd_ns.cli.doctor.kernels import Kernels
-from abcd_ns.cli.doctor.packages import Packages
+from abcd_ns.cli.doctor.packages import VERSIONS
 from abcd_ns.cli.doctor.rules import RULES
 from abcd_ns.cli.findings import Finding, by_level, check_json, judge, print_findings, write_report
 from abcd_ns.cli.terminal import many, print_plain
@@ -23,6 +23,8 @@ CANNOT_TRAIN = 1
 """Exit code where something makes training impossible."""
 MAIN = ("torch", "nerfstudio", "gsplat", "viser")
 """Packages whose versions are always shown."""
+DETAILS = {*VERSIONS, "OS", "driver", "torch's CUDA", "compilers", "LPIPS"}
+"""Rows that only --verbose shows."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     """
     check_json(json)
     report = diagnose(gather())
-    console, rows = Console(), _rows(report.facts, verbose)
+    console = Console()
+    rows = {name: value for name, value in _rows(report.facts).items() if verbose or name not in DETAILS}
     width = max(map(len, rows))
     for name, value in rows.items():
         print_plain(f"{name:<{width}}  {value}", console)
@@ -73,66 +76,51 @@ def diagnose(facts: Facts) -> Report:
     return decode(Report, json_text.loads(without_home(json_text.dumps(encode(report)))), "the report")
 
 
-def _rows(facts: Facts, verbose: bool) -> dict[str, str]:
+def _rows(facts: Facts) -> dict[str, str]:
+    """All there is to show."""
     packages, hardware, kernels = facts.packages, facts.hardware, facts.kernels
-    rows = _packages(packages, verbose)
-    if hardware is None:
-        rows["machine"] = "unknown, as torch does not start"
-    else:
-        rows |= _hardware(hardware, verbose) | {"workers": _workers(hardware, packages.ray)}
-    if kernels is None:
-        return rows | {"kernels": "unknown, as packages do not start"}
-    return rows | _kernels(kernels, hardware.gpu is not None, verbose)
-
-
-def _packages(packages: Packages, verbose: bool) -> dict[str, str]:
     number, plus, changes = (packages.commit or "").partition("+")
     commit = f", commit {number[:10]}{plus}{changes}" if number else ""
-    names = packages.versions if verbose else MAIN
-    versions = {name: packages.versions.get(name) or "not installed" for name in names}
-    listed = {"packages": ", ".join(f"{name} {version}" for name, version in versions.items())}
-    own = {"abcd_ns": f"{packages.abcd_ns}{commit}; Python {packages.python}"}
-    return own | (versions if verbose else listed)
+    versions = {name: version or "not installed" for name, version in packages.versions.items()}
+    rows = {
+        "abcd_ns": f"{packages.abcd_ns}{commit}; Python {packages.python}",
+        "packages": ", ".join(f"{name} {versions.get(name)}" for name in MAIN),
+        **{name: version for name, version in versions.items() if name not in MAIN},
+    }
+    rows |= _hardware(hardware, packages.ray) if hardware else {"machine": "unknown, as torch does not start"}
+    return rows | (_kernels(kernels) if kernels else {"kernels": "unknown, as packages do not start"})
 
 
-def _hardware(hardware: Hardware, verbose: bool) -> dict[str, str]:
+def _hardware(hardware: Hardware, ray: str | None) -> dict[str, str]:
     gpu, device = hardware.gpu, "none: training runs on the CPU, which is meant for small pictures"
+    most, workers = hardware.cores, f"up to {hardware.cores}, one for each core, for two blocks each"
     if gpu is not None:
         device = f"{gpu.name}, {bytes_in_words(gpu.memory_bytes)}, capability {gpu.capability}"
-    rows = {
+        how = f"by Ray {ray}" if ray else "after pip install 'abcd-ns[cluster]'"
+        most, workers = hardware.gpus, f"up to {hardware.gpus}, one for each GPU: --pipeline.workers, {how}"
+    return {
         "GPU": device,
         "CPU": f"{hardware.cpu}, {hardware.cores} cores",
         "RAM": f"{bytes_in_words(hardware.ram_bytes)}, {bytes_in_words(hardware.ram_free_bytes)} free",
         "disk": f"{bytes_in_words(hardware.disk_free_bytes)} free",
+        "OS": hardware.os,
+        "driver": hardware.driver or "none",
+        "torch's CUDA": hardware.torch_cuda or "none",
+        "workers": workers if most > 1 else f"none here: one {'GPU' if gpu else 'core'}",
     }
-    cuda = {"driver": hardware.driver or "none", "torch's CUDA": hardware.torch_cuda or "none"}
-    return rows | ({"OS": hardware.os} | cuda if verbose else {})
 
 
-def _workers(hardware: Hardware, ray: str | None) -> str:
-    """How many blocks could be trained at once."""
-    most, of = (hardware.gpus, "GPU") if hardware.gpu else (hardware.cores, "core")
-    if most < 2:
-        return f"none here: one {of}"
-    if not hardware.gpu:
-        return f"up to {most}, one for each core, where a scene has two blocks for each"
-    how = f"by Ray {ray}" if ray else "after pip install 'abcd-ns[cluster]'"
-    return f"up to {most}, one for each GPU: --pipeline.workers, {how}"
-
-
-def _kernels(kernels: Kernels, on_gpu: bool, verbose: bool) -> dict[str, str]:
+def _kernels(kernels: Kernels) -> dict[str, str]:
     checks = [f"{name} differs by {error:.0e}" for name, error in kernels.self_check.items()]
-    checks += [f"{name} FAILED" for name in kernels.failed]
-    built = "compiled" if kernels.built else "not compiled"
-    if not kernels.built and not on_gpu:
-        built += ": the first use compiles it, in some 15 seconds"
-    rows = {"CPU rasterizer": f"{built}, in {kernels.folder}" if verbose else built}
-    if verbose or on_gpu:
-        rows["gsplat's"] = kernels.gsplat or "not built: the first training or `abcd plan` compiles them"
-    rows["self-check"] = ", ".join(checks)
-    if verbose:
-        nvcc = f"nvcc {kernels.nvcc}" if kernels.nvcc else "no nvcc"
-        ninja = "ninja" if kernels.ninja else "no ninja"
-        rows["compilers"] = f"{kernels.compiler or 'no C++ compiler'}, {nvcc}, {ninja}"
-        rows["LPIPS"] = "no weights" if kernels.lpips_missing else "weights are there"
-    return rows
+    tools = (
+        kernels.compiler or "no C++ compiler",
+        f"nvcc {kernels.nvcc}" if kernels.nvcc else "no nvcc",
+        "ninja" if kernels.ninja else "no ninja",
+    )
+    return {
+        "CPU rasterizer": f"compiled, in {kernels.folder}" if kernels.built else "first use compiles it",
+        "gsplat's": kernels.gsplat or "not built",
+        "self-check": ", ".join([*checks, *(f"{name} FAILED" for name in kernels.failed)]),
+        "compilers": ", ".join(tools),
+        "LPIPS": "no weights" if kernels.lpips_missing else "weights are there",
+    }
