@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import resource
 import subprocess
 import sys
 import time
@@ -49,8 +50,8 @@ class Steps:
         minutes, seconds = divmod(int(self.seconds), 60)
         self._console.print(f"\n[bold]{minutes}:{seconds:02d}  {title}[/]", highlight=False)
 
-    def run(self, name: str, command: Sequence[object], *, quiet: bool = True) -> int:
-        """Run a command to its end; returns its peak RAM in bytes.
+    def run(self, name: str, command: Sequence[object], *, quiet: bool = True) -> None:
+        """Run a command to its end.
 
         Args:
             quiet: its output goes to a log file instead of the terminal.
@@ -64,14 +65,10 @@ class Steps:
         log = self._logs / f"{name}.log"
         with open(log if quiet else os.devnull, "wb") as stream:
             output = {"stdout": stream, "stderr": subprocess.STDOUT} if quiet else {}
-            process = subprocess.Popen(words, stdin=subprocess.DEVNULL, **output)
-            # wait4 and not wait: it tells what this one child used.
-            _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode != 0:
+            code = subprocess.run(words, stdin=subprocess.DEVNULL, check=False, **output).returncode
+        if code != 0:
             where = f"see {log}" if quiet else "see its output above"
-            raise StepFailed(f"{name} failed with exit code {process.returncode}; {where}.")
-        return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)  # KiB but on macOS
+            raise StepFailed(f"{name} failed with exit code {code}; {where}.")
 
 
 def demo(
@@ -153,7 +150,7 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
 
 
 def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) -> tuple[Path, int]:
-    """The run's folder, and the peak RAM of training in bytes."""
+    """The run's folder, and the most RAM, in bytes, that a child of this process has taken so far."""
     stamp = time.strftime("%Y-%m-%d_%H%M%S")
     words = ["abcd", "--data", scene.resolve(), "--output-dir", out / "training", "--experiment-name", "demo"]
     words += ["--timestamp", stamp, "--vis", "tensorboard", "--viewer.quit-on-train-completion", True]
@@ -161,8 +158,10 @@ def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) ->
     # The seconds end the run; evaluations meanwhile would only make the demo longer.
     words += ["--max-num-iterations", 10**9, "--steps-per-save", 10**9]
     words += ["--steps-per-eval-image", 0, "--steps-per-eval-all-images", 0]
-    peak = steps.run("ns-train", [_tool("ns-train"), *words], quiet=False)
-    return out / "training" / "demo" / "abcd" / stamp, peak
+    steps.run("ns-train", [_tool("ns-train"), *words], quiet=False)
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    # In KiB, but on macOS.
+    return out / "training" / "demo" / "abcd" / stamp, peak * (1 if sys.platform == "darwin" else 1024)
 
 
 def _closing_picture(out: Path) -> Path:

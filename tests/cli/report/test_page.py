@@ -7,14 +7,12 @@ import re
 import shlex
 from html.parser import HTMLParser
 
-import numpy as np
 import pytest
 import torch
 
-from abcd_ns.cli.report import held_out as held_out_module
 from abcd_ns.cli.report.charts import draw_map, smoothed
 from abcd_ns.cli.report.figures import block_rows, more_figures, tiles
-from abcd_ns.cli.report.held_out import HeldOut, data_uri, pick
+from abcd_ns.cli.report.held_out import HeldOut, pick
 from abcd_ns.cli.report.options import changed_options, training_command
 from abcd_ns.cli.report.page import render_page
 from abcd_ns.cli.report.run_folder import CHECKPOINTS, open_run
@@ -25,7 +23,6 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import RunState
-from abcd_ns.lab.runs.evaluate import Drawn, HeldOutView
 from tests.cli.report.runs import (
     TRAINING,
     line,
@@ -204,23 +201,6 @@ def test_shown_views_reach_from_the_best_to_the_worst(count):
     assert len(found) == min(count, 5)
     assert pick(scores, 0) == {}
     assert pick([], 3) == {}
-
-
-def test_pictures_of_a_page_are_reduced_to_a_few_megapixels(monkeypatch):
-    monkeypatch.setattr(held_out_module, "PAGE_PIXELS", 3 * 2 * 100)
-    noise = torch.rand(40, 60, 3, generator=torch.Generator().manual_seed(0))
-    drawn = Drawn(HeldOutView(0, "a.png", None, noise), noise, noise)
-    shown = held_out_module._show(drawn, made_up_score(0, 20.0), "best", 2)
-    assert shown.width * shown.height <= 110
-    assert shown.width / shown.height == pytest.approx(1.5, rel=0.15)
-
-
-@pytest.mark.parametrize("lossless", [True, False])
-def test_pictures_stand_in_the_page_itself(lossless):
-    picture = np.full((8, 8, 3), 200, np.uint8)
-    kind, _, content = data_uri(picture, lossless).partition(";base64,")
-    assert kind == f"data:image/{'png' if lossless else 'jpeg'}"
-    assert base64.b64decode(content)[:2] == (b"\x89P" if lossless else b"\xff\xd8")
 
 
 def test_changed_settings_and_the_command_that_sets_them():
