@@ -47,7 +47,7 @@ def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) 
         axes.plot(*zip(*smoothed(crops), strict=True), color=QUIET, linewidth=1.2, label="training crops")
     if scored:
         points, color = sorted(scored.values()), COLORS.get(method, STEPS)
-        axes.plot(*zip(*points, strict=True), "o-", color=color, markersize=4.5, label="held-out views")
+        axes.plot(*zip(*points, strict=True), "o-", color=color, clip_on=False, label="held-out views")
     axes.legend(frameon=False, loc="lower right")
     return _uri(figure)
 
@@ -72,8 +72,8 @@ def _draw_visits(axes: Axes, story: Story) -> None:
         for seconds, color in ((visit.seconds, STEPS), (visit.layer_seconds, LAYERS)):
             alpha = 0.3 if visit.block is None else 0.85 if visit.done else 0.5
             axes.add_patch(Rectangle((visit.began, top), seconds, height, color=color, lw=0, alpha=alpha))
-    for color, name in ((STEPS, "steps"), (LAYERS, "layers")):
-        axes.plot([], [], "s", color=color, label=name)
+    for color, alpha, name in ((STEPS, 0.85, "steps"), (LAYERS, 0.85, "layers"), (STEPS, 0.3, "warm-up")):
+        axes.plot([], [], "s", color=color, alpha=alpha, label=name)
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     axes.set_ylim(story.blocks + 0.6, 0.4)
     axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))
@@ -119,7 +119,8 @@ def draw_map(checkpoint: Checkpoint, cameras: Sequence[Cameras]) -> str:
         margin = 0.05 * np.ptp(ends, axis=0).max() + 1e-6
         low, high = ends.min(axis=0) - margin, ends.max(axis=0) + margin
         frame = np.stack([low, high], axis=1)
-        axes.hist2d(*means[:, plane].T, BINS, frame, norm="log", cmap="Greys", alpha=0.8, rasterized=True)
+        look = {"norm": "log", "cmap": "Greys", "alpha": 0.8, "rasterized": True}
+        axes.hist2d(*means[:, plane].T, BINS, range=frame, **look)
         for block in range(tree.num_blocks):
             cell, own = tree.cell(block), means[owner == block][:, plane]
             lower, upper = (np.clip(side.numpy()[[*plane]], low, high) for side in (cell.lower, cell.upper))

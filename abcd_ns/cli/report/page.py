@@ -47,7 +47,6 @@ def render_page(
     psnr = None if held_out is None else held_out.mean("psnr_merged")
     measured = None if psnr is None or checkpoint is None else (checkpoint.step, psnr)
     views = [] if held_out is None else list(held_out.shown)
-    changed = changed_options(settings)
     versions = vars(settings.versions) | {"machine": about_machine(settings.machine)}
     pages = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("page.html").render(
@@ -72,7 +71,7 @@ def render_page(
         figures=more_figures(run, held_out).items(),
         block_titles=BLOCK_TITLES,
         blocks=block_rows(run),
-        changed=[(option.name, option.value, option.default) for option in changed],
+        changed=changed_options(settings),
         options=[(name, as_text(value)) for name, value in sorted(settings.options.items())],
         command=without_home(training_command(settings)),
         versions=[(name, value or NOTHING) for name, value in versions.items()],

@@ -208,7 +208,7 @@ def test_changed_settings_and_the_command_that_sets_them():
     changed = {"pipeline.blocks": 4, "pipeline.max_seconds": 60.0, "timestamp": "now", "output_dir": "x"}
     no_flag = {"pipeline.training.recipe.visit_steps": 7}
     settings = made_up_settings(options={**options, **changed, **no_flag}, data="my data; rm -rf")
-    found = {option.name: (option.value, option.default) for option in changed_options(settings)}
+    found = {name: (value, default) for name, value, default in changed_options(settings)}
     assert found.pop("pipeline.training.recipe.visit_steps") == ("7", "0")
     assert found == {"pipeline.blocks": ("4", "0"), "pipeline.max_seconds": ("60.0", "None")}
     assert shlex.split(training_command(settings).replace("\\\n", "")) == [
