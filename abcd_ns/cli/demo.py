@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import resource
 import subprocess
 import sys
 import time
@@ -11,33 +12,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import matplotlib
 import tyro
-from matplotlib.figure import Figure
+from PIL import Image
 from rich.console import Console
 
 from abcd_ns.cli.terminal import print_facts, print_plain
-from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.pictures import PictureArray, draw_comparison, psnr_of, read_picture
-from abcd_ns.lab.results.style import STYLE
+from abcd_ns.lab.compare.pictures import psnr_of, read_picture
 from abcd_ns.lab.runs.runner import take_folder, taking
 
 SCENE = {"courts": 1, "views_per_court": 56, "width": 256, "height": 192, "points_per_court": 24_000}
 """What two minutes on two cores suffice for: views that overlap, and points that need not multiply first."""
 MARKER = "abcd-demo.txt"
 """Marks a folder that this command made."""
-SHOWN = 3
-"""Held-out views of which pictures with errors are made."""
-CLOSING = "court.png"
-"""A held-out view, as the photo has it and as the Gaussians draw it."""
-CLOSING_INCHES = 6.4
-"""Width of either."""
-Pair = tuple[PictureArray, PictureArray]
+ENLARGED = 4
+"""By how much the closing picture is."""
 
 
 class StepFailed(Exception):
-    """A command that the demo started came to nothing; the message says which and where its output is."""
+    """A command that the demo started failed; the message names it and its output."""
 
 
 class Steps:
@@ -57,8 +50,8 @@ class Steps:
         minutes, seconds = divmod(int(self.seconds), 60)
         self._console.print(f"\n[bold]{minutes}:{seconds:02d}  {title}[/]", highlight=False)
 
-    def run(self, name: str, command: Sequence[str], *, quiet: bool = True) -> int:
-        """Run a command to its end; returns its peak RAM in bytes.
+    def run(self, name: str, command: Sequence[object], *, quiet: bool = True) -> None:
+        """Run a command to its end.
 
         Args:
             quiet: its output goes to a log file instead of the terminal.
@@ -66,19 +59,16 @@ class Steps:
         Raises:
             StepFailed: it exited with another code than 0.
         """
-        typed = ["abcd", *command[3:]] if command[1:2] == ["-m"] else [name, *command[1:]]
+        words = list(map(str, command))
+        typed = ["abcd", *words[3:]] if words[1:2] == ["-m"] else [name, *words[1:]]
         self._console.print(f"$ {' '.join(typed)}", style="dim", markup=False, emoji=False, soft_wrap=True)
         log = self._logs / f"{name}.log"
         with open(log if quiet else os.devnull, "wb") as stream:
             output = {"stdout": stream, "stderr": subprocess.STDOUT} if quiet else {}
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **output)
-            # wait4 and not wait: it tells what this one child used.
-            _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode != 0:
+            code = subprocess.run(words, stdin=subprocess.DEVNULL, check=False, **output).returncode
+        if code != 0:
             where = f"see {log}" if quiet else "see its output above"
-            raise StepFailed(f"{name} failed with exit code {process.returncode}; {where}.")
-        return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)  # KiB but on macOS
+            raise StepFailed(f"{name} failed with exit code {code}; {where}.")
 
 
 def demo(
@@ -89,13 +79,12 @@ def demo(
 ) -> int:
     """Make a small scene, train it block by block, score it and export it. Needs no GPU and no data.
 
-    Runs `abcd synth`, `ns-train abcd`, `ns-eval`, `ns-export gaussian-splat` and `abcd report`, as you
-    would.
+    Runs `abcd synth`, `ns-train abcd`, `ns-eval`, `ns-export gaussian-splat` and `abcd report`.
 
     Args:
         out: Folder for everything that is made; absent, empty, or an earlier demo's.
         seconds: Time for training. The rest takes about a minute on two cores.
-        blocks: Blocks that space is cut into.
+        blocks: Number of blocks.
 
     Raises:
         UserError: `out` holds something else or cannot be written, an option is out of range, or nerfstudio
@@ -120,27 +109,25 @@ def demo(
 
 
 def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Console) -> None:
-    scene = out / "scene"
+    scene, ply, page = out / "scene", out / "splat.ply", out / "report.html"
     steps.begin(f"1/5  A scene: a walled court, seen by {SCENE['views_per_court']} cameras")
-    flags = [word for name, value in SCENE.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    steps.run("synth", [*_abcd("synth"), str(scene), *flags, "--overwrite"])
+    flags = [word for name, value in SCENE.items() for word in (f"--{name.replace('_', '-')}", value)]
+    steps.run("synth", [*_abcd("synth"), scene, *flags, "--overwrite"])
     steps.begin(f"2/5  Training in {blocks} blocks for {seconds:g} s")
     began = steps.seconds
-    config, peak = _train(steps, out, scene, seconds, blocks)
+    run, peak = _train(steps, out, scene, seconds, blocks)
     trained = steps.seconds - began
-    steps.begin("3/5  Held-out views: scores and pictures")
-    scores = _evaluate(steps, out, config)
+    load = ["--load-config", run / "config.yml"]
+    steps.begin("3/5  Scores and pictures of held-out views")
+    found = out / "eval" / "results.json"
+    evaluate = [*load, "--output-path", found, "--render-output-path", found.parent]
+    steps.run("ns-eval", [_tool("ns-eval"), *evaluate])
+    scores = json.loads(found.read_text(encoding="utf-8"))["results"]
     steps.begin("4/5  Export for other viewers")
-    ply = out / "splat.ply"
-    export = [_tool("ns-export"), "gaussian-splat", "--load-config", str(config)]
-    steps.run("ns-export", [*export, "--output-dir", str(out), "--output-filename", ply.name])
-    pairs = _pairs(out)
-    how = f"{blocks} blocks, {seconds:g} s of training on this machine"
-    pictures = [_draw_closing(out, pairs, how), *_draw(out, pairs)]
+    export = [*load, "--output-dir", out, "--output-filename", ply.name]
+    steps.run("ns-export", [_tool("ns-export"), "gaussian-splat", *export])
     steps.begin("5/5  A report about the run")
-    page = out / "report.html"
-    where = ["--data", str(scene), "--out", str(page)]
-    steps.run("report", [*_abcd("report"), str(config.parent), *where])
+    steps.run("report", [*_abcd("report"), run, "--data", scene, "--out", page])
     steps.begin("Done")
     facts = {
         "held-out PSNR": f"{scores['psnr']:.2f} dB",
@@ -148,17 +135,22 @@ def _carry_out(steps: Steps, out: Path, seconds: float, blocks: int, console: Co
         "Gaussians": f"{_count(ply):,}",
         "peak RAM of training": f"{peak / 2**30:.2f} GiB",
         "time": f"{steps.seconds:.0f} s, training {trained:.0f} s of it",
-        "the picture": str(pictures[0]),
-        "with its errors": "\n".join(map(str, pictures[1:])),
+        "report": str(page),
+        "photo | rendering": str(_closing_picture(out)),
         "Gaussians for viewers": str(ply),
-        "all about the run": str(page),
     }
     print_facts(facts, console)
-    _print_next(config, console)
+    console.print("\nNext:", highlight=False)
+    for command, what in {
+        f"ns-viewer --load-config {run / 'config.yml'}": "look around in it",
+        f"abcd compare --data {scene} --seconds 60 --blocks 4 --out comparison": "compare with one block",
+        "ns-train abcd --data FOLDER": "train on your own photographs (a COLMAP model or transforms.json)",
+    }.items():
+        print_plain(f"  {command}\n      {what}", console)
 
 
 def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) -> tuple[Path, int]:
-    """The run's config.yml, by which nerfstudio's other commands find it, and its peak RAM in bytes."""
+    """The run's folder, and the most RAM, in bytes, that a child of this process has taken so far."""
     stamp = time.strftime("%Y-%m-%d_%H%M%S")
     words = ["abcd", "--data", scene.resolve(), "--output-dir", out / "training", "--experiment-name", "demo"]
     words += ["--timestamp", stamp, "--vis", "tensorboard", "--viewer.quit-on-train-completion", True]
@@ -166,54 +158,28 @@ def _train(steps: Steps, out: Path, scene: Path, seconds: float, blocks: int) ->
     # The seconds end the run; evaluations meanwhile would only make the demo longer.
     words += ["--max-num-iterations", 10**9, "--steps-per-save", 10**9]
     words += ["--steps-per-eval-image", 0, "--steps-per-eval-all-images", 0]
-    peak = steps.run("ns-train", [_tool("ns-train"), *map(str, words)], quiet=False)
-    return out / "training" / "demo" / "abcd" / stamp / "config.yml", peak
+    steps.run("ns-train", [_tool("ns-train"), *words], quiet=False)
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    # In KiB, but on macOS.
+    return out / "training" / "demo" / "abcd" / stamp, peak * (1 if sys.platform == "darwin" else 1024)
 
 
-def _evaluate(steps: Steps, out: Path, config: Path) -> dict[str, float]:
-    """Mean scores of the held-out views; ns-eval leaves their pictures in `out`/eval."""
-    found = out / "eval" / "results.json"
-    words = ["--load-config", config, "--output-path", found, "--render-output-path", found.parent]
-    steps.run("ns-eval", [_tool("ns-eval"), *map(str, words)])
-    return json.loads(found.read_text(encoding="utf-8"))["results"]
+def _closing_picture(out: Path) -> Path:
+    """The held-out view of median PSNR, enlarged. ns-eval leaves photo and rendering side by side."""
 
+    def psnr(pair: Path) -> float:
+        both = read_picture(pair)
+        return psnr_of(both[:, : both.shape[1] // 2], both[:, both.shape[1] // 2 :])
 
-def _pairs(out: Path) -> list[Pair]:
-    """Photo and rendering of each held-out view, which ns-eval leaves side by side."""
-    wide = [read_picture(path) for path in sorted((out / "eval").glob("eval_img_*.png"))]
-    return [(pair[:, : pair.shape[1] // 2], pair[:, pair.shape[1] // 2 :]) for pair in wide]
-
-
-def _draw_closing(out: Path, pairs: Sequence[Pair], how: str) -> Path:
-    """A view of average quality, large: neither the best nor the worst."""
-    pairs = sorted(pairs, key=lambda pair: psnr_of(*pair))
-    photo, picture = pairs[len(pairs) // 2]
-    captions = ("photo, held out from training", f"{how}: {psnr_of(picture, photo):.1f} dB")
-    height = CLOSING_INCHES * photo.shape[0] / photo.shape[1]
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(2 * CLOSING_INCHES, height + 0.35), layout="constrained")
-        for axes, pixels, caption in zip(figure.subplots(1, 2), (photo, picture), captions, strict=True):
-            axes.imshow(pixels, interpolation="bicubic")
-            axes.set_title(caption, fontsize=12)
-            axes.axis("off")
-        figure.savefig(out / CLOSING, dpi=150)
-    return out / CLOSING
-
-
-def _draw(out: Path, pairs: Sequence[Pair]) -> list[Path]:
-    """Photo, picture and error of a few held-out views."""
-    folder = out / "pictures"
-    folder.mkdir(exist_ok=True)
-    paths = []
-    for row in evenly(range(len(pairs)), SHOWN):
-        photo, picture = pairs[row]
-        paths.append(folder / f"view-{row:04d}.png")
-        draw_comparison(photo, {"abcd": picture}, f"held-out view {row}", paths[-1])
-    return paths
+    pairs = sorted((out / "eval").glob("eval_img_*.png"), key=psnr)
+    with Image.open(pairs[len(pairs) // 2]) as image:
+        size = ENLARGED * image.width, ENLARGED * image.height
+        image.resize(size, Image.Resampling.BICUBIC).save(path := out / "court.png")
+    return path
 
 
 def _count(ply: Path) -> int:
-    """How many Gaussians the file that was exported says, in its header, that it holds."""
+    """How many Gaussians the header of the exported file names."""
     with open(ply, "rb") as file:
         return int(re.search(rb"^element vertex (\d+)$", file.read(1024), re.MULTILINE)[1])
 
@@ -229,18 +195,3 @@ def _tool(name: str) -> str:
 def _abcd(command: str) -> list[str]:
     """A command of ours, in the environment of this one."""
     return [sys.executable, "-m", "abcd_ns.cli.main", command]
-
-
-def _print_next(config: Path, console: Console) -> None:
-    scene = config.parents[4] / "scene"
-    commands = {
-        f"ns-viewer --load-config {config}": "look around in it",
-        f"abcd report {config.parent} --data {scene}": "a page about any run, such as this one's report.html",
-        f"abcd compare --data {scene} --seconds 60 --blocks 4 --out comparison": (
-            "hold it against training in one piece"
-        ),
-        "ns-train abcd --data FOLDER": "train on your own photographs (a COLMAP model or transforms.json)",
-    }
-    console.print("\nNext:", highlight=False)
-    for command, what in commands.items():
-        print_plain(f"  {command}\n      {what}", console)

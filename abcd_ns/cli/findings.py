@@ -1,7 +1,7 @@
 """What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do; --json."""
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ STYLES: dict[Level, str] = {"error": "bold red", "warning": "yellow", "note": "c
 SHOWN = 20
 """Findings of one level that are printed; the others are counted."""
 WIDEST = 110
-"""Columns beyond which text is wrapped even where the terminal has more."""
+"""Columns at which text is wrapped at the latest."""
 
 
 @dataclass(frozen=True)
@@ -30,21 +30,50 @@ class Finding:
     level: Level
     """error: nothing can come of it. warning: it may go wrong. note: good to know."""
     name: str
-    """By which docs/troubleshooting.md explains it; stable."""
+    """Its heading in docs/troubleshooting.md; stable."""
     what: str
-    """What was found and what follows from it, in one or two sentences."""
+    """What was found and what follows from it."""
     fix: str = ""
-    """What to do about it; empty where `what` says so, or where there is nothing to be done."""
+    """What to do about it; empty where there is nothing to be done."""
 
 
-error, warning, note = partial(Finding, "error"), partial(Finding, "warning"), partial(Finding, "note")
-"""A finding of that level."""
+@dataclass(frozen=True)
+class Rule:
+    """How a finding is found, and in which words it is told."""
+
+    level: Level
+    name: str
+    look: Callable[[Any], Any]
+    """Takes all that is known, and returns values for the texts: a mapping, a list of mappings for several
+    findings, or anything true where the texts need none. What is false makes no finding."""
+    what: str
+    """With fields of the values; `f` is all that is known."""
+    fix: str = ""
+
+    def findings(self, known: Any) -> list[Finding]:
+        """Those of this rule."""
+        found = self.look(known) or []
+        values = [{"f": known, **(v if isinstance(v, Mapping) else {})} for v in _listed(found)]
+        return [Finding(self.level, self.name, self.what.format(**v), self.fix.format(**v)) for v in values]
 
 
-def by_level(findings: Iterable[Finding]) -> list[Finding]:
+def _listed(found: Any) -> list[Any]:
+    return found if isinstance(found, list) else [found]
+
+
+error, warning, note = partial(Rule, "error"), partial(Rule, "warning"), partial(Rule, "note")
+"""A rule whose findings are of that level."""
+
+
+def judge(rules: Iterable[Rule], known: Any) -> list[Finding]:
+    """All that the rules find."""
+    return [finding for rule in rules for finding in rule.findings(known)]
+
+
+def by_level(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """The most serious first, otherwise in their order."""
     order = list(STYLES)
-    return sorted(findings, key=lambda finding: order.index(finding.level))
+    return tuple(sorted(findings, key=lambda finding: order.index(finding.level)))
 
 
 def print_findings(findings: Sequence[Finding], console: Console) -> None:
@@ -76,7 +105,7 @@ def _print(finding: Finding, console: Console) -> None:
 
 
 def check_json(path: Path | None) -> None:
-    """Whether a report could be written: refused before any work where it could not.
+    """Refuse, before any work, a file that could not be written.
 
     Raises:
         UserError: `path` is a folder, or lies in none.

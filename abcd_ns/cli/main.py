@@ -1,4 +1,4 @@
-"""The `abcd` command: finds the subcommand asked for, and imports nothing else."""
+"""The `abcd` command: imports the subcommand that is called, and nothing else."""
 
 import difflib
 import importlib
@@ -25,10 +25,10 @@ class Command(NamedTuple):
     target: str
     help: str
     hands_on: bool = False
-    """The function takes the words as they are, and reads or hands them on by itself."""
+    """The function takes the words as they are."""
 
     def load(self) -> Callable[..., int | None]:
-        """Import the function. This is where the seconds go (torch, nerfstudio), so only on use."""
+        """Import the function, which takes seconds (torch, nerfstudio)."""
         module, function = self.target.split(":")
         return getattr(importlib.import_module(module), function)
 
@@ -57,33 +57,25 @@ COMMANDS = (
     Command("completion", "abcd_ns.cli.completion:completion", "complete words of this command in a shell"),
 )
 
-EXAMPLES = (
-    ("abcd demo", "see it work, without a GPU or any data"),
-    ("abcd synth --help", "the options of one command"),
-    ("abcd check --data garden", "see whether your own photographs can be trained on"),
-    ("ns-train abcd --data garden", "train on them"),
-)
+EXAMPLES = {
+    "abcd demo": "see it work, without a GPU or any data",
+    "abcd synth --help": "the options of one command",
+    "abcd check --data garden": "see whether your own photographs can be trained on",
+    "ns-train abcd --data garden": "train on them",
+}
 
 
 def help_text() -> str:
     """The text of `abcd --help`."""
-    width = max(len(name) for name in ("--version", *(c.name for c in COMMANDS))) + 2
-    example_width = max(len(example) for example, _ in EXAMPLES) + 2
+    options = {"--help": "show this text; after a command, its options", "--version": "show the version"}
     return "\n".join(
         [
-            "usage: abcd COMMAND [OPTIONS]",
-            "",
-            "Gaussian splatting, one block at a time.",
-            "",
-            "commands:",
-            *(f"  {c.name:<{width}}{c.help}" for c in COMMANDS),
-            "",
-            "options:",
-            f"  {'--help':<{width}}show this text; after a command, its options",
-            f"  {'--version':<{width}}show the version",
-            "",
-            "examples:",
-            *(f"  {example:<{example_width}}{what}" for example, what in EXAMPLES),
+            "usage: abcd COMMAND [OPTIONS]\n\nGaussian splatting, one block at a time.\n\ncommands:",
+            *(f"  {command.name:<12}{command.help}" for command in COMMANDS),
+            "\noptions:",
+            *(f"  {name:<12}{what}" for name, what in options.items()),
+            "\nexamples:",
+            *(f"  {example:<30}{what}" for example, what in EXAMPLES.items()),
         ]
     )
 

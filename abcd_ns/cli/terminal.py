@@ -1,4 +1,4 @@
-"""Text for people: lists and counts in sentences, and what the terminal shows as it is."""
+"""Text for the terminal: lists and counts in sentences, facts in two columns, and plain lines."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,12 +11,12 @@ NAMED = 3
 
 
 def print_plain(text: str, console: Console, style: str | None = None) -> None:
-    """Without markup and colours, as names of files may look like it, and not wrapped, to be copied."""
+    """Print without markup and wrapping: names of files may look like markup, and are copied."""
     console.print(text, style=style, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def print_facts(facts: Mapping[str, str], console: Console) -> None:
-    """Two columns: what is told of, and what is told of it."""
+    """Print names and values in two columns."""
     table = Table.grid(padding=(0, 2))
     for name, value in facts.items():
         table.add_row(Text(name), Text(value))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from abcd_ns.cli.findings import Finding, print_findings
+from abcd_ns.cli.findings import Finding, Rule, by_level, judge, print_findings
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = (ROOT / "docs/troubleshooting.md").read_text()
@@ -23,9 +23,11 @@ def printed(*findings: Finding, width: int = 80) -> list[str]:
 
 
 def test_groups_are_titled_and_the_most_serious_comes_first():
-    lines = printed(
-        Finding("note", "n", "Nice."), Finding("error", "e", "Bad."), Finding("note", "m", "Too.")
+    found = by_level(
+        [Finding("note", "n", "Nice."), Finding("error", "e", "Bad."), Finding("note", "m", "Too.")]
     )
+    lines = printed(*found)
+    assert [finding.name for finding in found] == ["e", "n", "m"]
     assert lines == ["", "error", "  e: Bad.", "", "notes (2)", "  n: Nice.", "  m: Too."]
 
 
@@ -40,6 +42,26 @@ def test_text_is_wrapped_and_errors_are_not():
 def test_names_of_files_are_no_markup():
     name = "[red]a.png[/red] :smile:"
     assert printed(Finding("note", "n", name))[-1] == f"  n: {name}"
+
+
+def test_a_rule_finds_nothing_one_thing_or_several():
+    facts = {"broken": ["a", "b"], "free": 3}
+    rules = [
+        Rule(
+            "error",
+            "broken",
+            lambda f: [{"who": who} for who in f["broken"]],
+            "{who} is broken.",
+            "Mend {who}.",
+        ),
+        Rule("note", "free", lambda f: f["free"] < 9, "Free: {f[free]}."),
+        Rule("note", "never", lambda f: f["free"] > 9 and {"free": 0}, "Free: {free}."),
+    ]
+    assert judge(rules, facts) == [
+        Finding("error", "broken", "a is broken.", "Mend a."),
+        Finding("error", "broken", "b is broken.", "Mend b."),
+        Finding("note", "free", "Free: 3."),
+    ]
 
 
 def names_in_code() -> set[str]:

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from rich.console import Console
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from abcd_ns.cli.poses import command, mapping
@@ -147,4 +148,4 @@ def test_what_phones_write_and_nothing_reads_is_told(tmp_path, monkeypatch, caps
 def test_a_process_that_dies_is_an_error_and_not_a_wait(tmp_path):
     task = mapping.Task(tmp_path / "nowhere", ("a.png",), tmp_path, "OPENCV", True, "any")
     with pytest.raises(UserError):
-        mapping.find_poses(task, lambda *_: None)
+        mapping.find_poses(task, Console(quiet=True))

@@ -1,4 +1,4 @@
 """`abcd check`: what training would refuse, and what is readable but doubtful.
 
-`survey` reads all there is, `about_*` find fault with photos, cameras and points, `command` tells.
+`survey` reads all there is, `rules` find fault with it.
 """

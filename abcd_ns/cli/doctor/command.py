@@ -1,26 +1,30 @@
 """`abcd doctor`: what this machine and environment are, whether they can train, and what to do where not."""
 
-from collections.abc import Iterator
+import json as json_text
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
-from abcd_ns.cli.doctor import findings
-from abcd_ns.cli.doctor.facts import Facts, gather, without_home
+from abcd_ns.cli.doctor.facts import Facts, gather
 from abcd_ns.cli.doctor.hardware import Hardware
 from abcd_ns.cli.doctor.kernels import Kernels
-from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
+from abcd_ns.cli.doctor.packages import VERSIONS
+from abcd_ns.cli.doctor.rules import RULES
+from abcd_ns.cli.findings import Finding, by_level, check_json, judge, print_findings, write_report
 from abcd_ns.cli.terminal import many, print_plain
+from abcd_ns.lab.results.records import decode, encode
+from abcd_ns.machine import without_home
 from abcd_ns.units import bytes_in_words
 
 SCHEMA = 1
 """Of the JSON file; changes with its fields."""
 CANNOT_TRAIN = 1
 """Exit code where something makes training impossible."""
-UNKNOWN = "unknown, as torch does not start"
 MAIN = ("torch", "nerfstudio", "gsplat", "viser")
 """Packages whose versions are always shown."""
+DETAILS = {*VERSIONS, "OS", "driver", "torch's CUDA", "compilers", "LPIPS"}
+"""Rows that only --verbose shows."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +38,14 @@ class Report:
 
 
 def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
-    """Look at this machine and environment: versions, hardware, compiled kernels; and say what to mend.
+    """Look at this machine and environment: versions, hardware, compiled kernels; and say what to fix.
 
     Compiles nothing, and writes nothing unless --json is given. What it prints is fit to be copied into an
     issue: it names no user and no folder of theirs. The exit code is 1 if training cannot work, else 0.
 
     Args:
         json: Also write all that was found into this file.
-        verbose: Show all of it here too, notes on what works as it is included.
+        verbose: Show all of it here too, notes included.
 
     Raises:
         UserError: the JSON file cannot be written.
@@ -49,12 +53,14 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     check_json(json)
     report = diagnose(gather())
     console = Console()
-    for line in _lines(report.facts, verbose):
-        print_plain(line, console)
+    rows = {name: value for name, value in _rows(report.facts).items() if verbose or name not in DETAILS}
+    width = max(map(len, rows))
+    for name, value in rows.items():
+        print_plain(f"{name:<{width}}  {value}", console)
     shown = [finding for finding in report.findings if verbose or finding.level != "note"]
     print_findings(shown, console)
     ill = any(finding.level == "error" for finding in report.findings)
-    verdict = "Training cannot work here yet: mend the errors." if ill else "Training can work here."
+    verdict = "Training cannot work here yet: fix the errors." if ill else "Training can work here."
     if not verbose:
         left = len(report.findings) - len(shown)
         notes = f" and {many(left, 'note', 'notes')}" if left else ""
@@ -66,75 +72,55 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
 
 def diagnose(facts: Facts) -> Report:
     """What follows from the facts."""
-    found = [finding for look in findings.ALL for finding in look(facts)]
-    return without_home(Report(SCHEMA, facts, tuple(by_level(found))))
+    report = Report(SCHEMA, facts, by_level(judge(RULES, facts)))
+    return decode(Report, json_text.loads(without_home(json_text.dumps(encode(report)))), "the report")
 
 
-def _lines(facts: Facts, verbose: bool) -> Iterator[str]:
-    packages = facts.packages
+def _rows(facts: Facts) -> dict[str, str]:
+    """All there is to show."""
+    packages, hardware, kernels = facts.packages, facts.hardware, facts.kernels
     number, plus, changes = (packages.commit or "").partition("+")
     commit = f", commit {number[:10]}{plus}{changes}" if number else ""
-    rows = {"abcd_ns": f"{packages.abcd_ns}{commit}; Python {packages.python}"}
-    named = packages.versions if verbose else MAIN
-    versions = {name: packages.versions.get(name) or "not installed" for name in named}
-    rows |= (
-        versions if verbose else {"packages": ", ".join(f"{n} {version}" for n, version in versions.items())}
-    )
-    rows |= _hardware(facts.hardware, verbose) if facts.hardware else {"machine": UNKNOWN}
-    if facts.hardware:
-        rows["workers"] = _workers(facts.hardware, packages.ray)
-    if facts.kernels is None:
-        rows["kernels"] = "unknown, as packages do not start"
-    else:
-        rows |= _kernels(facts.kernels, verbose or bool(facts.hardware and facts.hardware.gpu), verbose)
-    width = max(map(len, rows))
-    for name, value in rows.items():
-        yield f"{name:<{width}}  {value}"
+    versions = {name: version or "not installed" for name, version in packages.versions.items()}
+    rows = {
+        "abcd_ns": f"{packages.abcd_ns}{commit}; Python {packages.python}",
+        "packages": ", ".join(f"{name} {versions.get(name)}" for name in MAIN),
+        **{name: version for name, version in versions.items() if name not in MAIN},
+    }
+    rows |= _hardware(hardware, packages.ray) if hardware else {"machine": "unknown, as torch does not start"}
+    return rows | (_kernels(kernels) if kernels else {"kernels": "unknown, as packages do not start"})
 
 
-def _hardware(hardware: Hardware, verbose: bool) -> dict[str, str]:
+def _hardware(hardware: Hardware, ray: str | None) -> dict[str, str]:
     gpu, device = hardware.gpu, "none: training runs on the CPU, which is meant for small pictures"
+    most, workers = hardware.cores, f"up to {hardware.cores}, one for each core, for two blocks each"
     if gpu is not None:
         device = f"{gpu.name}, {bytes_in_words(gpu.memory_bytes)}, capability {gpu.capability}"
-    rows = {
+        how = f"by Ray {ray}" if ray else "after pip install 'abcd-ns[cluster]'"
+        most, workers = hardware.gpus, f"up to {hardware.gpus}, one for each GPU: --pipeline.workers, {how}"
+    return {
         "GPU": device,
         "CPU": f"{hardware.cpu}, {hardware.cores} cores",
         "RAM": f"{bytes_in_words(hardware.ram_bytes)}, {bytes_in_words(hardware.ram_free_bytes)} free",
         "disk": f"{bytes_in_words(hardware.disk_free_bytes)} free",
+        "OS": hardware.os,
+        "driver": hardware.driver or "none",
+        "torch's CUDA": hardware.torch_cuda or "none",
+        "workers": workers if most > 1 else f"none here: one {'GPU' if gpu else 'core'}",
     }
-    if verbose:
-        rows |= {"OS": hardware.os, "driver": hardware.driver or "none"}
-        rows |= {"torch's CUDA": hardware.torch_cuda or "none"}
-    return rows
 
 
-def _workers(hardware: Hardware, ray: str | None) -> str:
-    """How many blocks could be trained at once."""
-    most, of = (hardware.gpus, "GPU") if hardware.gpu else (hardware.cores, "core")
-    if most < 2:
-        return f"none here: one {of}"
-    if not hardware.gpu:
-        return f"up to {most}, one for each core, where a scene has two blocks for each"
-    said = f"up to {most}, one for each {of}: --pipeline.workers"
-    return f"{said}, by Ray {ray}" if ray else f"{said}, after pip install 'abcd-ns[cluster]'"
-
-
-def _kernels(kernels: Kernels, on_gpu: bool, verbose: bool) -> dict[str, str]:
-    compilers = (
+def _kernels(kernels: Kernels) -> dict[str, str]:
+    checks = [f"{name} differs by {error:.0e}" for name, error in kernels.self_check.items()]
+    tools = (
         kernels.compiler or "no C++ compiler",
         f"nvcc {kernels.nvcc}" if kernels.nvcc else "no nvcc",
         "ninja" if kernels.ninja else "no ninja",
     )
-    checks = [f"{name} differs by {error:.0e}" for name, error in kernels.self_check.items()]
-    checks += [f"{name} FAILED" for name in kernels.failed]
-    built = "compiled" if kernels.built else "not compiled"
-    if not kernels.built and not on_gpu:
-        built += ": the first use compiles it, in some 15 seconds"
-    rows = {"CPU rasterizer": f"{built}, in {kernels.folder}" if verbose else built}
-    if on_gpu:
-        rows["gsplat's"] = kernels.gsplat or "not built: the first training or `abcd plan` compiles them"
-    rows["self-check"] = ", ".join(checks)
-    if verbose:
-        rows["compilers"] = ", ".join(compilers)
-        rows["LPIPS"] = "no weights" if kernels.lpips_missing else "weights are there"
-    return rows
+    return {
+        "CPU rasterizer": f"compiled, in {kernels.folder}" if kernels.built else "first use compiles it",
+        "gsplat's": kernels.gsplat or "not built",
+        "self-check": ", ".join([*checks, *(f"{name} FAILED" for name in kernels.failed)]),
+        "compilers": ", ".join(tools),
+        "LPIPS": "no weights" if kernels.lpips_missing else "weights are there",
+    }

@@ -1,4 +1,4 @@
 """`abcd export`: a trained scene as files for other programs, whole or in parts.
 
-`shown` picks the Gaussians from the blocks at rest; abcd_ns.formats writes them.
+`shown` picks the Gaussians from the stored blocks; abcd_ns.formats writes them.
 """

@@ -24,9 +24,9 @@ from abcd_ns.formats.scene_file import PACKED, rounding, suffix_of, write_scene
 from abcd_ns.nerfstudio.run import STATE, STORE
 
 TRANSFORMS = "dataparser_transforms.json"
-"""nerfstudio's file that tells how the data's frame became the run's."""
+"""nerfstudio's file with the transform from the data's frame to the run's."""
 LOST_DIGITS = 1e-4
-"""A rounding error that is worth a word: this share of the scene's size."""
+"""Rounding errors above this share of the scene's size are printed."""
 FAR_AWAY = ": the data's origin is far away. --frame nerfstudio keeps all digits."
 
 
@@ -48,8 +48,9 @@ def export(
     The suffix of --out is the format. .ply is read everywhere and loses nothing; .spz, .sog and
     .compressed.ply are for the web, and 4 to 15 times smaller; .glb is glTF with KHR_gaussian_splatting.
 
-    Reads the blocks at rest; .ply and .glb are written block by block, so that no scene is too large.
-    Also of a run that was stopped or killed. Gaussians too transparent for any rasterizer are left out.
+    Reads the blocks that a run stored, also those of a run that was stopped or killed. .ply and .glb are
+    written block by block, so that no scene is too large. Gaussians too transparent for any rasterizer are
+    left out.
 
     Args:
         run: A run's folder, outputs/SCENE/METHOD/TIME, or its config.yml.
@@ -95,7 +96,7 @@ def to_data(run: Path) -> Frame:
     """From the run's frame back to that of the data.
 
     Raises:
-        UserError: the file that tells is not there, or is none.
+        UserError: the file is missing or damaged.
     """
     path = run / TRANSFORMS
     try:
@@ -161,7 +162,7 @@ def _report(written: Sequence[Path], counts: dict[int, int], scene: Shown, suffi
 
 
 def tell_rounding(suffix: str, largest: float, size: float) -> None:
-    """Say by how much positions are off, where it is worth a word.
+    """Print by how much positions are off, where that is more than LOST_DIGITS.
 
     Args:
         largest: of all coordinates.

@@ -82,8 +82,7 @@ class Shown:
         return found if self.to is None else self.to.gaussians(found)
 
     def _load(self, block: int, names: tuple[str, ...]) -> dict[str, Tensor]:
-        """These parameters, the means among them, of the block and of those that left others for it, but for
-        those that nobody sees yet."""
+        """These parameters, the means among them, of the block's active Gaussians and of pending migrants."""
         found = self._columns(block, names)
         seen = ~found.pop(WAITS)
         found = {name: value[seen] for name, value in found.items()}

@@ -41,7 +41,7 @@ VOXEL_PIXELS = 2.0
 """The side of a voxel by default, in pixels as wide as most are where they meet the surface."""
 STAY = Frame(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), 1.0)
 MANY = 0.01
-"""Share of the pixels that may be left out without a word."""
+"""Share of the pixels that may be left out without a warning."""
 
 
 def mesh(
@@ -59,8 +59,8 @@ def mesh(
 
     abcd mesh outputs/garden/abcd/TIME --data garden --out garden.ply
 
-    Draws the depth of every training view from the blocks at rest, and fuses them on a grid of voxels, one
-    part of space after the other: RAM holds a part, and the mesh.
+    Renders the depth of every training view from the stored blocks, and fuses the depths on a grid of voxels,
+    one part of space after the other. RAM holds one part and the mesh.
 
     Args:
         run: A run's folder, outputs/SCENE/METHOD/TIME.
@@ -72,8 +72,8 @@ def mesh(
         box: Only what lies in this box, in the coordinates of `frame`.
         frame: "data" is that of the photos' poses, as COLMAP or transforms.json have them, with its scale;
             "nerfstudio" is that of the run, its viewer and `ns-export`.
-        depth: Of a pixel: "median" is where half of it is covered, "expected" the mean of what it shows,
-            which a little that floats before a wall moves off the wall.
+        depth: Of a pixel. "median" is where half of it is covered. "expected" is the mean, which floaters in
+            front of a wall move off the wall.
 
     Raises:
         UserError: there is no run, it has nothing to show yet, the data is not the run's, there is no
@@ -96,7 +96,7 @@ def mesh(
 
 @dataclass(frozen=True)
 class Wanted:
-    """What `mesh` is asked for."""
+    """The options of `mesh`."""
 
     out: Path
     voxel: float | None
@@ -131,7 +131,7 @@ def _check(out: Path, voxel: float | None, box: Box | None) -> None:
 def _surface(
     painter: Painter, settings: PaintSettings, views: list[View], wanted: Wanted
 ) -> tuple[Piece, float]:
-    """The mesh in the frame that is asked for, and the side of its voxels there."""
+    """The mesh in the frame of the options, and the side of its voxels there."""
     from abcd_ns.cli.mesh.fusion import FAR, Fusion  # imports open3d
 
     with tempfile.TemporaryDirectory(prefix=".abcd-mesh-", dir=wanted.out.absolute().parent) as folder:
@@ -157,8 +157,7 @@ def _surface(
 
 
 def _seen(store: ParameterStore, config: AbcdPipelineConfig) -> tuple[Painter, PaintSettings, list[View]]:
-    """What draws the scene, and its training views. Where these were refined is of no account: the depth
-    that they see is the scene's, wherever they stand."""
+    """What renders the scene, and its training views, as posed in the data."""
     check_trained(store)
     mirror(config.training, config.model)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -46,7 +46,7 @@ class Wanted:
     """What a run is to be like."""
 
     blocks: Number = 0
-    """number of blocks; 0 takes as few as the device's budget allows."""
+    """number of blocks; 0 takes as few as the device's budget permits."""
     device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GiB")] = 0.0
     """memory of the device that training may take; 0 takes 0.9 of what is free on a GPU, or a quarter of
     the RAM on a CPU, as in training."""
@@ -78,9 +78,9 @@ def plan(
 
     Args:
         data: the scene, as for `ns-train abcd --data`.
-        wanted: what the run is to be like.
+        wanted: options of the run.
         downscale: divides the photos' width and height; left out, no side is over 1600 px, as in training.
-        verbose: show what takes the room, and how points and views are spread over the blocks.
+        verbose: show what takes the memory, and how points and views are spread over the blocks.
 
     Returns:
         0; 1 if something would not fit.
@@ -221,7 +221,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     for line in found.warnings:
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
     if not (found.warnings or verbose):
-        console.print("\nAll of it fits. What takes the room: abcd plan --verbose", highlight=False)
+        console.print("\nAll of it fits. What takes the memory: abcd plan --verbose", highlight=False)
 
 
 def _hours(hours: float) -> str:

@@ -30,7 +30,7 @@ PLACES = {
     "RAM": ("of RAM", "are free", "limit the scene by --max-gaussians, or free memory"),
     "disk": ("of disk", "are free in this folder", "use `ns-train --output-dir` on another disk"),
 }
-"""Where room is taken, and in which words it is said where there is not enough, with what to do about it."""
+"""Where memory is needed, and the words for a lack of it, with the fix."""
 LAYERS_BY_STEPS = 0.15
 """Time for layers by the time of steps: they take 10 to 18% of runs on a CPU (docs/results)."""
 
@@ -82,7 +82,7 @@ class Forecast:
 
 
 def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple[int, ...]:
-    """By block, how many views have one of its points in the picture.
+    """By block, the number of views that have one of its points in the picture.
 
     Args:
         points: [n, 3], world space.
@@ -115,7 +115,7 @@ def _largest(fit: Fit) -> int:
 
 
 def sent_shares(fit: Fit, needs: DeviceNeeds) -> Shares:
-    """What a visit by a worker moves: at most, for a machine keeps what it was sent until it changes."""
+    """What a visit by a worker moves at most: a machine caches what it was sent until that changes."""
     block = _largest(fit) * needs.parameter_bytes
     return {
         "its block, with the optimiser's state, there and back": 2 * STATES * block,
@@ -128,8 +128,8 @@ def ram_shares(fit: Fit, needs: DeviceNeeds, photo_bytes: int, workers: int) -> 
     scene = fit.gaussians * needs.parameter_bytes
     out = 2 * SLACK * workers * STATES * _largest(fit) * needs.parameter_bytes
     shares = RamShares.of(0)
-    lent = {"blocks that are out, there and back, and those around them": out + scene}
-    return (lent if workers > 1 else {}) | {
+    sent = {"blocks in flight, there and back, and those around them": out + scene}
+    return (sent if workers > 1 else {}) | {
         "decoded photos": min(photo_bytes, shares.photos),
         "frozen blocks": min(scene, shares.blocks),
         "the whole scene, while a checkpoint is written": scene,

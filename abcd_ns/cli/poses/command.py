@@ -9,11 +9,10 @@ from typing import Annotated
 
 import pycolmap
 import tyro
-from rich import progress
 from rich.console import Console
 
-from abcd_ns.cli.poses.mapping import FEATURES, MATCHES, POSES, Model, Order, Task, find_poses
-from abcd_ns.cli.terminal import print_plain
+from abcd_ns.cli.poses.mapping import Model, Order, Task, find_poses
+from abcd_ns.cli.terminal import few, print_plain
 from abcd_ns.data.input_errors import Problems
 from abcd_ns.data.picture_files import SUFFIXES, UNREAD, check_complete, read_header
 from abcd_ns.errors import UserError
@@ -24,9 +23,6 @@ FEWEST = 3
 """Photos."""
 MANY = 400
 """With more photos, comparing each with each takes hours."""
-NAMED = 5
-"""Photos without a pose that are named."""
-WORDS = {FEATURES: "looking for features", MATCHES: "comparing photos", POSES: "finding poses"}
 
 
 def poses(
@@ -44,23 +40,21 @@ def poses(
 
     The photos are in DATA/images. Writes a COLMAP model to DATA/sparse/0, by pycolmap; then
     `ns-train abcd --data DATA` trains. Photos should overlap by two thirds, be sharp, and show nothing that
-    moves. On a CPU 50 photos take minutes; twice as many take four times as long, each being compared with
-    each.
+    moves. On a CPU 50 photos take minutes. Twice as many take four times as long.
 
     Args:
         data: Folder of the scene.
         order: "any" compares each photo with each; "video" with those that follow by name, for many photos.
         lens: COLMAP's camera model. OPENCV suits phones and cameras, OPENCV_FISHEYE fisheyes, PINHOLE photos
             without distortion.
-        several_lenses: The photos are of several lenses, or zoomed; taken for granted where their sizes
-            differ.
+        several_lenses: The photos are of several lenses, or zoomed; assumed where their sizes differ.
         seed: Of pycolmap's random choices.
 
     Returns:
         0; 1 if fewer than half of the photos have a pose.
 
     Raises:
-        UserError: there are no photos, a model is there already, or the photos do not fit together.
+        UserError: there are no photos, a model is there already, or no two photos match.
     """
     photos, names, sizes = _photos(data)
     if (data / "sparse").exists():
@@ -71,9 +65,11 @@ def poses(
         print_plain(line, console)
     one_lens = not several_lenses and len(sizes) == 1
     if not several_lenses and not one_lens:
-        console.print(f"Photos of {len(sizes)} sizes: taken for those of several lenses.")
+        console.print(f"Photos of {len(sizes)} sizes: assuming several lenses.")
     if order == "any" and len(names) > MANY:
-        console.print(f"{len(names)} photos: comparing each with each takes long; is it --order video?")
+        console.print(
+            f"{len(names)} photos: comparing each with each takes hours. Use --order video for a video."
+        )
     task = Task(photos, names, data / WORK, lens, one_lens, order, seed)
     return _report(data, names, _model(data, task, console), console)
 
@@ -83,11 +79,11 @@ def _model(data: Path, task: Task, console: Console) -> Model:
     try:
         shutil.rmtree(task.work, ignore_errors=True)
         task.work.mkdir()
-        model = _with_bars(task, console)
+        model = find_poses(task, console)
         if model is None:
             raise UserError(
-                f"No two photos in {task.photos} fit together. They need to overlap, and to be taken from "
-                "different places."
+                f"No two photos in {task.photos} match. They need to overlap, and to be taken from different "
+                "places."
             )
         (data / "sparse").mkdir()
         os.replace(model.folder, data / "sparse" / "0")
@@ -133,42 +129,17 @@ def _check_lens(lens: str) -> None:
         raise UserError(f"--lens {lens} is no camera model of COLMAP's: {known}.")
 
 
-def _with_bars(task: Task, console: Console) -> Model | None:
-    columns = (
-        progress.TextColumn("{task.description:<20}"),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TimeElapsedColumn(),
-        progress.TimeRemainingColumn(),
-    )
-    with progress.Progress(*columns, console=console) as bars:
-        shown = {stage: bars.add_task(words, total=None, start=False) for stage, words in WORDS.items()}
-
-        def show(stage: int, done: int) -> None:
-            for earlier in range(stage):  # it may have ended between two looks
-                total = task.total(earlier)
-                bars.update(shown[earlier], total=total, completed=total)
-            bars.start_task(shown[stage])
-            bars.update(shown[stage], total=task.total(stage), completed=done)
-
-        found = find_poses(task, show)
-        bars.update(shown[POSES], completed=len(found.posed) if found else 0)
-        return found
-
-
 def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) -> int:
-    left_out = sorted(set(names) - set(model.posed))
+    left_out, fewer_than_half = sorted(set(names) - set(model.posed)), 2 * len(model.posed) < len(names)
     lines = [
         f"{len(model.posed)} of {len(names)} photos have a pose, {model.points:,} points, mean error "
         f"{model.error:.2f} px: {data / 'sparse' / '0'}"
     ]
     if left_out:
-        named = ", ".join(left_out[:NAMED]) + (", ..." if len(left_out) > NAMED else "")
-        lines.append(f"Without a pose, and not used: {named}. They show too little of what others show.")
-    few = 2 * len(model.posed) < len(names)
-    if few:
-        lines.append("That is fewer than half. Take photos between those that do not fit, or try --lens.")
+        lines.append(f"Without a pose, and not used: {few(left_out)}. They overlap too little with others.")
+    if fewer_than_half:
+        lines.append("That is fewer than half. Take photos between those that do not match, or try --lens.")
     lines.append(f"Next: ns-train abcd --data {shlex.quote(str(data))}")
     for line in lines:
         print_plain(line, console)
-    return int(few)
+    return int(fewer_than_half)

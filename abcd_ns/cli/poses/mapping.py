@@ -1,8 +1,7 @@
-"""Structure from motion by pycolmap, in a process of its own, step by step."""
+"""Structure from motion by pycolmap, in a process of its own, as pycolmap does not stop at Ctrl-C."""
 
 import multiprocessing
 import sqlite3
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
@@ -11,23 +10,21 @@ from pathlib import Path
 from typing import Literal
 
 import pycolmap
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from abcd_ns.errors import UserError, first_line
 
 ENOUGH = 0.9
-"""Once so large a share of the photos has a pose, no other focal length is tried."""
+"""Once this share of the photos has a pose, no other focal length is tried."""
 FOCAL_FACTORS = (1.2, 0.72, 0.5)
-"""Focal lengths to begin with, by the photo's longer side, where EXIF tells none: COLMAP's own guess, a
-phone's main camera, a wide one. The true one is found from a start that is not too far off."""
+"""Initial focal lengths, by the photo's longer side, where EXIF has none: COLMAP's own guess, a phone's main
+camera, a wide one. Bundle adjustment finds the true one from a start that is not too far off."""
 OVERLAP = 12
-"""Photos of a video are compared with so many that follow, and with some farther on."""
+"""Photos of a video are matched with that many that follow, and with some farther on."""
 SECONDS_BETWEEN_LOOKS = 0.3
 
 Order = Literal["any", "video"]
-FEATURES, MATCHES, POSES = range(3)
-"""What is being done."""
-TABLES = {FEATURES: "images", MATCHES: "matches"}
-"""Of the database: a row for all that a stage has done."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +46,10 @@ class Task:
     def database(self) -> Path:
         return self.work / "database.db"
 
-    def total(self, stage: int) -> int:
-        """What a stage goes through: photos, or the pairs of them that are compared, about."""
-        n = len(self.names)
-        if stage != MATCHES:
-            return n
-        return n * (n - 1) // 2 if self.order == "any" else n * OVERLAP
-
 
 @dataclass(frozen=True)
 class Model:
-    """What came of it; the model itself is in `folder`."""
+    """The model that was found."""
 
     folder: Path
     posed: tuple[str, ...]
@@ -69,28 +59,35 @@ class Model:
     """Mean reprojection error, pixels."""
 
 
-def find_poses(task: Task, show: Callable[[int, int], None]) -> Model | None:
-    """Features, matches and poses; None where no two photos fit together.
-
-    Args:
-        show: is told several times a second what is being done, and how much of its total is.
+def find_poses(task: Task, console: Console) -> Model | None:
+    """Features, matches and poses, with a progress bar each; None where no two photos match.
 
     Raises:
         UserError: pycolmap raised, or its process died; the message is its own.
     """
+    count = len(task.names)
+    pairs = count * (count - 1) // 2 if task.order == "any" else count * OVERLAP
     context = multiprocessing.get_context("spawn")
-    stage, posed = context.Value("i", 0), context.Value("i", 0)
-    pool = ProcessPoolExecutor(1, mp_context=context, initializer=_share, initargs=(stage, posed))
+    posed = context.Value("i", 0)
+    pool = ProcessPoolExecutor(1, mp_context=context, initializer=_share, initargs=(posed,))
+    columns = TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     try:
         found = pool.submit(_work, task)
-        while not wait([found], SECONDS_BETWEEN_LOOKS).done:
-            now = stage.value
-            show(now, posed.value if now == POSES else _rows(task.database, TABLES[now]))
+        with Progress(*columns, console=console) as bars:
+            features = bars.add_task("looking for features", total=count)
+            matches = bars.add_task("comparing photos", total=pairs)
+            poses = bars.add_task("finding poses", total=count)
+            over = False
+            while not over:
+                over = bool(wait([found], SECONDS_BETWEEN_LOOKS).done)
+                bars.update(features, completed=_rows(task.database, "images"))
+                bars.update(matches, completed=_rows(task.database, "matches"))
+                bars.update(poses, completed=posed.value)
         return found.result()
     except (RuntimeError, ValueError, IndexError, OSError) as error:
         raise UserError(f"pycolmap could not find poses: {first_line(error)}.") from error
     finally:
-        for process in multiprocessing.active_children():  # pycolmap does not listen to Ctrl-C
+        for process in multiprocessing.active_children():
             process.kill()
         pool.shutdown()
 
@@ -104,51 +101,40 @@ def _rows(database: Path, table: str) -> int:
         return 0
 
 
-_shared: list[Synchronized] = []
-"""Of the process: the stage, and the photos that have a pose in it."""
-
-
-def _share(stage: Synchronized, posed: Synchronized) -> None:
+def _share(posed: Synchronized) -> None:
+    """Begin the process: `posed` counts the photos that have a pose."""
+    global _posed
+    _posed = posed
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    _shared[:] = [stage, posed]
 
 
 def _work(task: Task) -> Model | None:
-    """What the process does."""
-    stage, posed = _shared
+    """What the process does: the model with most photos, over the initial focal lengths."""
     pycolmap.set_random_seed(task.seed)
-    mode = pycolmap.CameraMode.SINGLE if task.one_lens else pycolmap.CameraMode.AUTO
-    reader = pycolmap.ImageReaderOptions(camera_model=task.lens)
     pycolmap.extract_features(
-        task.database, task.photos, image_names=list(task.names), camera_mode=mode, reader_options=reader
+        task.database,
+        task.photos,
+        image_names=list(task.names),
+        camera_mode=pycolmap.CameraMode.SINGLE if task.one_lens else pycolmap.CameraMode.AUTO,
+        reader_options=pycolmap.ImageReaderOptions(camera_model=task.lens),
     )
-    stage.value = MATCHES
     if task.order == "any":
         pycolmap.match_exhaustive(task.database)
     else:
         pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
         pycolmap.match_sequential(task.database, pairing_options=pairing)
-    stage.value = POSES
-    return _best_model(task, posed)
-
-
-def _best_model(task: Task, posed: Synchronized) -> Model | None:
-    """The model of most photos, over the focal lengths to begin with."""
-    best: Model | None = None
+    models = []
     for factor in FOCAL_FACTORS:
-        guessed = _begin_with(task, factor)
-        posed.value = 0
-        found = _map(task, task.work / f"models-{factor:g}", posed)
-        if found is not None and (best is None or len(found.posed) > len(best.posed)):
-            best = found
-        enough = best is not None and len(best.posed) >= ENOUGH * len(task.names)
-        if enough or not guessed:  # another start changes nothing where EXIF tells all focal lengths
+        guessed = _set_focal_lengths(task, factor)
+        models += _map(task, task.work / f"models-{factor:g}")
+        enough = any(len(model.posed) >= ENOUGH * len(task.names) for model in models)
+        if enough or not guessed:  # another start changes nothing where EXIF has all focal lengths
             break
-    return best
+    return max(models, key=lambda model: len(model.posed), default=None)
 
 
-def _begin_with(task: Task, factor: float) -> bool:
-    """Set the focal lengths that EXIF does not tell; whether there are any."""
+def _set_focal_lengths(task: Task, factor: float) -> bool:
+    """Set the focal lengths that EXIF does not have; whether there are any."""
     with pycolmap.Database.open(task.database) as database:
         guessed = [camera for camera in database.read_all_cameras() if not camera.has_prior_focal_length]
         for camera in guessed:
@@ -160,18 +146,23 @@ def _begin_with(task: Task, factor: float) -> bool:
     return bool(guessed)
 
 
-def _map(task: Task, out: Path, posed: Synchronized) -> Model | None:
+def _map(task: Task, out: Path) -> list[Model]:
     def another() -> None:
-        posed.value += 1
+        _posed.value += 1
 
     out.mkdir()
+    _posed.value = 0
     options = pycolmap.IncrementalPipelineOptions(random_seed=task.seed, min_model_size=3)
     options.mapper.random_seed = task.seed
-    models = pycolmap.incremental_mapping(
+    found = pycolmap.incremental_mapping(
         task.database, task.photos, out, options=options, next_image_callback=another
     )
-    if not models:
-        return None
-    number, model = max(models.items(), key=lambda item: (item[1].num_reg_images(), -item[0]))
-    names = tuple(sorted(model.image(i).name for i in model.reg_image_ids()))
-    return Model(out / str(number), names, model.num_points3D(), model.compute_mean_reprojection_error())
+    return [
+        Model(
+            out / str(number),
+            tuple(sorted(model.image(i).name for i in model.reg_image_ids())),
+            model.num_points3D(),
+            model.compute_mean_reprojection_error(),
+        )
+        for number, model in sorted(found.items())
+    ]

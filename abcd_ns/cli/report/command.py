@@ -10,7 +10,6 @@ from rich.console import Console
 from abcd_ns import __version__
 from abcd_ns.cli.report.held_out import look_at_held_out
 from abcd_ns.cli.report.page import GENERATOR, render_page
-from abcd_ns.cli.report.plan import Plan, make_plan
 from abcd_ns.cli.report.run_folder import RunFolder, load_pipeline, open_run
 from abcd_ns.cli.run_path import find_run
 from abcd_ns.cli.terminal import print_plain
@@ -33,17 +32,17 @@ def report(
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None,
     pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 3,
 ) -> int:
-    """Write a page about a training run: quality, visits, memory, held-out views, blocks, settings.
+    """Write a page about a training run: held-out views, quality, memory, visits, blocks, settings.
 
     abcd report outputs/garden/abcd/TIME --data garden
 
-    The page is one file that needs no network and no other file. With --data, held-out views are drawn anew
-    from the newest checkpoint and shown beside their photos.
+    The page is one file that needs no network and no other file. With --data, held-out views are rendered
+    from the newest checkpoint and shown over their photos.
 
     Args:
         run: A run's folder, outputs/SCENE/METHOD/TIME, as `ns-train abcd` leaves it.
-        data: The run's photos, as given to `ns-train`. Where the run says they are is not looked at, since
-            a run from elsewhere could name any folder, and the page would show what is in it.
+        data: The run's photos, as given to `ns-train`. The path in the run is not followed: a run from
+            elsewhere could name any folder, and the page would show its content.
         out: The page. Default: report.html in the run's folder.
         pictures: Held-out views to show, from the best to the worst.
 
@@ -56,13 +55,15 @@ def report(
     _check_page(out)
     console, found = Console(), open_run(folder)
     pipeline, notes = _load(found, data)
-    held_out = None
+    held_out, cameras = None, []
     if pipeline is not None:
+        data_of = pipeline.datamanager
+        cameras = [data_of.train_dataset.cameras, data_of.eval_dataset.cameras]
         try:
             held_out = look_at_held_out(pipeline, pictures, console)
         except UserError as error:  # photos may go missing until they are read
             notes.append(UNDRAWN.format(error))
-    page = render_page(found, held_out, _plan(found, pipeline), notes)
+    page = render_page(found, held_out, cameras, notes)
     try:
         # A file's name may have bytes that are no text.
         out.write_bytes(page.encode("utf-8", "backslashreplace"))
@@ -90,10 +91,9 @@ def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[
     """The trained model, or None and why there is none."""
     notes, version = [], run.settings.versions.abcd_ns
     if version != __version__:
-        theirs = f"The run is of abcd_ns {one_line(version)}"
-        notes.append(f"{theirs}; settings are compared with those of {__version__}.")
+        notes.append(f"The run is of abcd_ns {one_line(version)}; the defaults are those of {__version__}.")
     if run.checkpoint is None:
-        return None, [*notes, "There is no checkpoint yet: held-out views and blocks could not be looked at."]
+        return None, [*notes, "There is no checkpoint yet, and so no held-out views and no map."]
     if run.checkpoint.step < run.story.step:
         notes.append(
             f"Pictures and blocks are those of the checkpoint at step {run.checkpoint.step:,}; the log "
@@ -105,11 +105,3 @@ def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[
         return load_pipeline(run, run.checkpoint, data), notes
     except UserError as error:
         return None, [*notes, UNDRAWN.format(error)]
-
-
-def _plan(run: RunFolder, pipeline: AbcdPipeline | None) -> Plan | None:
-    if run.checkpoint is None:
-        return None
-    data = None if pipeline is None else pipeline.datamanager
-    cameras = [data.train_dataset.cameras, data.eval_dataset.cameras] if data else []
-    return make_plan(run.checkpoint.tree, run.checkpoint.means, cameras)

@@ -1,7 +1,6 @@
 """What a run's options say: those that differ from the defaults, and the command that trains it again."""
 
 import shlex
-from dataclasses import dataclass, replace
 
 from abcd_ns.cli.report.run_folder import default_config
 from abcd_ns.machine import without_home
@@ -27,31 +26,17 @@ TAKEN_OVER = {f"pipeline.model.{name}" for name in MIRRORED}
 """Options that follow others."""
 READER = "pipeline.datamanager.dataparser."
 NO_FLAGS = ("pipeline.training.recipe.", "pipeline.training.limits.")
-"""What these begin is no option of `ns-train`; the method sets it, or the device's memory."""
+"""Prefixes of what is no option of `ns-train`: the method sets it, or the device's memory."""
 
 
-@dataclass(frozen=True)
-class Changed:
-    """An option that is not at its default."""
-
-    name: str
-    value: str
-    default: str
-
-    @property
-    def words(self) -> list[str]:
-        """As on `ns-train`'s command line."""
-        return [f"--{self.name.replace('_', '-')}", self.value]
-
-
-def changed_options(settings: Settings) -> list[Changed]:
-    """Options that differ from this version's defaults; of a method that it has not, none are known."""
+def changed_options(settings: Settings) -> list[tuple[str, str, str]]:
+    """Name, value and default of options that differ from the defaults; none of an unknown method."""
     config = default_config(settings.method, settings.reader)
     if config is None:
         return []
     defaults, passed_over = flat_options(config), ABOUT_THE_PLACE | TAKEN_OVER
     return [
-        Changed(name, as_text(value), as_text(defaults.get(name)))
+        (name, as_text(value), as_text(defaults.get(name)))
         for name, value in settings.options.items()
         if name not in passed_over and (name not in defaults or defaults[name] != value)
     ]
@@ -59,15 +44,20 @@ def changed_options(settings: Settings) -> list[Changed]:
 
 def training_command(settings: Settings) -> str:
     """The command line that trains the run again, an option a line."""
-    changed = [c for c in changed_options(settings) if not c.name.startswith(NO_FLAGS)]
-    # Options of another reader of data stand after its name, without a prefix.
-    readers = () if settings.reader == OUR_READER else tuple(c for c in changed if c.name.startswith(READER))
-    words = [["ns-train", settings.method, "--data", settings.data]]
-    words += [c.words for c in changed if c not in readers]
+    words, of_reader = [["ns-train", settings.method, "--data", settings.data]], []
+    for name, value, _ in changed_options(settings):
+        if settings.reader != OUR_READER and name.startswith(READER):
+            # Options of another reader of data stand after its name, without a prefix.
+            of_reader.append([_flag(name.removeprefix(READER)), value])
+        elif not name.startswith(NO_FLAGS):
+            words.append([_flag(name), value])
     if settings.reader != OUR_READER:
-        words.append([settings.reader])
-    words += [replace(c, name=c.name.removeprefix(READER)).words for c in readers]
+        words += [[settings.reader], *of_reader]
     return " \\\n  ".join(map(shlex.join, words))
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def as_text(value: Plain) -> str:

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pickle import UnpicklingError
@@ -16,7 +15,6 @@ from abcd_ns.cli.report.story import Story, read_story
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore, StoreError
-from abcd_ns.engine.train.density.shedding import WEIGHED
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError, first_line
 from abcd_ns.lab.results.records import read_record
@@ -62,11 +60,9 @@ class RunFolder:
     checkpoint: Checkpoint | None
     """None where the run ended before its first."""
     state: RunState = field(default_factory=RunState)
-    """Where the planner stood at the checkpoint, or else when the run was last heard of."""
-    filled: Mapping[int, float] = field(default_factory=dict)
-    """By block, the pixels that a Gaussian fills in all its views, the median, as known then."""
-    parameters: Mapping[int, int] = field(default_factory=dict)
-    """By block, of how many numbers its Gaussians at rest are, as known then."""
+    """Of the planner at the checkpoint, or else the last that was saved."""
+    parameters: int = 0
+    """Of all Gaussians; 0 where it is not known."""
 
 
 def open_run(path: Path) -> RunFolder:
@@ -92,7 +88,7 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPip
     """The trained model with its data, for drawing.
 
     Args:
-        data: the folder of the photos, or its transforms.json. What the run names is not looked at: a run
+        data: the folder of the photos, or its transforms.json. The path in the run is not followed: a run
             from elsewhere could name anything.
 
     Raises:
@@ -182,39 +178,15 @@ def _newest(folder: Path) -> Checkpoint | None:
         raise UserError(one_line(why)) from None
 
 
-def _read_store(
-    folder: Path, checkpoint: Checkpoint | None
-) -> tuple[RunState, dict[int, float], dict[int, int]]:
+def _read_store(folder: Path, checkpoint: Checkpoint | None) -> tuple[RunState, int]:
+    """The planner's state and the number of parameters, at the checkpoint or else as saved last."""
     if not folder.is_dir():
-        return RunState(), {}, {}
+        return RunState(), 0
     try:
         store = ParameterStore.open(folder, read_only=True)
-        kept = checkpoint is not None and checkpoint.path.stem in store.pins
-        if kept:
+        if checkpoint is not None and checkpoint.path.stem in store.pins:
             store = ParameterStore.open(folder, checkpoint.path.stem)
-        state = RunState.from_json(store.state)
-        seen = [block for block, views in state.views.items() if views]
-        # What no checkpoint keeps, a run that goes on may take from under a reader.
-        unknown = (KeyError,) if kept else (KeyError, StoreError)
-        filled = {}
-        for block in seen:
-            with suppress(*unknown):
-                filled[block] = _filled(store, block)
-        parameters = {
-            block: store.meta(block)["parameters"] for block in store.blocks if isinstance(block, int)
-        }
-        return state, filled, parameters
+        blocks = [block for block in store.blocks if isinstance(block, int)]
+        return RunState.from_json(store.state), sum(store.meta(block)["parameters"] for block in blocks)
     except StoreError as error:
         raise UserError(one_line(str(error))) from None
-
-
-def _filled(store: ParameterStore, block: int) -> float:
-    """Pixels.
-
-    Raises:
-        KeyError: nobody was weighed, as by methods that keep everything.
-    """
-    weight, passes = store.load(block, [f"growth.{name}" for name in WEIGHED])[0].values()
-    if not bool((passes > 0).any()):
-        raise KeyError(block)
-    return float((weight / passes)[passes > 0].median())

@@ -1,7 +1,7 @@
 """A run's log, read back: what happened when."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -40,8 +40,8 @@ class Visit:
     ended: float
     done: bool
     """False where the log ends within the visit."""
-    layer_seconds: float
-    psnr: float | None
+    layer_seconds: float = 0.0
+    psnr: float | None = None
     """Of its later half, on training crops, dB."""
 
     @property
@@ -55,7 +55,7 @@ class Story:
     """All of a log."""
 
     trainings: tuple[TrainingLine, ...]
-    """Where training began, and where it went on after being resumed; at least one."""
+    """Where training began, and where it was resumed; at least one."""
     samples: tuple[SampleLine, ...]
     visits: tuple[Visit, ...]
     sweeps: tuple[SweepEndLine, ...]
@@ -64,13 +64,13 @@ class Story:
     workers: tuple[WorkerLine, ...]
     """At the end; none where one process trained."""
     shed_at_end: ShedAtEndLine | None
-    """The last; None where the run is not complete, or nothing was to go."""
+    """The last; None where the run is not complete, or nothing was pruned."""
     end: EndLine | None
-    """None where the run is still going on, or was killed."""
+    """None where the run goes on, or was killed."""
     moments: tuple[tuple[int, float], ...]
     """(step, training time) of every line."""
     blocks: int
-    """That space is cut into, as far as is known: one that is cut off during a run has the next number."""
+    """Their number, as far as is known: one that is split off during a run has the next number."""
 
     @property
     def step(self) -> int:
@@ -83,7 +83,7 @@ class Story:
         return self.moments[-1][1]
 
     def seconds_at(self, step: int) -> float:
-        """Training time when so many steps had been taken, between the lines by proportion."""
+        """Training time at a step, interpolated between the lines."""
         steps, seconds = zip(*self.moments, strict=True)
         return float(np.interp(step, steps, seconds))
 
@@ -120,7 +120,7 @@ def read_story(path: Path) -> Story:
     lines = [_read_line(text, f"{path}, line {number}") for number, text in enumerate(texts, start=1)]
     if not any(isinstance(line, TrainingLine) for line in lines):
         raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
-    trainings, visits = _of(lines, TrainingLine), _join_visits(lines)
+    trainings, visits = _of(lines, TrainingLine), tuple(_join_visits(lines))
     return Story(
         trainings=trainings,
         samples=_of(lines, SampleLine),
@@ -157,26 +157,14 @@ def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is no number in JSON")
 
 
-def _join_visits(lines: list[Line]) -> tuple[Visit, ...]:
+def _join_visits(lines: list[Line]) -> Iterator[Visit]:
     begun = {line.visit: line for line in _of(lines, VisitLine)}
     over = {line.visit: line for line in _of(lines, VisitEndLine)}
-    return tuple(
-        _join(number, begun.get(number), over.get(number), lines[-1].seconds)
-        for number in sorted({*begun, *over})
-    )
-
-
-def _join(number: int, begun: VisitLine | None, over: VisitEndLine | None, now: float) -> Visit:
-    known = over or begun
-    # A resumed run whose past is lost has visits without a beginning.
-    since = begun.seconds if begun else over.seconds - over.visit_seconds
-    return Visit(
-        number=number,
-        sweep=known.sweep,
-        block=known.block,
-        began=since,
-        ended=over.seconds if over else now,
-        done=over is not None,
-        layer_seconds=over.layer_seconds if over else 0.0,
-        psnr=over.psnr if over else None,
-    )
+    for number in sorted({*begun, *over}):
+        first, last = begun.get(number), over.get(number)
+        if last is None:
+            yield Visit(number, first.sweep, first.block, first.seconds, lines[-1].seconds, done=False)
+            continue
+        # A resumed run whose past is lost has visits without a beginning.
+        began = first.seconds if first else last.seconds - last.visit_seconds
+        yield Visit(number, last.sweep, last.block, began, last.seconds, True, last.layer_seconds, last.psnr)

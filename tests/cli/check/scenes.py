@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from abcd_ns.cli.check.command import findings_of
-from abcd_ns.cli.check.looks import Look
-from abcd_ns.cli.check.survey import Survey
-from abcd_ns.cli.check.visibility import visibility
+from abcd_ns.cli.check.survey import Look, Survey, visibility
 from abcd_ns.cli.findings import Finding
 from tests.data.dataparser_scenes import write_model, write_photos
 
@@ -22,7 +20,7 @@ def wide(width: int, height: int) -> tuple[str, list[float]]:
 
 
 def write_sound(folder: Path) -> Path:
-    """Nothing about it is doubtful; it is noted that photos have two sizes."""
+    """Nothing about it is doubtful; its photos have two sizes."""
     write_model(folder / "sparse/0", points=POINTS, params=wide)
     write_photos(folder / "images")
     return folder
