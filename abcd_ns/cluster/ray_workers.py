@@ -22,16 +22,7 @@ from ray.exceptions import (
     RayTaskError,
 )
 
-from abcd_ns.cluster.lease import (
-    Finished,
-    Lease,
-    Lost,
-    Parcel,
-    Report,
-    StepsSeen,
-    VisitTask,
-    WorkersError,
-)
+from abcd_ns.cluster.lease import Finished, Lease, Lost, Parcel, Report, StepsSeen, VisitTask, WorkersError
 from abcd_ns.cluster.members import Member, Members, RecentMean
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken

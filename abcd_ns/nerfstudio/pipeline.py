@@ -39,15 +39,7 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
-from abcd_ns.nerfstudio.fit import (
-    FITTED,
-    SCAFFOLD,
-    Demand,
-    Fit,
-    RamShares,
-    device_budget,
-    find_fit,
-)
+from abcd_ns.nerfstudio.fit import FITTED, SCAFFOLD, Demand, Fit, RamShares, device_budget, find_fit
 from abcd_ns.nerfstudio.flags import named_too, opens_ours, trains_ours
 from abcd_ns.nerfstudio.inspection import factor_of
 from abcd_ns.nerfstudio.metrics import lpips_missing

@@ -162,11 +162,7 @@ def test_a_split_by_a_share_leaves_something_on_either_side(scene, share):
 
 @pytest.mark.parametrize(
     ("kind", "extra"),
-    [
-        ("PINHOLE", []),
-        ("OPENCV", [0.1, 0.01, 1e-3, 2e-3]),
-        ("OPENCV_FISHEYE", [0.05, 0.01, 0.0, 0.0]),
-    ],
+    [("PINHOLE", []), ("OPENCV", [0.1, 0.01, 1e-3, 2e-3]), ("OPENCV_FISHEYE", [0.05, 0.01, 0.0, 0.0])],
 )
 def test_nerfstudios_own_means_come_to_the_same_photos(tmp_path, kind, extra):
     """Registered for `ns-train splatfacto ... abcd-data`, it leaves undistorting to nerfstudio."""

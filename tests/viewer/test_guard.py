@@ -82,8 +82,7 @@ def test_no_path_leads_to_a_file_outside(server, canary):
 
 
 @pytest.mark.skipif(
-    not hasattr(_infra, "WebSocketServerProtocol"),
-    reason="viser 1.0.25 refuses such paths itself",
+    not hasattr(_infra, "WebSocketServerProtocol"), reason="viser 1.0.25 refuses such paths itself"
 )
 def test_without_the_guard_the_canary_sings(canary, monkeypatch):
     monkeypatch.setattr(_infra, "websockets", _infra.websockets._original)
