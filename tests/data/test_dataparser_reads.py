@@ -15,8 +15,6 @@ from PIL import Image
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.ply import read_points
-from abcd_ns.engine.events import PhotosWanted
-from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -99,13 +97,6 @@ def test_default_frame_is_nerfstudios(scene):
     assert ours.dataparser_scale == pytest.approx(theirs.dataparser_scale, rel=1e-5)
 
 
-def test_held_out_views_are_every_eighth_by_name(scene):
-    train, test = (parser(scene).get_dataparser_outputs(split).image_filenames for split in ("train", "test"))
-    ordered = [scene / "images" / name for name in sorted(NAMES)]
-    assert test == ordered[::8]
-    assert sorted(train + test) == ordered
-
-
 @given(count=st.integers(2, 60), interval=st.integers(2, 12))
 @settings(derandomize=True, max_examples=40, deadline=None)
 def test_splits_partition_the_views(count, interval):
@@ -140,12 +131,6 @@ def test_dataset_gives_photos_of_the_cameras_sizes_and_writes_nothing(scene):
         AbcdDataset(outputs, scale_factor=0.5)
 
 
-def test_photo_of_a_pinhole_is_bit_equal(scene):
-    outputs = parser(scene).get_dataparser_outputs()
-    for i, path in enumerate(outputs.image_filenames):
-        assert np.array_equal(AbcdDataset(outputs).get_numpy_image(i), np.array(Image.open(path)))
-
-
 @pytest.mark.parametrize(("kind", "extra"), [("SIMPLE_RADIAL", [0.0]), ("OPENCV", [0.0, 0.0, 0.0, 0.0])])
 def test_zero_distortion_is_a_pinhole(tmp_path, scene, kind, extra):
     def params(w, h):
@@ -156,18 +141,6 @@ def test_zero_distortion_is_a_pinhole(tmp_path, scene, kind, extra):
     shutil.copytree(scene / "images", tmp_path / "zero/images")
     outputs = parser(tmp_path / "zero").get_dataparser_outputs()
     assert all(source.undistortion is None for source in outputs.metadata["photos"])
-
-
-def test_distorted_cameras_become_pinholes(tmp_path):
-    write_model(
-        tmp_path / "sparse/0", params=lambda w, h: ("OPENCV", [w, w, w / 2, h / 2, 0.1, 0.01, 1e-3, 2e-3])
-    )
-    write_photos(tmp_path / "images")
-    outputs = parser(tmp_path).get_dataparser_outputs()
-    assert outputs.cameras.distortion_params is None
-    for i, source in enumerate(outputs.metadata["photos"]):
-        assert source.size == (outputs.cameras.width[i].item(), outputs.cameras.height[i].item())
-        assert AbcdDataset(outputs).get_numpy_image(i).shape == (*source.size[::-1], 3)
 
 
 def test_reduced_folder_is_used_where_it_fits(scene):
@@ -195,13 +168,6 @@ def test_reduced_copies_serve_where_there_are_no_full_photos(scene):
     assert parser(scene, downscale_factor=4).get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 4
 
 
-def test_scene_is_viewed_without_photos(scene):
-    shutil.rmtree(scene / "images")
-    viewing = parser(scene, downscale_factor=2)
-    viewing.downscale_factor = 1  # as FullImageDatamanager does for test_mode="inference"
-    assert viewing.get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 2
-
-
 def test_scene_without_points_starts_at_random(tmp_path, capsys):
     write_model(tmp_path / "sparse/0", points=0)
     write_photos(tmp_path / "images")
@@ -213,14 +179,6 @@ def test_photos_without_pose_are_mentioned(scene, capsys):
     Image.new("RGB", (9, 9)).save(scene / "images/extra.png")
     parser(scene).get_dataparser_outputs()
     assert "1 photos in" in capsys.readouterr().out
-
-
-def test_odd_file_names(tmp_path):
-    names = ["a b/ü 1.png", "a b/[red]x.png", "ß/ü 1.png"]
-    write_model(tmp_path / "sparse/0", names=names)
-    write_photos(tmp_path / "images", names=names)
-    outputs = parser(tmp_path, eval_mode="all").get_dataparser_outputs()
-    assert outputs.image_filenames == sorted(tmp_path / "images" / name for name in names)
 
 
 def test_nerfstudios_datamanager_takes_it(tmp_path):
@@ -243,17 +201,6 @@ def test_nerfstudios_datamanager_takes_it(tmp_path):
     camera, data = manager.next_train(0)
     expected = manager.train_dataset.photos.image(camera.metadata["cam_idx"])
     assert torch.equal(data["image"], expected)
-
-
-@pytest.mark.parametrize(("device", "read"), [("cpu", []), ("cuda", [0, 2])])
-def test_photos_of_the_next_steps_are_read_ahead_of_a_device(scene, monkeypatch, device, read):
-    """But for those that are kept there."""
-    manager = AbcdDataManagerConfig(data=scene).setup(device="cpu", test_mode="val")
-    manager.device, manager._on_device["image", 1] = device, torch.empty(0)
-    expected: list[int] = []
-    monkeypatch.setattr(manager.train_dataset.photos, "expect", expected.extend)
-    manager.read_ahead(PhotosWanted((0, 1, 2)))
-    assert expected == read
 
 
 def test_a_scene_is_read_once_for_all_splits(scene):

@@ -234,10 +234,6 @@ def test_useless_mask_is_named(tmp_path, mask, message):
         masked(tmp_path, mask, (WIDTH, HEIGHT)).mask(0)
 
 
-def test_photo_without_mask_has_none(sources):
-    assert Photos(sources).mask(0) is None
-
-
 # Distortion
 
 LENSES = {
@@ -318,10 +314,3 @@ def test_absurd_distortion_is_refused(coefficients):
     padded = coefficients + (0.0,) * (8 - len(coefficients))
     with pytest.raises(InputError, match="leaves no picture"):
         undistortion(Lens(200, 150, 160, 160, 100, 75, padded))
-
-
-def test_lens_scales_with_its_photo():
-    lens = Lens(101, 67, 80, 81, 50, 33).resized(50, 33)
-    assert lens.size == (50, 33)
-    assert (lens.fx, lens.cx) == pytest.approx((80 * 50 / 101, 50 * 50 / 101))
-    assert (lens.fy, lens.cy) == pytest.approx((81 * 33 / 67, 33 * 33 / 67))
