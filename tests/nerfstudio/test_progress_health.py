@@ -52,8 +52,3 @@ def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
         "  block 3: seen by 1 view only",
         "  3 giants shrunk",
     ]
-
-
-def test_without_visits_nothing_is_said_of_them(coordinator, capsys):
-    ProgressReport(coordinator).close()
-    assert len(capsys.readouterr().out.splitlines()) == 1

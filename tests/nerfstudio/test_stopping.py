@@ -1,7 +1,6 @@
 """A signal ends a run between two steps, and the line that says how to go on is one that can be typed."""
 
 import signal
-import threading
 from pathlib import Path
 
 import pytest
@@ -49,19 +48,6 @@ def test_handlers_are_put_back():
     with StopSignals():
         assert signal.getsignal(signal.SIGTERM) not in before
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
-def test_in_another_thread_signals_stay_as_they_are():
-    before, seen = signal.getsignal(signal.SIGTERM), []
-
-    def enter() -> None:
-        with StopSignals():
-            seen.append(signal.getsignal(signal.SIGTERM))
-
-    thread = threading.Thread(target=enter)
-    thread.start()
-    thread.join()
-    assert seen == [before]
 
 
 @pytest.mark.parametrize(

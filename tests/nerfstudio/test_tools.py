@@ -10,10 +10,8 @@ import pytest
 import torch
 import yaml
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.scripts import render
 from nerfstudio.scripts.eval import ComputePSNR
-from nerfstudio.scripts.exporter import ExportCameraPoses
 from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
@@ -173,14 +171,6 @@ def test_the_data_set_is_rendered_beside_its_photos(trained, tmp_path):
         assert float(psnr(drawn, photo)) > 12
 
 
-def test_the_cameras_are_exported(trained, tmp_path):
-    ExportCameraPoses(load_config=trained / "config.yml", output_dir=tmp_path).main()
-    for split, count in (("train", VIEWS - HELD_OUT), ("eval", HELD_OUT)):
-        frames = json.loads((tmp_path / f"transforms_{split}.json").read_text())
-        assert len(frames) == count
-        assert np.shape(frames[0]["transform"]) == (3, 4)
-
-
 # Scores
 
 
@@ -315,11 +305,3 @@ def test_a_derived_model_trains_is_saved_and_loads(data, tmp_path):
     found = pipeline.get_average_eval_image_metrics()
     assert found["psnr_again"] == pytest.approx(found["psnr"], abs=1e-3)
     assert found["ssim_again"] == pytest.approx(found["ssim"], abs=1e-3)
-
-
-def test_cameras_stay_as_they_are(data, tmp_path):
-    assert SplatfactoModelConfig().camera_optimizer.mode == "off"
-    trainer = run(configure(data, tmp_path, steps=2))
-    assert trainer.config.pipeline.model.camera_optimizer.mode == "off"
-    assert not list(trainer.pipeline.model.camera_optimizer.parameters())
-    assert "camera_opt" not in trainer.pipeline.get_param_groups()
