@@ -11,7 +11,7 @@ import numpy as np
 from abcd_ns.data.input_errors import InputError
 
 _NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
-_TYPES = dict(zip(_NAMES.split(), "i1 u1 i2 u2 i4 u4 f4 f8".split() * 2, strict=True))
+_TYPES = dict(zip(_NAMES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
 GREY = 127

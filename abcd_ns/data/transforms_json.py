@@ -199,7 +199,7 @@ def _distortion(values: dict[str, Any], label: str, fisheye: bool) -> tuple[floa
     if fisheye:
         return (k1, k2, k3, k4)
     if k4 != 0:
-        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort the photos first.")
+        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
     return (k1, k2, p1, p2, k3)
 
 
