@@ -170,9 +170,7 @@ def _read_photo(source: PhotoSource) -> Tensor:
     image = _decode(source.path, has_alpha)
     if (image.shape[1], image.shape[0]) != source.stored:
         wanted = f"{source.stored[0]} x {source.stored[1]}"
-        raise InputError(
-            f"{source.path} is {image.shape[1]} x {image.shape[0]} px, not {wanted}; put the photo back."
-        )
+        raise InputError(f"{source.path} is no longer {wanted} px; put the photo back.")
     if source.alpha_color is not None and image.shape[2] == 4:
         image = _on_color(image, source.alpha_color)
     image = area_reduce(image, source.reduced)
@@ -195,7 +193,7 @@ def _read_mask(source: PhotoSource) -> Tensor:
     if not same_shape or mask.shape[1] < width or mask.shape[0] < height:
         shape = f"{mask.shape[1]} x {mask.shape[0]}"
         raise InputError(
-            f"{source.mask_path} is {shape} px, unlike its photo of {width} x {height}; make the mask again."
+            f"{source.mask_path}: {shape} px, unlike its photo ({width} x {height}); replace it."
         )
     used = area_reduce(np.where(mask > 0, np.uint8(_MASK_USED), np.uint8(0)), source.reduced)
     used = np.where(used == _MASK_USED, used, 0)

@@ -103,9 +103,7 @@ def read_header(path: Path, check_kind: bool = True) -> Header:
         fix = "reduce the photo and make the model again" if check_kind else "reduce the mask"
         raise InputError(f"{path} has more than 89 Mpx; {fix}.") from None
     except UnidentifiedImageError:
-        raise InputError(
-            f"{path} is not a picture of a known kind; save it as JPEG, PNG, WebP, TIFF or BMP."
-        ) from None
+        raise InputError(f"{path} is not a picture of a known kind; save it as JPEG or PNG.") from None
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None
 

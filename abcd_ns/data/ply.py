@@ -28,9 +28,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         InputError: missing, not a .ply with x, y and z in its first element, or not as long as it claims.
     """
     if not path.is_file():
-        raise InputError(
-            f"{path} does not exist; correct ply_file_path, or remove it to start from random points."
-        )
+        raise InputError(f"{path} does not exist; correct ply_file_path, or remove it to start at random.")
     content = path.read_bytes()
     end = content.find(b"end_header", 0, _MAX_HEADER)
     start = content.find(b"\n", end) + 1

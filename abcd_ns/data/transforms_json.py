@@ -54,9 +54,7 @@ def read_transforms(path: Path) -> Scene:
             xyz, rgb = read_points(inside(root, str(meta["ply_file_path"]), path))
     masks = sum(frame.mask_path is not None for frame in frames)
     if 0 < masks < len(frames):
-        problems.add(
-            f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to every frame or to none."
-        )
+        problems.add(f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to all or none.")
     with problems.collect():
         given = _matrix(meta.get("applied_transform", np.eye(4)), path)
         transform = rigid(given, f"{path}: applied_transform")
@@ -86,9 +84,7 @@ def read_split_transforms(folder: Path) -> Scene:
     for scene in scenes:
         same = np.array_equal(train.applied_transform, scene.applied_transform)
         if not same or train.applied_scale != scene.applied_scale:
-            raise InputError(
-                f"{scene.model} has another applied_transform than {train.model}; make both new."
-            )
+            raise InputError(f"{scene.model} and {train.model} need the same applied_transform; make both.")
         at = os.path.relpath(scene.photo_folder, folder)
         lists.append([replace(f, name=os.path.normpath(f"{at}/{f.name}")) for f in scene.frames])
     frames = sorted((frame for frames in lists for frame in frames), key=lambda frame: frame.name)
@@ -181,9 +177,7 @@ def _focal(values: dict[str, Any], key: str, size: int, label: str) -> float:
     """Pixels: size / (2 tan(angle / 2)), for the full angle of view in radians."""
     angle = _number(values, key, label)
     if not 0 < angle < math.pi:
-        raise InputError(
-            f"{label}: an angle of view of {angle:g} radians is no camera's; it lies between 0 and pi."
-        )
+        raise InputError(f"{label}: {key} is {angle:g} radians; it must lie between 0 and pi.")
     return size / (2 * math.tan(angle / 2))
 
 

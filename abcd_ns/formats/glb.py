@@ -102,9 +102,7 @@ def write_glb(
     head = 12 + 8 + words + 8
     total = head + starts[-1]
     if total >= _LARGEST:
-        raise UserError(
-            f"{count:,} Gaussians are {bytes_in_words(total)} and a .glb holds 4; use --by-block."
-        )
+        raise UserError(f"{count:,} Gaussians: {bytes_in_words(total)}, and a .glb holds 4; use --by-block.")
     done, low, high = 0, np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
     with path.open("wb") as file:
         file.truncate(total)

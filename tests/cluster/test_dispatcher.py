@@ -33,16 +33,12 @@ class Unreliable:
         self._out, self._late = [], []
         self.lost = self.answered_late = 0
 
-    @property
-    def count(self):
-        return self._inner.count
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
 
     @property
     def idle(self):
         return self.count - len(self._out)
-
-    def share(self, value):
-        return self._inner.share(value)
 
     def submit(self, lease):
         assert self.idle > 0
@@ -67,18 +63,6 @@ class Unreliable:
             self._late = [Finished(lease.number, replace(outcome, state=outcome.state.nobody))]
             self.answered_late += 1
         return [*late, Lost(lease.number, fate)]
-
-    def hold(self):
-        return self._inner.hold()
-
-    def go_on(self):
-        self._inner.go_on()
-
-    def seen(self):
-        return self._inner.seen()
-
-    def close(self):
-        pass
 
 
 @pytest.mark.parametrize("options", [{"density": GROWING}, {"density": STILL, "scaffold": 40, "warmup": 0.3}])
@@ -127,23 +111,6 @@ def test_who_waited_for_an_undone_visit_is_not_seen_before_the_next(make, photos
         train(run, photos, steps=1)
     block = ended[-1].block
     assert 0 < len(run.scene.gaussians(block)) < run.scene.count(block)
-
-
-def test_a_visit_that_is_lent_again_knows_what_time_it_is(make, photos, monkeypatch):
-    run = make(workers=1, density=STILL)
-    submit, wait, lent = run.workers.submit, run.workers.wait, []
-
-    def lose_the_first(seconds):
-        if len(lent) > 1:
-            return wait(seconds)
-        run.stopwatch._before += 100.0
-        return [Lost(run.workers._leases.popleft().number, "it was killed")]
-
-    monkeypatch.setattr(run.workers, "submit", lambda lease: (lent.append(lease.task), submit(lease)))
-    monkeypatch.setattr(run.workers, "wait", lose_the_first)
-    train(run, photos, steps=8)
-    assert lent[0].active.number == lent[1].active.number
-    assert lent[1].seconds > lent[0].seconds + 100.0
 
 
 def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(make, photos):

@@ -36,7 +36,7 @@ def test_what_is_no_number_and_what_is_undone_is_said_at_once(coordinator, capsy
     assert capsys.readouterr().out.splitlines() == [
         "block 2: 12 gradients that were no numbers set to zero",
         "warm-up: 1 Gaussians that were no numbers replaced",
-        "block 3: visit undone, it raised the loss of its views by 25%",
+        "block 3: visit undone, it raised its views' loss by 25%",
     ]
 
 
@@ -52,3 +52,8 @@ def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
         "  block 3: seen by 1 view only",
         "  3 giants shrunk",
     ]
+
+
+def test_without_visits_nothing_is_said_of_them(coordinator, capsys):
+    ProgressReport(coordinator).close()
+    assert len(capsys.readouterr().out.splitlines()) == 1

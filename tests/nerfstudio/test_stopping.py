@@ -1,6 +1,7 @@
 """A signal ends a run between two steps, and the line that says how to go on is one that can be typed."""
 
 import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -68,3 +69,16 @@ def test_handlers_are_put_back():
 )
 def test_the_command_to_go_on_keeps_the_options(argv, expected):
     assert command_to_go_on(argv.split(), "abcd", Path("my run")) == expected
+
+
+def test_in_another_thread_signals_stay_as_they_are():
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def enter() -> None:
+        with StopSignals():
+            seen.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert seen == [before]

@@ -84,9 +84,7 @@ class ProgressReport:
                 self._print(f"{_block(event.block)}: {event.count:,} {MENDED[event.what]}")
             case VisitUndone():
                 rise = event.after / event.before - 1
-                self._print(
-                    f"{_block(event.block)}: visit undone, it raised the loss of its views by {rise:.0%}"
-                )
+                self._print(f"{_block(event.block)}: visit undone, it raised its views' loss by {rise:.0%}")
 
     def scalars(self) -> dict[str, float]:
         """Where the training stands, by name, for TensorBoard, wandb and comet.

@@ -190,9 +190,7 @@ def has_begun(folder: Path) -> bool:
 
 def _is_taken(folder: Path) -> UserError:
     run = folder.parent.parent
-    return UserError(
-        f"{folder} holds a run already: go on with it by --load-dir {run}, or choose another --timestamp."
-    )
+    return UserError(f"{folder} holds a run already: add --load-dir {run}, or another --timestamp.")
 
 
 def take_over(start: Start, folder: Path, made_for: MadeFor) -> ParameterStore:
@@ -247,7 +245,5 @@ def _at_checkpoint(path: Path) -> Start:
 def _at(folder: Path, pin: str | None) -> Start:
     with ParameterStore.open(folder, pin, read_only=True) as store:
         if not store.blocks:
-            raise UserError(
-                f"The run in {folder} was ended before it began: start it anew, without --load-dir."
-            )
+            raise UserError(f"The run in {folder} ended before it began: start it anew, without --load-dir.")
         return Start(folder, pin, store.state.get("step", 0))
