@@ -261,14 +261,10 @@ class Dispatcher(Coordinator):
         active.layer_seconds = outcome.layer_seconds
         updates = settle(self.scene, block, outcome.state, self.config.recipe.migrate, lent.taken)
         rest_after_visit(self.run, active, outcome.state, updates, sweep)
-        if not self._is_under_way(sweep):
+        queued = state.sweep == sweep and state.queue
+        if not queued and all(other.lease.task.sweep != sweep for other in self._lent):
             self.announce(SweepEnded(sweep, state.step))
         return True
-
-    def _is_under_way(self, sweep: int) -> bool:
-        """Whether visits of a sweep are still to come, or out."""
-        queued = self.state.sweep == sweep and bool(self.state.queue)
-        return queued or any(lent.lease.task.sweep == sweep for lent in self._lent)
 
     # -- at rest -------------------------------------------------------------------------------------
 

@@ -5,7 +5,6 @@ which loads a cut cameras.bin silently and hangs on an empty points3D.bin.
 """
 
 import mmap
-import stat
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.picture_files import check_regular
 from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
 from abcd_ns.data.split_lists import read_list_files
 
@@ -142,7 +142,7 @@ class _Cursor:
 
     def __init__(self, path: Path):
         self.path = path
-        _check_file(path)
+        check_regular(path, "file")
         with path.open("rb") as file:
             self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.at = 0
@@ -236,7 +236,7 @@ def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number from 1, text) of all lines but comments; blank ones too: an image may have no 2D points."""
-    _check_file(path)
+    check_regular(path, "file")
     with path.open(encoding="utf-8", errors="surrogateescape") as file:
         for number, line in enumerate(file, start=1):
             if not line.startswith("#"):
@@ -306,16 +306,3 @@ def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 _BINARY = (_cameras_bin, _images_bin, _points_bin)
 _TEXT = (_cameras_txt, _images_txt, _points_txt)
-
-
-def _check_file(path: Path) -> None:
-    """Refuse what cannot be read as a file: nothing, a folder, a pipe (which would block), no bytes."""
-    try:
-        status = path.stat()
-    except OSError as error:
-        what = f"cannot be read ({error.strerror})"
-        raise InputError(f"{path} {what}; a model is cameras, images and points3D.") from None
-    if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path} is not a regular file; put COLMAP's file there.")
-    if status.st_size == 0:
-        raise InputError(f"{path} is empty; copy or make it again.")

@@ -61,12 +61,12 @@ class Problems:
         self.lines.append(line)
 
     @contextmanager
-    def collect(self) -> Iterator[None]:
-        """Note the InputError that the body raises, if any, and go on after it."""
+    def collect(self, label: str = "") -> Iterator[None]:
+        """Note the InputError that the body raises, if any, each line after the label, and continue."""
         try:
             yield
         except InputError as error:
-            self.lines.extend(error.lines)
+            self.lines.extend(label + line for line in error.lines)
 
     def raise_if_any(self) -> None:
         """Raise one InputError with all that was noted.

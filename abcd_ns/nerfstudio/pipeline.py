@@ -5,7 +5,6 @@ import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -127,18 +126,15 @@ class AbcdPipeline(VanillaPipeline):
         self._rendered: Rendered | None = None
         self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
 
-    def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
-        """Everything exists by now, checkpoint included: begin, or go on, and drive the coordinator."""
-        trainer = training_callback_attributes.trainer
-        self.coordinator = self._begin(trainer.run, training_callback_attributes.optimizers.optimizers)
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Everything exists by now, checkpoint included: begin or resume, and drive the coordinator."""
+        trainer = attributes.trainer
+        self.coordinator = self._begin(trainer.run, attributes.optimizers.optimizers)
         self.datamanager.follow(self.coordinator)
         self.model.follow(self.coordinator)
         report = ProgressReport(self.coordinator)
+        log = keep_log(trainer.run, self.datamanager.train_dataset.photos, self.coordinator)
         self.coordinator.announce.subscribe(report)
-        photos = self.datamanager.train_dataset.photos
-        log = keep_log(trainer.run, photos, self.coordinator)
         self.coordinator.announce.subscribe(log)
         self.panel.follow(self.coordinator)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -174,15 +170,13 @@ class AbcdPipeline(VanillaPipeline):
         self.datamanager.take_poses(self.model.poses)
         return super().get_eval_image_metrics_and_images(step)
 
-    def get_average_eval_image_metrics(
-        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
-    ) -> dict[str, Any]:
+    def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
         if self.coordinator is not None:
             self.coordinator.pause()
         self.datamanager.take_poses(self.model.poses)
         with _as_a_command():
-            found = super().get_average_eval_image_metrics(step, output_path, get_std)
+            found = super().get_average_eval_image_metrics(*args, **kwargs)
         if self.coordinator is not None:
             self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
@@ -237,8 +231,9 @@ class AbcdPipeline(VanillaPipeline):
             return ExactTrainer(run)
         if run.config.recipe.overlap > 0:
             return independent_trainer(run)
-        source, target = LayerSource(run, self._room_for_layers()), self.datamanager.target
-        blocks = run.scene.tree.num_blocks
+        blocks, layers = run.scene.tree.num_blocks, self._ram.layers  # on the CPU, RAM is the device
+        room = LayerRoom(layers) if self._on_cpu else LayerRoom(int(LAYER_SHARE * self._budget), layers)
+        source, target = LayerSource(run, room), self.datamanager.target
         # Where RAM is short, one process: each reads blocks for itself.
         wanted = self.config.workers or int(self.config.ram_budget_gb > 0)
         workers = number_of_workers(wanted, blocks, run.config, self.device)
@@ -255,12 +250,6 @@ class AbcdPipeline(VanillaPipeline):
         """Bytes of the device that training may take, of what is free when it begins."""
         return device_budget(self.config.device_budget_gb, self.device)
 
-    def _room_for_layers(self) -> LayerRoom:
-        """Of the device and of RAM; on the CPU these are one."""
-        if self._on_cpu:
-            return LayerRoom(self._ram.layers)
-        return LayerRoom(int(LAYER_SHARE * self._budget), self._ram.layers)
-
     def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
         """The limits that were fitted to the device: as the run began, unless it goes on with a budget of
         its own."""
@@ -273,15 +262,8 @@ class AbcdPipeline(VanillaPipeline):
     def _fit(self, points: int, blocks: int = 1) -> Fit:
         """How many blocks for a scene that goes on with so many Gaussians in so many blocks."""
         config = self.config
-        demand = Demand(
-            self._pixels,
-            points,
-            config.training,
-            most=config.training.density.limit,
-            factor=factor_of(self.datamanager.dataparser),
-            blocks=blocks,
-            on_cpu=self._on_cpu,
-        )
+        most, factor = config.training.density.limit, factor_of(self.datamanager.dataparser)
+        demand = Demand(self._pixels, points, config.training, most, factor, blocks, self._on_cpu)
         return find_fit(self._budget, demand)
 
     @property
@@ -317,11 +299,8 @@ class AbcdPipeline(VanillaPipeline):
         self._tell_of_points(len(everything))
         gaussians = thin_out(everything, training.density.limit, training.seed)
         if len(gaussians) < len(everything):
-            CONSOLE.print(
-                f"Training begins with {len(gaussians):,} of {len(everything):,} Gaussians, the limit "
-                "on Gaussians.",
-                highlight=False,
-            )
+            words = f"Training begins with {len(gaussians):,} of {len(everything):,} Gaussians, the limit."
+            CONSOLE.print(words, highlight=False)
         del everything
         blocks, fitted = self._first_cut(len(gaussians))
         if self.config.partition == "kd":

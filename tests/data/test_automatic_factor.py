@@ -9,15 +9,14 @@ import torch
 
 from abcd_ns.data.prepare import automatic_factor
 from abcd_ns.data.scene import Frame, Lens, Scene
-from tests.data.dataparser_scenes import parser, write_model, write_photos
+from tests.data.dataparser_scenes import parser, write_capture
 
 
 @pytest.fixture
 def long_scene(tmp_path, monkeypatch) -> Path:
     """Photos of 3300 x 40 px and, every other one, of 900 x 48."""
     monkeypatch.setattr("tests.data.dataparser_scenes.SIZES", ((3300, 40), (900, 48)))
-    write_model(tmp_path / "sparse/0")
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path)
     return tmp_path
 
 

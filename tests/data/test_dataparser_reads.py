@@ -24,6 +24,7 @@ from tests.data.dataparser_scenes import (
     project,
     project_pycolmap,
     refusal,
+    write_capture,
     write_model,
     write_photos,
     write_transforms,
@@ -34,8 +35,7 @@ from tests.data.dataparser_scenes import (
 @pytest.mark.parametrize("factor", [1, 2])
 @pytest.mark.parametrize("text", [False, True])
 def test_points_project_where_pycolmap_projects_them(tmp_path, text, factor, offset):
-    model = write_model(tmp_path / "sparse/0", text=text, offset=offset)
-    write_photos(tmp_path / "images")
+    model = write_capture(tmp_path, text=text, offset=offset)
     outputs = parser(tmp_path, downscale_factor=factor, eval_mode="all").get_dataparser_outputs()
     assert [path.relative_to(tmp_path / "images").as_posix() for path in outputs.image_filenames] == sorted(
         NAMES
@@ -56,8 +56,7 @@ def test_points_project_where_pycolmap_projects_them(tmp_path, text, factor, off
 def test_geo_referenced_scene_is_the_same_scene(tmp_path, orientation, center):
     outputs = []
     for name, offset in (("near", 0.0), ("far", 5e6)):
-        write_model(tmp_path / name / "sparse/0", offset=offset)
-        write_photos(tmp_path / name / "images")
+        write_capture(tmp_path / name, offset=offset)
         options = {"orientation_method": orientation, "center_method": center}
         outputs.append(parser(tmp_path / name, **options).get_dataparser_outputs())
     near, far = outputs
@@ -67,8 +66,7 @@ def test_geo_referenced_scene_is_the_same_scene(tmp_path, orientation, center):
 
 
 def test_poses_go_back_to_original_coordinates(tmp_path):
-    model = write_model(tmp_path / "sparse/0", offset=5e6)
-    write_photos(tmp_path / "images")
+    model = write_capture(tmp_path, offset=5e6)
     outputs = parser(tmp_path, eval_mode="all").get_dataparser_outputs()
     back = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds)
     for row, name in enumerate(sorted(NAMES)):
@@ -169,8 +167,7 @@ def test_reduced_copies_serve_where_there_are_no_full_photos(scene):
 
 
 def test_scene_without_points_starts_at_random(tmp_path, capsys):
-    write_model(tmp_path / "sparse/0", points=0)
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, points=0)
     assert "points3D_xyz" not in parser(tmp_path).get_dataparser_outputs().metadata
     assert "no points" in capsys.readouterr().out
 
@@ -188,8 +185,7 @@ def test_nerfstudios_datamanager_takes_it(tmp_path):
         FullImageDatamanagerConfig,
     )
 
-    write_model(tmp_path / "sparse/0", params=lambda w, h: ("SIMPLE_RADIAL", [w, w / 2, h / 2, -0.1]))
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, params=lambda w, h: ("SIMPLE_RADIAL", [w, w / 2, h / 2, -0.1]))
     config = FullImageDatamanagerConfig(
         dataparser=AbcdDataParserConfig(), data=tmp_path, cache_images_type="uint8"
     )

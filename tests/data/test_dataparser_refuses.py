@@ -22,8 +22,8 @@ from tests.data.dataparser_scenes import (
     REAL,
     SIZES,
     refusal,
+    write_capture,
     write_model,
-    write_photos,
     write_transforms,
 )
 
@@ -121,8 +121,7 @@ def _at_the_origin(line: str) -> str:
     ],
 )
 def test_bad_lines_of_a_text_model_are_refused(tmp_path, file, change, message):
-    write_model(tmp_path / "sparse/0", text=True)
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, text=True)
     path = tmp_path / f"sparse/0/{file}.txt"
     lines = map(change, path.read_text().splitlines())
     path.write_text("\n".join(line for line in lines if line is not None) + "\n")
@@ -287,7 +286,7 @@ def _spoil_pose(row: int, column: int, value: float) -> Callable[[dict], None]:
         (lambda meta: meta.update(ply_file_path="gone.ply"), "does not exist"),
         (lambda meta: meta.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
         (lambda meta: meta.update(frames=[]), "no list of frames"),
-        (lambda meta: meta.update(frames=meta["frames"][:1]), "at least 2"),
+        (lambda meta: meta.update(frames=meta["frames"][:1]), "2 are needed"),
         (lambda meta: meta.update(frames=meta["frames"] + meta["frames"][:1]), "twice"),
         (lambda meta: meta.update(applied_scale=0), "positive"),
     ],

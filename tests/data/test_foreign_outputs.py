@@ -22,7 +22,7 @@ from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
-from tests.data.dataparser_scenes import NAMES, SIZES, parser, write_model, write_photos, write_transforms
+from tests.data.dataparser_scenes import NAMES, SIZES, parser, write_capture, write_photos, write_transforms
 from tests.data.test_layouts import write_blender
 
 PINHOLE = {"fx": 40.0, "fy": 40.0, "cx": 16.0, "cy": 12.0, "width": 32, "height": 24}
@@ -54,8 +54,7 @@ def photo(tmp_path) -> Path:
 )
 def test_photos_and_cameras_are_those_that_splatfacto_trains_on(tmp_path, kind, extra, reader):
     """By nerfstudio's reader, and by ours as `ns-train splatfacto ... abcd-data` has it."""
-    write_model(tmp_path / "sparse/0", params=lambda w, h: (kind, [w, w, w / 2, h / 2, *extra]))
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, params=lambda w, h: (kind, [w, w, w / 2, h / 2, *extra]))
     if reader == "ours":
         stored, trained = AbcdDataParserConfig(data=tmp_path, as_stored=True), parser(tmp_path)
     else:

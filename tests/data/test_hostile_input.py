@@ -13,15 +13,7 @@ from PIL import Image
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.inspection import inspect
-from tests.data.dataparser_scenes import (
-    NAMES,
-    SIZES,
-    parser,
-    refusal,
-    write_model,
-    write_photos,
-    write_transforms,
-)
+from tests.data.dataparser_scenes import NAMES, SIZES, parser, refusal, write_capture, write_transforms
 
 
 def rewrite(scene: Path, meta: dict) -> None:
@@ -47,8 +39,7 @@ def check_refusal(scene: Path, **options) -> list[str]:
 
 def test_odd_names_are_read_and_shown_in_one_line(tmp_path):
     names = ["a\nb.png", "c d/[red]\tx.png", "ß/ü 1.png"]
-    write_model(tmp_path / "sparse/0", names=names)
-    write_photos(tmp_path / "images", names=names)
+    write_capture(tmp_path, names=names)
     assert parser(tmp_path, eval_mode="all").rows("train") == [0, 1, 2]
     (tmp_path / "images/a\nb.png").unlink()
     assert refusal(tmp_path).splitlines() == [
@@ -63,14 +54,13 @@ def test_all_broken_files_of_a_model_are_listed_at_once(scene):
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         (scene / "sparse/0" / name).write_bytes(b"")
     assert refusal(scene).splitlines() == [
-        f"{scene}/sparse/0/{name} is empty; copy or make it again."
+        f"{scene}/sparse/0/{name} is empty; copy the file again."
         for name in ("cameras.bin", "images.bin", "points3D.bin")
     ]
 
 
 def test_names_given_twice_and_missing_photos_are_listed_at_once(tmp_path):
-    write_model(tmp_path / "sparse/0", text=True)
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, text=True)
     path = tmp_path / "sparse/0/images.txt"
     text = path.read_text()
     path.write_text(text.replace(NAMES[2], NAMES[0]).replace(NAMES[3], NAMES[1]))
@@ -88,16 +78,14 @@ def test_mixed_camera_models_are_one_scene(tmp_path):
             return "OPENCV", [width, width, width / 2, height / 2, 0.05, 0.0, 0.0, 0.0]
         return "PINHOLE", [width, width, width / 2, height / 2]
 
-    write_model(tmp_path / "sparse/0", params=params)
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, params=params)
     flat = {source.stored: source.undistortion for source in parser(tmp_path).prepared().sources}
     assert flat[SIZES[0]] is not None
     assert flat[SIZES[1]] is None
 
 
 def test_points_at_absurd_places_are_left_out(tmp_path, capsys):
-    write_model(tmp_path / "sparse/0", text=True)
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, text=True)
     with (tmp_path / "sparse/0/points3D.txt").open("a") as file:
         file.write("100 1e300 0 0 9 9 9 0.1\n101 nan 0 0 9 9 9 0.1\n")
     points = parser(tmp_path).get_dataparser_outputs().metadata["points3D_xyz"]

@@ -108,7 +108,7 @@ def test_splits_in_different_worlds_are_refused(tmp_path):
     meta = json.loads((data / "transforms_test.json").read_text())
     turned = [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0]]
     (data / "transforms_test.json").write_text(json.dumps({**meta, "applied_transform": turned}))
-    assert "another applied_transform" in refusal(data)
+    assert "need the same applied_transform" in refusal(data)
 
 
 # Splits by a share

@@ -151,7 +151,7 @@ BELOW_0 = ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "dataman
         ("pipeline.model.cull_alpha_thresh", 0.2, "density.cull-alpha-thresh"),
         ("pipeline.model.camera_optimizer.mode", "SO3xR3", "training.poses"),
         ("pipeline.model.collider_params", None, "collider-params"),
-        ("pipeline.cluster", "10.0.0.1:6379", "how many workers"),
+        ("pipeline.cluster", "10.0.0.1:6379", "needs a number of workers"),
         ("pipeline.blocks", MAX_BLOCKS + 1, "--pipeline.blocks must be 65536 or less, not 65537"),
         ("pipeline.training.batch", -1, "batch must be 0 or more"),
         ("pipeline.training.density.cull_alpha_thresh", 0.001, "must be 0.0020 or more where opacities are"),

@@ -225,7 +225,7 @@ def test_a_checkpoint_that_does_not_fit_ends_the_run_with_one_line(
     assert ended.value.code == 2
     said = capsys.readouterr().out
     assert "step-000000010.ckpt could not be written" in said
-    assert "safe in the store" in said
+    assert "the store is safe" in said
     folder = run_folder(tmp_path / "full")
     assert not list(folder.glob(".*"))
     resumed = run(configure(data, tmp_path / "resumed", load_dir=folder))
