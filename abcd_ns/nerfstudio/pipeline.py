@@ -73,20 +73,19 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """How blocks are trained."""
     blocks: int = 0
-    """Number of blocks that space is cut into. 0 takes as few as `device_budget_gb` allows, one where the
-    scene fits, and cuts blocks that outgrow it in two; a number forces so many, which nothing holds in it."""
+    """Number of blocks. 0 takes as few as `device_budget_gb` allows and splits those that outgrow it. A
+    number forces that many blocks; the memory budget is then not enforced."""
     device_budget_gb: float = 0.0
-    """Memory of the device that training may take, GiB, by which `blocks` 0 is decided; 0 takes 0.9 of what
-    is free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
-    eighth for photos."""
+    """Device memory for training, GiB; sets the number of blocks where `blocks` is 0. On a GPU, an eighth each
+    is for layers and for photos. 0 takes 90% of a GPU's free memory; on a CPU, a quarter of the RAM."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
     near_plane: float = 0.0
     """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
     the nearest distance at which a photo shows a point."""
     ram_budget_gb: float = 0.0
-    """RAM for photos, blocks and layers that could be read or drawn again, GiB; no result depends on it, but
-    that `workers` 0 is one where it is set. 0 takes 8, or 40% of the machine's memory where that is less."""
+    """RAM for cached photos, blocks and layers, GiB. Does not change results. Setting it turns off automatic
+    workers. 0 takes 8, or 40% of the machine's memory where that is less."""
     workers: int = 0
     """Blocks that are trained at once, each by a process of its own: on a core each, or on a GPU each, which
     needs Ray (pip install 'abcd-ns[cluster]'). 0 takes all cores where there is no GPU, as far as there are
@@ -337,7 +336,8 @@ class AbcdPipeline(VanillaPipeline):
             words = f"The data has no points: {begun:,} Gaussians begin at random places, as splatfacto's do."
             CONSOLE.print(words, highlight=False)
         if begun < self._points:
-            words = f"{self._points:,} points begin as {begun:,} Gaussians: photos of this size show no more."
+            merged = f"merged {self._points:,} points closer than these photos resolve"
+            words = f"Starting with {begun:,} Gaussians: {merged}."
             CONSOLE.print(words, highlight=False)
 
 

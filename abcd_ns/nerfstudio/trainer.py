@@ -29,15 +29,7 @@ from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STATE, STORE
-from abcd_ns.nerfstudio.run.resuming import (
-    RunRequest,
-    Start,
-    check_blocks,
-    check_folder,
-    find_start,
-    has_begun,
-    pin_name,
-)
+from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_go_on
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
@@ -106,8 +98,7 @@ class AbcdTrainerConfig(TrainerConfig):
             CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
         with exit_on_user_error():
             start = find_start(self)
-            check_folder(self.get_base_dir() / STATE / STORE, start)
-            check_blocks(start, self.pipeline.blocks)
+            check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
             check_options(self)
             found = inspect(self.pipeline.datamanager.reader())
             if self.pipeline.blocks == 0:

@@ -253,7 +253,7 @@ def test_a_damaged_checkpoint_is_found_and_does_not_hinder_going_on(data, stoppe
     assert_same(resumed.base_dir, undisturbed)
 
 
-# What cannot be gone on with
+# What cannot be resumed
 
 
 def test_a_second_run_in_a_folder_is_refused_until_the_first_is_gone(data, stopped, capsys):
