@@ -76,8 +76,8 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Number of blocks. 0 takes as few as `device_budget_gb` allows and splits those that outgrow it. A
     number forces that many blocks; the memory budget is then not enforced."""
     device_budget_gb: float = 0.0
-    """Device memory for training, GiB; sets the number of blocks where `blocks` is 0. On a GPU, an eighth each
-    is for layers and for photos. 0 takes 90% of a GPU's free memory; on a CPU, a quarter of the RAM."""
+    """Device memory for training, GiB; sets the number of blocks where `blocks` is 0. Of a GPU's, an eighth
+    is for layers and one for photos. 0 takes 90% of a GPU's free memory; on a CPU, a quarter of the RAM."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
     near_plane: float = 0.0
