@@ -85,8 +85,6 @@ class Dispatcher(Coordinator):
         self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}
         self._numbers, self._ended = itertools.count(1), 0
         self._counted = self.state.step
-        self.refused = 0
-        """Answers that came after their lease was given up."""
 
     # -- a step, here or elsewhere -------------------------------------------------------------------
 
@@ -221,8 +219,7 @@ class Dispatcher(Coordinator):
 
     def _hear(self, report: Report) -> None:
         lent = next((lent for lent in self._lent if lent.lease.number == report.lease), None)
-        if lent is None or lent.outcome is not None:
-            self.refused += isinstance(report, Finished)
+        if lent is None or lent.outcome is not None:  # its lease was given up
             return
         match report:
             case StepsSeen():

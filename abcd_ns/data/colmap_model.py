@@ -81,7 +81,7 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
         label = f"{model}/images{suffix}: {name}"
         if camera not in lenses:
             lacks = f"which cameras{suffix} does not have"
-            problems.add(f"{label} uses camera {camera}, {lacks}; make the model again.")
+            problems.append(f"{label} uses camera {camera}, {lacks}; make the model again.")
             continue
         with problems.collect():
             inside(photos, name, model / f"images{suffix}")

@@ -183,11 +183,11 @@ def check_masks(sources: list[PhotoSource]) -> None:
     def look(row: int) -> list[str]:
         with (found := Problems()).collect():
             photos.mask(row)
-        return found.lines
+        return found
 
     with ThreadPoolExecutor() as pool, ProgressBar("Looking at masks", len(masked)) as bar:
         for lines in pool.map(look, range(len(masked))):
-            problems.lines.extend(lines)
+            problems.extend(lines)
             bar.advance()
     problems.raise_if_any()
 

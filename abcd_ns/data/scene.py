@@ -162,7 +162,7 @@ def check_layout(scene: Scene) -> None:
     for name, times in Counter(frame.name for frame in scene.frames).items():
         if times > 1:
             many = "twice" if times == 2 else f"{times} times"
-            problems.add(f"{scene.model} names the photo {name} {many}; keep one pose of it.")
+            problems.append(f"{scene.model} names the photo {name} {many}; keep one pose of it.")
     problems.raise_if_any()
     centers = np.stack([frame.camera_to_world[:, 3] for frame in scene.frames])
     if np.abs(centers - centers[0]).max() <= 1e-12 * np.abs(centers).max():

@@ -54,14 +54,14 @@ def read_transforms(path: Path) -> Scene:
             xyz, rgb = read_points(inside(root, str(meta["ply_file_path"]), path))
     masks = sum(frame.mask_path is not None for frame in frames)
     if 0 < masks < len(frames):
-        problems.add(f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to all or none.")
+        problems.append(f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to all or none.")
     with problems.collect():
         given = _matrix(meta.get("applied_transform", np.eye(4)), path)
         transform = rigid(given, f"{path}: applied_transform")
     with problems.collect():
         scale = _number(meta, "applied_scale", str(path), default=1.0)
         if scale <= 0:
-            problems.add(f"{path}: applied_scale is {scale:g}; it must be positive.")
+            problems.append(f"{path}: applied_scale is {scale:g}; it must be positive.")
     problems.raise_if_any()
     folder, frames = _photo_folder(root, frames)
     frames.sort(key=lambda frame: frame.name)

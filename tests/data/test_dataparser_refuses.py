@@ -227,7 +227,7 @@ def test_all_bad_photos_are_listed_at_once(scene):
 def test_long_lists_are_cut_with_a_count():
     problems = Problems()
     for i in range(SHOWN + 2):
-        problems.add(f"file\n{i}")
+        problems.append(f"file\n{i}")
     with pytest.raises(InputError) as caught:
         problems.raise_if_any()
     last = [f"file\\n{SHOWN - 1}", f"... and 2 more like these ({SHOWN + 2} in all)."]
