@@ -322,7 +322,7 @@ def test_a_folder_without_a_run_says_so(data, tmp_path, capsys, what):
     expected = {
         "nothing": "There is no run of ABCD",
         "checkpoint alone": "can be viewed but not trained further",
-        "not begun": "was ended before it began: start it anew",
+        "not begun": "ended before it began: start it anew",
     }
     assert expected[what] in refusal(configure(data, tmp_path / "out", load_dir=models), capsys)
 
