@@ -10,7 +10,6 @@ from typing import Any
 from abcd_ns.cluster.lease import WorkersError
 from abcd_ns.errors import first_line
 
-MISSING = "Workers need Ray, which is not installed: pip install 'abcd-ns[cluster]'."
 LOOPBACK = "127.0.0.1"
 ON_LOOPBACK = ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
 """Without it Ray takes an interface that others can reach, whatever address it is given."""
@@ -25,7 +24,7 @@ def check_installed() -> None:
         WorkersError: it cannot.
     """
     if importlib.util.find_spec("ray") is None:
-        raise WorkersError(MISSING)
+        raise WorkersError("Workers need Ray, which is not installed: pip install 'abcd-ns[cluster]'.")
 
 
 def connect(address: str | None, *, cores: int, object_store_bytes: int | None = None) -> None:
@@ -69,9 +68,7 @@ def keep_to_ourselves(starts: bool) -> None:
         WorkersError: it was imported before.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault(
-        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0"
-    )  # no GPU asked for: leave the others alone
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without num_gpus, leave GPUs visible
     if starts and "ray" in sys.modules and os.environ.get(ON_LOOPBACK[0]) != ON_LOOPBACK[1]:
         raise WorkersError(
             "Ray was imported before workers were asked for, and would listen to strangers: set "

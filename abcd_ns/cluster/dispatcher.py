@@ -85,8 +85,6 @@ class Dispatcher(Coordinator):
         self._shown: dict[int, tuple[int, Callable[[], Gaussians]]] = {}
         self._numbers, self._ended = itertools.count(1), 0
         self._counted = self.state.step
-        self.refused = 0
-        """Answers that came after their lease was given up."""
 
     # -- a step, here or elsewhere -------------------------------------------------------------------
 
@@ -161,7 +159,7 @@ class Dispatcher(Coordinator):
             pass
 
     def _lent_of(self, active: ActiveVisit) -> Lent:
-        state, scene, block = self.state, self.scene, active.geometry.block
+        state, scene, block, light = self.state, self.scene, active.geometry.block, self.run.light
         blocks = range(scene.tree.num_blocks)
         mail = scene.mail(block)
         task = VisitTask(
@@ -172,7 +170,7 @@ class Dispatcher(Coordinator):
             seconds=self.stopwatch.seconds,
             sweep=state.sweep,
             health=state.health.get(block, BlockHealth()),
-            light=self._light_of(active.views),
+            light={} if light is None else {v: light.of(v).detach().cpu() for v in active.views},
             poses=self.run.poses.to_json(),
             beside=self._beside(active),
             allowance=self._allowance(),
@@ -182,11 +180,6 @@ class Dispatcher(Coordinator):
         own = self.workers.share(with_mail(scene, block))
         lease = Lease(next(self._numbers), task, own, {b: self._as_drawn(b) for b in blocks})
         return Lent(active, lease, len(mail or ()), self._ended + active.steps * max(active.batch, 1))
-
-    def _light_of(self, views: Sequence[int]) -> dict[int, Tensor]:
-        """The transforms of these views by now."""
-        light = self.run.light
-        return {} if light is None else {view: light.of(view).detach().cpu() for view in views}
 
     def _as_drawn(self, block: int) -> Callable[[], Gaussians]:
         """What reads a block as it is now; what was shared before stays with the leases that have it."""
@@ -217,19 +210,16 @@ class Dispatcher(Coordinator):
                 now = replace(lent.lease.task, seconds=self.stopwatch.seconds)  # it may have waited for long
                 lent.lease = replace(lent.lease, task=now)
                 self.workers.submit(lent.lease)
-                lent.submitted = True
-                active, task = lent.active, lent.lease.task
-                seen, gaussians = len(active.trained_on), task.outlines.counts[active.geometry.block]
+                lent.submitted, active, block = True, lent.active, lent.active.geometry.block
                 if not lent.losses:
-                    block = active.geometry.block
-                    self.announce(VisitBegan(active.number, task.sweep, block, active.steps, seen, gaussians))
+                    seen, gaussians = len(active.trained_on), now.outlines.counts[block]
+                    self.announce(VisitBegan(active.number, now.sweep, block, active.steps, seen, gaussians))
 
     # -- taking in -----------------------------------------------------------------------------------
 
     def _hear(self, report: Report) -> None:
         lent = next((lent for lent in self._lent if lent.lease.number == report.lease), None)
-        if lent is None or lent.outcome is not None:
-            self.refused += isinstance(report, Finished)
+        if lent is None or lent.outcome is not None:  # its lease was given up
             return
         match report:
             case StepsSeen():
@@ -242,12 +232,11 @@ class Dispatcher(Coordinator):
 
     def _lose(self, lent: Lent, why: str) -> None:
         lent.losses += 1
-        block = lent.active.geometry.block
-        self.announce(WorkerLost(block, why))
+        self.announce(WorkerLost(block := lent.active.geometry.block, why))
         if lent.losses >= LOSSES:
             raise WorkersError(
-                f"The visit to block {block + 1} lost {LOSSES} workers, the last one so: {why}. All that was "
-                "taken in is safe; see to their memory (abcd plan says what a block needs), and go on."
+                f"The visit to block {block + 1} lost {LOSSES} workers, the last one so: {why}. What other "
+                "visits did is safe: free memory (abcd plan says what a block needs) and resume."
             )
         lent.lease, lent.submitted = replace(lent.lease, number=next(self._numbers)), False
 
@@ -268,14 +257,10 @@ class Dispatcher(Coordinator):
         active.layer_seconds = outcome.layer_seconds
         updates = settle(self.scene, block, outcome.state, self.config.recipe.migrate, lent.taken)
         rest_after_visit(self.run, active, outcome.state, updates, sweep)
-        if not self._is_under_way(sweep):
+        queued = state.sweep == sweep and state.queue
+        if not queued and all(other.lease.task.sweep != sweep for other in self._lent):
             self.announce(SweepEnded(sweep, state.step))
         return True
-
-    def _is_under_way(self, sweep: int) -> bool:
-        """Whether visits of a sweep are still to come, or out."""
-        queued = self.state.sweep == sweep and bool(self.state.queue)
-        return queued or any(lent.lease.task.sweep == sweep for lent in self._lent)
 
     # -- at rest -------------------------------------------------------------------------------------
 
@@ -286,11 +271,9 @@ class Dispatcher(Coordinator):
         self._counted = self.state.step
 
     def dismiss(self) -> None:
-        """End the workers."""
         self.workers.close()
 
     def close(self) -> None:
-        """End the workers, write what waits, and let go of the store."""
         try:
             self.dismiss()
         finally:

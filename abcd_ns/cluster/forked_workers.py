@@ -21,8 +21,18 @@ from typing import Any, NoReturn
 
 import torch
 
-from abcd_ns.cluster.lease import Finished, Lease, Lost, Parcel, Report, StepsSeen, WorkersError
-from abcd_ns.cluster.members import Member, Members, RecentMean
+from abcd_ns.cluster.lease import (
+    Finished,
+    Lease,
+    Lost,
+    Member,
+    Parcel,
+    RecentMean,
+    Report,
+    StepsSeen,
+    Workers,
+    WorkersError,
+)
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
@@ -72,7 +82,7 @@ class Place(Member):
     """Whether it has said anything: from then on it ends when this process does."""
 
 
-class ForkedWorkers(Members[Place]):
+class ForkedWorkers(Workers[Place]):
     """So many processes at most at a time.
 
     Args:
@@ -87,11 +97,9 @@ class ForkedWorkers(Members[Place]):
         super().__init__([Place(number, since=now, free_since=now) for number in range(count)])
 
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
-        """The value itself: a fork has it, too, and what is at rest never changes."""
-        return lambda: value
+        return lambda: value  # a fork has it, too, and what is at rest never changes
 
     def submit(self, lease: Lease) -> None:
-        """Fork a process for a visit."""
         member = self._longest_idle()
         member.take(lease)
         member.heard, member.lives = time.monotonic(), False

@@ -1,8 +1,12 @@
 """What passes between the one who lends blocks and those who train them."""
 
+import math
+import time
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -58,7 +62,6 @@ class VisitOutcome:
     """On the CPU; Gaussians that left the cell are still among them."""
     done: int
     """Steps taken."""
-    """Gaussians of the block and around it, when the visit began."""
     shown: dict[int, float]
     """The influence that the block has on views that were doubtful."""
     health: BlockHealth
@@ -129,38 +132,120 @@ class Lost:
 Report = StepsSeen | Finished | Lost
 
 
-class Workers(Protocol):
-    """Those who train visits."""
+@dataclass
+class Member:
+    """A worker, or the place for one. Times are of `time.monotonic`."""
+
+    number: int
+    lease: Lease | None = None
+    """What it trains."""
+    done: int = 0
+    """Steps of its visit so far."""
+    ready: bool = True
+    since: float | None = None
+    """When it was first ready."""
+    free_since: float = 0.0
+    waited: float = 0.0
+    """Seconds without a block until its last visit began."""
+    pid: int = 0
+    visits: int = 0
+    deaths: int = 0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether it could take a visit now."""
+        return self.ready and self.lease is None
+
+    def take(self, lease: Lease) -> None:
+        """Begin a visit."""
+        self.waited += time.monotonic() - self.free_since
+        self.lease, self.done = lease, 0
+
+    def put_down(self) -> Lease:
+        """End the visit, whatever became of it."""
+        lease, self.lease, self.free_since = self.lease, None, time.monotonic()
+        return lease
+
+    def seen(self) -> WorkerSeen:
+        """What it is doing."""
+        now, visit = time.monotonic(), self.lease and self.lease.task.active
+        waited = self.waited + (now - self.free_since if self.is_idle else 0.0)
+        share = min(waited / max(now - self.since, 1e-9), 1.0) if self.since else 0.0
+        block, steps = (visit.geometry.block, visit.steps) if visit else (None, 0)
+        return WorkerSeen(self.number, block, self.done, steps, self.visits, self.deaths, share)
+
+
+M = TypeVar("M", bound=Member)
+
+
+class Workers(ABC, Generic[M]):
+    """Those that train visits."""
+
+    def __init__(self, members: Sequence[M]) -> None:
+        self._members = list(members)
 
     @property
     def count(self) -> int:
         """How many there are, those that are starting included."""
+        return len(self._members)
 
     @property
     def idle(self) -> int:
         """How many could take a visit now."""
+        return sum(member.is_idle for member in self._members)
 
+    @property
+    def pids(self) -> list[int]:
+        """Processes of those that train."""
+        return [member.pid for member in self._members if member.lease is not None]
+
+    @abstractmethod
     def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
         """What reads this wherever a worker is, as long as the caller keeps it."""
 
+    @abstractmethod
     def submit(self, lease: Lease) -> None:
-        """Give a visit to one that is idle."""
+        """Give a visit to the one that has been idle for longest."""
 
     def hold(self) -> bool:
-        """Let those that are at work stand still; whether that can be done. Harmless when done twice."""
+        """Stop those that train; whether that can be done. Harmless when done twice."""
+        return not any(member.lease is not None for member in self._members)
 
     def go_on(self) -> None:
-        """Let those that stand still go on; to be called before anybody is waited for, or given a visit."""
+        """Let those that were stopped continue; to be called before `wait` and `submit`."""
 
+    @abstractmethod
     def wait(self, seconds: float) -> list[Report]:
         """What has happened, in order; waits for something so long at most.
 
         Raises:
-            WorkersError: a worker cannot do what it was asked, and no other could.
+            WorkersError: a worker cannot do its work, and no other could.
         """
 
     def seen(self) -> Sequence[WorkerSeen]:
         """What each is doing."""
+        return [member.seen() for member in self._members]
 
+    @abstractmethod
     def close(self) -> None:
         """End them. Harmless when done twice."""
+
+    def _longest_idle(self) -> M:
+        return min((m for m in self._members if m.is_idle), key=lambda member: member.free_since)
+
+
+class RecentMean:
+    """Of the last 16 finite numbers; NaN where there is none."""
+
+    def __init__(self) -> None:
+        self._last: deque[float] = deque(maxlen=16)
+
+    def add(self, value: float) -> None:
+        """One more."""
+        if math.isfinite(value):
+            self._last.append(value)
+
+    @property
+    def value(self) -> float:
+        """The mean."""
+        return sum(self._last) / len(self._last) if self._last else math.nan

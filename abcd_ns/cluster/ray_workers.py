@@ -13,26 +13,21 @@ from typing import Any
 
 import ray
 import torch
-from ray.exceptions import (
-    GetTimeoutError,
-    ObjectStoreFullError,
-    OutOfDiskError,
-    RayActorError,
-    RayError,
-    RayTaskError,
-)
+from ray import exceptions as of_ray
 
 from abcd_ns.cluster.lease import (
     Finished,
     Lease,
     Lost,
+    Member,
     Parcel,
+    RecentMean,
     Report,
     StepsSeen,
     VisitTask,
+    Workers,
     WorkersError,
 )
-from abcd_ns.cluster.members import Member, Members, RecentMean
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import Event, StepTaken
 from abcd_ns.engine.gaussians.block_state import BlockState
@@ -47,7 +42,7 @@ LOOK_EVERY = 1.0
 """Seconds between two questions."""
 STARTS = 3
 """Workers in a row that may end before they are ready; then there is something wrong with all of them."""
-FULL = (ObjectStoreFullError, OutOfDiskError)
+FULL = (of_ray.ObjectStoreFullError, of_ray.OutOfDiskError)
 
 
 @dataclass(frozen=True)
@@ -119,7 +114,7 @@ class Remote(Member):
     """When its last question was put, or it was started."""
 
 
-class RayWorkers(Members[Remote]):
+class RayWorkers(Workers[Remote]):
     """So many actors of the Ray cluster that this process is connected to; see `connect`.
 
     Args:
@@ -135,35 +130,28 @@ class RayWorkers(Members[Remote]):
         self._failed_starts = 0
         super().__init__([self._start(Remote(number)) for number in range(count)])
 
-    def share(self, value: Gaussians | BlockState) -> Callable[[], Gaussians | BlockState]:
-        """Put it where all workers can read it."""
-        return Shared.of(value)
+    share = staticmethod(Shared.of)
 
     def submit(self, lease: Lease) -> None:
-        """Give a visit to the one who has waited longest."""
         member = self._longest_idle()
         member.take(lease)
         member.asked_at = time.monotonic()
         member.asked = member.actor.visit.remote(lease.task, lease.state, dict(lease.drawn))
 
     def wait(self, seconds: float) -> list[Report]:
-        """What has happened; asks those that are at work how far they are."""
         self._ask()
         by_ref = {ref: member for member in self._members for ref in (member.asked, member.question) if ref}
         if not by_ref:
             return []
-        ray.wait(list(by_ref), num_returns=1, timeout=seconds)
+        ray.wait(list(by_ref), timeout=seconds)
         answered, _ = ray.wait(list(by_ref), num_returns=len(by_ref), timeout=0)
         reports: list[Report] = []
         for ref in answered:
-            member = by_ref[ref]
-            if ref == member.question:
-                reports += self._answer_of(member)
-            elif ref == member.asked:
-                reports += self._end_of(member, ref)
-        for member in self._members:
-            reports += self._give_up(member)
-        return reports
+            if ref == by_ref[ref].question:
+                reports += self._answer_of(by_ref[ref])
+            elif ref == by_ref[ref].asked:
+                reports += self._end_of(by_ref[ref], ref)
+        return reports + [report for member in self._members for report in self._give_up(member)]
 
     def _give_up(self, member: Remote) -> list[Report]:
         """Replace one that has not answered for too long."""
@@ -196,7 +184,7 @@ class RayWorkers(Members[Remote]):
         question, member.question = member.question, None
         try:
             steps, psnr = ray.get(question, timeout=0)
-        except (RayActorError, GetTimeoutError):
+        except (of_ray.RayActorError, of_ray.GetTimeoutError):
             return []  # what it was asked to do fails likewise, and says why
         if member.lease is None:
             return []
@@ -206,12 +194,12 @@ class RayWorkers(Members[Remote]):
     def _end_of(self, member: Remote, ref: ray.ObjectRef) -> list[Report]:
         try:
             answer = ray.get(ref)
-        except RayTaskError as error:
+        except of_ray.RayTaskError as error:
             if is_out_of_memory(error.cause):  # as if the kernel had killed it: a new one begins with none
                 ray.kill(member.actor)
                 return self._replace(member, "out of memory")
             raise _as_user_error(error, member.number) from error
-        except RayError as error:
+        except of_ray.RayError as error:
             return self._replace(member, first_line(error))
         member.asked, lease = None, member.put_down()
         if not member.ready:
@@ -242,7 +230,7 @@ def _no_room(error: Exception) -> WorkersError:
     )
 
 
-def _as_user_error(error: RayTaskError, number: int) -> Exception:
+def _as_user_error(error: of_ray.RayTaskError, number: int) -> Exception:
     """What a worker raised, as it would have been raised here."""
     cause = error.cause
     if isinstance(cause, UserError):

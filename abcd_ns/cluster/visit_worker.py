@@ -45,9 +45,8 @@ class RunSetup:
     def of(run: TrainingRun, layer_room: LayerRoom) -> "RunSetup":
         """Of a run that begins."""
         groups = {name: optimizer.param_groups[0] for name, optimizer in run.optimizers.items()}
-        options = {
-            name: {key: group[key] for key in ("lr", "betas", "eps")} for name, group in groups.items()
-        }
+        kept = ("lr", "betas", "eps")
+        options = {name: {key: group[key] for key in kept} for name, group in groups.items()}
         return RunSetup(run.config, run.budget, list(run.views.values()), options, layer_room)
 
 
@@ -105,7 +104,6 @@ class VisitWorker:
         """
         scene = LentScene(task.tree, task.outlines, task.active.geometry.block, state, drawn)
         run = self._run_of(task, scene)
-
         run.announce.subscribe(listen)
         run.announce.subscribe(self._read_ahead)
         run.stopwatch = Stopwatch(task.seconds, clock)
@@ -117,13 +115,9 @@ class VisitWorker:
         while not training.is_over:
             self._take_step(training, shared)
         active, block = run.active, run.active.geometry.block
-        return VisitOutcome(
-            training.finish(),
-            active.done,
-            run.state.influence[block],
-            run.state.health[block],
-            active.layer_seconds,
-        )
+        result, state = training.finish(), run.state
+        shown, health = state.influence[block], state.health[block]
+        return VisitOutcome(result, active.done, shown, health, active.layer_seconds)
 
     def _run_of(self, task: VisitTask, scene: LentScene) -> TrainingRun:
         setup, block = self._setup, task.active.geometry.block
@@ -160,12 +154,11 @@ class VisitWorker:
         batch = training.next_batch()
         targets = [self._target(sample) for sample in batch.samples]
         rendered = training.render(batch)
-        pictures, photos, wanted = [], [], []
+        rows = []
         for sample, picture, (photo, counts) in zip(batch.samples, rendered.pictures, targets, strict=True):
             found = (picture, photo, shared.target(sample, photo))
-            if counts is not None:
-                found = tuple(pixels * counts.to(picture.device) for pixels in found)
-            for pixels, into in zip(found, (pictures, photos, wanted), strict=True):
-                into.append(pixels)
+            masked = found if counts is None else [pixels * counts.to(picture.device) for pixels in found]
+            rows.append(masked)
+        pictures, photos, wanted = map(list, zip(*rows, strict=True))
         step_by(training.loss(batch, pictures, wanted), training.run.optimizers)
         training.after_step(rendered, squared_errors(pictures, photos))

@@ -5,7 +5,6 @@ which loads a cut cameras.bin silently and hangs on an empty points3D.bin.
 """
 
 import mmap
-import stat
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.picture_files import check_regular
 from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
 from abcd_ns.data.split_lists import read_list_files
 
@@ -66,16 +66,13 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
     Raises:
         InputError: a file is missing, cut, empty or absurd; every bad camera and pose is listed.
     """
-    binary = (model / "cameras.bin").exists()
-    suffix = ".bin" if binary else ".txt"
-    problems = Problems()
-    with problems.collect():
-        lenses = (_cameras_bin if binary else _cameras_txt)(model / f"cameras{suffix}")
-    with problems.collect():
-        posed = (_images_bin if binary else _images_txt)(model / f"images{suffix}")
-    with problems.collect():
-        xyz, rgb = (_points_bin if binary else _points_txt)(model / f"points3D{suffix}")
+    binary, problems, found = (model / "cameras.bin").exists(), Problems(), []
+    suffix, readers = (".bin", _BINARY) if binary else (".txt", _TEXT)
+    for name, read in zip(("cameras", "images", "points3D"), readers, strict=True):
+        with problems.collect():
+            found.append(read(model / f"{name}{suffix}"))
     problems.raise_if_any()
+    lenses, posed, (xyz, rgb) = found
     for number, lens in lenses.items():
         with problems.collect():
             check_lens(lens, f"{model}/cameras{suffix}: camera {number}")
@@ -83,9 +80,8 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
     for name, quat, translation, camera in posed:
         label = f"{model}/images{suffix}: {name}"
         if camera not in lenses:
-            problems.add(
-                f"{label} uses camera {camera}, which cameras{suffix} does not have; make the model again."
-            )
+            lacks = f"which cameras{suffix} does not have"
+            problems.append(f"{label} uses camera {camera}, {lacks}; make the model again.")
             continue
         with problems.collect():
             inside(photos, name, model / f"images{suffix}")
@@ -115,9 +111,8 @@ def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> n
     """Invert COLMAP's world to camera (w, x, y, z), t and turn it to OpenGL axes and a z-up world."""
     norm = np.linalg.norm(quat)
     if not (np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6):
-        raise InputError(
-            f"{label} has a pose with NaN, infinity or a zero quaternion; remove the photo from the model."
-        )
+        bad = "has a pose with NaN, infinity or a zero quaternion"
+        raise InputError(f"{label} {bad}; remove the photo from the model.")
     rotation = Rotation.from_quat(np.roll(quat, -1)).as_matrix()
     pose = np.concatenate([rotation.T * [1, -1, -1], -rotation.T @ translation[:, None]], axis=1)
     return rigid(Z_UP[:, :3] @ pose, label)
@@ -147,7 +142,7 @@ class _Cursor:
 
     def __init__(self, path: Path):
         self.path = path
-        _check_file(path)
+        check_regular(path, "file")
         with path.open("rb") as file:
             self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.at = 0
@@ -161,9 +156,8 @@ class _Cursor:
     def skip(self, size: int) -> None:
         """Go on by `size` bytes, which must be there."""
         if size > len(self.data) - self.at:
-            raise InputError(
-                f"{self.path} is cut: it ends at byte {len(self.data)} inside an entry; make it again."
-            )
+            end = len(self.data)
+            raise InputError(f"{self.path} is cut: it ends at byte {end} inside an entry; make it again.")
         self.at += size
 
     def count(self, smallest: int) -> int:
@@ -171,9 +165,8 @@ class _Cursor:
         (n,) = self.take("Q")
         left = len(self.data) - self.at
         if n * smallest > left:
-            raise InputError(
-                f"{self.path} claims {n} entries but only {left} bytes follow; copy or make it again."
-            )
+            what = f"claims {n} entries but only {left} bytes follow"
+            raise InputError(f"{self.path} {what}; copy or make it again.")
         return n
 
     def name(self) -> str:
@@ -188,10 +181,8 @@ class _Cursor:
     def finish(self) -> None:
         """Refuse bytes after the last entry: the count was wrong."""
         if self.at != len(self.data):
-            extra = len(self.data) - self.at
-            raise InputError(
-                f"{self.path} has {extra} bytes more than its entries need; copy or make it again."
-            )
+            what = f"has {len(self.data) - self.at} bytes more than its entries need"
+            raise InputError(f"{self.path} {what}; copy or make it again.")
 
 
 def _cameras_bin(path: Path) -> dict[int, Lens]:
@@ -245,7 +236,7 @@ def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number from 1, text) of all lines but comments; blank ones too: an image may have no 2D points."""
-    _check_file(path)
+    check_regular(path, "file")
     with path.open(encoding="utf-8", errors="surrogateescape") as file:
         for number, line in enumerate(file, start=1):
             if not line.startswith("#"):
@@ -257,8 +248,7 @@ def _broken_line(path: Path, number: int) -> InputError:
 
 
 def _cameras_txt(path: Path) -> dict[int, Lens]:
-    sizes = dict(_MODELS.values())
-    lenses = {}
+    sizes, lenses = dict(_MODELS.values()), {}
     for number, line in _lines(path):
         words = line.split()
         if not words:
@@ -278,8 +268,7 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 def _images_txt(path: Path) -> list[tuple[str, np.ndarray, np.ndarray, int]]:
     """Each image takes two lines: the pose, and its 2D points, which may be none."""
-    images = []
-    lines = _lines(path)
+    images, lines = [], _lines(path)
     for number, line in lines:
         if not line:
             continue
@@ -315,15 +304,5 @@ def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(xyz, dtype=np.float64).reshape(-1, 3), np.array(rgb, dtype=np.uint8).reshape(-1, 3)
 
 
-def _check_file(path: Path) -> None:
-    """Refuse what cannot be read as a file: nothing, a folder, a pipe (which would block), no bytes."""
-    try:
-        status = path.stat()
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error.strerror}); a model is cameras, images and points3D."
-        ) from None
-    if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path} is not a regular file; put COLMAP's file there.")
-    if status.st_size == 0:
-        raise InputError(f"{path} is empty; copy or make it again.")
+_BINARY = (_cameras_bin, _images_bin, _points_bin)
+_TEXT = (_cameras_txt, _images_txt, _points_txt)

@@ -32,9 +32,7 @@ class AbcdDataset(InputDataset):
         needs_photos: bool = True,
     ):
         if scale_factor != 1.0:
-            raise InputError(
-                "camera_res_scale_factor is not used here; set --downscale-factor of the dataparser instead."
-            )
+            raise InputError("camera_res_scale_factor has no effect: set --downscale-factor instead.")
         outputs = with_photos(dataparser_outputs, needs_photos)
         super().__init__(outputs, scale_factor)
         self.photos = Photos(outputs.metadata[PHOTOS], budget_bytes)

@@ -14,7 +14,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.photos import PhotoSource
+from abcd_ns.data.photos import PhotoSource, reduces_to
 from abcd_ns.data.picture_files import check_complete, read_header
 from abcd_ns.data.scene import Lens, check_lens
 from abcd_ns.data.undistort import undistortion
@@ -48,7 +48,9 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
                 header = read_header(path)
                 check_complete(path, header)
                 stored = header.size
-                _check_shape(str(path), stored, lens.size)
+                if not reduces_to(stored, lens.size):
+                    shapes = f"is {stored[0]} x {stored[1]} but its camera is {lens.width} x {lens.height}"
+                    raise InputError(f"{path} {shapes}; put the photos there that the model was made from.")
             flat = undistortion(lens) if lens.distorted else None
             mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
             if mask is not None and needs_photos:
@@ -90,13 +92,3 @@ def _lens(cameras: Cameras, row: int, label: str) -> Lens:
     lens = Lens(*size, fx, fy, cx, cy, coefficients, kind == _FISHEYE)
     check_lens(lens, label)
     return lens
-
-
-def _check_shape(label: str, stored: tuple[int, int], size: tuple[int, int]) -> None:
-    """A photo may be larger than its camera, then it is reduced; but it must show the same."""
-    (wide, high), (width, height) = stored, size
-    if wide < width or high < height or abs(wide / high * height - width) > max(1.0, width / height):
-        raise InputError(
-            f"{label} is {wide} x {high} but its camera is {width} x {height}; put the photos there that the "
-            "model was made from."
-        )

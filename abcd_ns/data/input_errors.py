@@ -50,23 +50,16 @@ class InputError(UserError):
         super().__init__("\n".join([*self.lines[:SHOWN], *more]))
 
 
-class Problems:
+class Problems(list[str]):
     """Collects errors so that all bad files are named at once, instead of one per run."""
 
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def add(self, line: str) -> None:
-        """Note one problem and go on."""
-        self.lines.append(line)
-
     @contextmanager
-    def collect(self) -> Iterator[None]:
-        """Note the InputError that the body raises, if any, and go on after it."""
+    def collect(self, label: str = "") -> Iterator[None]:
+        """Note the InputError that the body raises, if any, each line after the label, and continue."""
         try:
             yield
         except InputError as error:
-            self.lines.extend(error.lines)
+            self.extend(label + line for line in error.lines)
 
     def raise_if_any(self) -> None:
         """Raise one InputError with all that was noted.
@@ -74,5 +67,5 @@ class Problems:
         Raises:
             InputError: something was noted.
         """
-        if self.lines:
-            raise InputError(*self.lines)
+        if self:
+            raise InputError(*self)

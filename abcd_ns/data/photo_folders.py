@@ -31,22 +31,16 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
         except InputError as error:
             if not full.is_dir():
                 raise
-            notes.append(
-                f"{copies[factor]} does not fit and is not used; {full} is reduced instead ({error.lines[0]})"
-            )
+            notes.append(f"{copies[factor]} does not fit: {full} is reduced instead ({error.lines[0]})")
     if full.is_dir():
         return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene)
     if not copies:
         count, example = len(scene.frames), next((frame.name for frame in scene.frames), "none")
-        raise InputError(
-            f"{full} does not exist: put the {count} photos of {scene.model} there ({example}, ...)."
-        )
+        raise InputError(f"{full} does not exist: put the {count} photos there ({example}, ...).")
     of = max((n for n in copies if factor % n == 0), default=min(copies))
     if factor % of:
         found = of * max(factor // of, 1)
-        notes.append(
-            f"{full} does not exist: {copies[of]} is used, and photos are at 1/{found}, not 1/{factor}."
-        )
+        notes.append(f"{full} does not exist: {copies[of]} is used, at 1/{found} and not 1/{factor}.")
     return _check_folder(copies[of], of, scene.frames, max(factor, of)), notes
 
 
@@ -88,9 +82,7 @@ def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> li
 def _reduce(label: str, size: tuple[int, int], factor: int) -> tuple[int, int]:
     width, height = size[0] // factor, size[1] // factor
     if width == 0 or height == 0:
-        raise InputError(
-            f"{label}: --downscale-factor leaves nothing of {size[0]} x {size[1]} px; set a smaller one."
-        )
+        raise InputError(f"{label}: --downscale-factor leaves nothing of {size[0]} x {size[1]} px; lower it.")
     return width, height
 
 

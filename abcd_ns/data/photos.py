@@ -157,6 +157,12 @@ def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UIn
     return reduced.reshape(size[1], size[0], image.shape[2])
 
 
+def reduces_to(stored: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether a picture is large enough for a size, and of its proportion to half a pixel of the result."""
+    (wide, high), (width, height) = stored, size
+    return wide >= width and high >= height and abs(wide / high * height - width) <= max(1, width / height)
+
+
 def _decode(path: Path, keeps_alpha: Callable[[Image.Image], bool]) -> np.ndarray:
     """uint8 [H, W, 3 or 4] as stored."""
     try:
@@ -170,32 +176,23 @@ def _read_photo(source: PhotoSource) -> Tensor:
     image = _decode(source.path, has_alpha)
     if (image.shape[1], image.shape[0]) != source.stored:
         wanted = f"{source.stored[0]} x {source.stored[1]}"
-        raise InputError(
-            f"{source.path} is {image.shape[1]} x {image.shape[0]} px, not {wanted}; put the photo back."
-        )
+        raise InputError(f"{source.path} is no longer {wanted} px; put the photo back.")
     if source.alpha_color is not None and image.shape[2] == 4:
-        image = _on_color(image, source.alpha_color)
+        alpha, behind = image[..., 3:].astype(np.float32) / 255, 255 * np.float32(source.alpha_color)
+        image = np.rint(image[..., :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
     image = area_reduce(image, source.reduced)
     if source.undistortion:
         image = source.undistortion.apply(image)
     return torch.from_numpy(image)
 
 
-def _on_color(image: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
-    """A picture with alpha on one colour, uint8 [H, W, 3]."""
-    alpha = image[..., 3:].astype(np.float32) / 255
-    return np.rint(image[..., :3] * alpha + 255 * np.float32(color) * (1 - alpha)).astype(np.uint8)
-
-
 def _read_mask(source: PhotoSource) -> Tensor:
     mask = _decode(source.mask_path, lambda _: False).max(axis=2, keepdims=True)
     width, height = source.reduced
-    # Proportion, to half a pixel of the result: masks_N folders and full-size masks both do.
-    same_shape = abs(mask.shape[1] / mask.shape[0] * height - width) <= max(1.0, width / height)
-    if not same_shape or mask.shape[1] < width or mask.shape[0] < height:
+    if not reduces_to((mask.shape[1], mask.shape[0]), source.reduced):  # masks_N and full-size masks both do
         shape = f"{mask.shape[1]} x {mask.shape[0]}"
         raise InputError(
-            f"{source.mask_path} is {shape} px, unlike its photo of {width} x {height}; make the mask again."
+            f"{source.mask_path}: {shape} px, unlike its photo ({width} x {height}); replace it."
         )
     used = area_reduce(np.where(mask > 0, np.uint8(_MASK_USED), np.uint8(0)), source.reduced)
     used = np.where(used == _MASK_USED, used, 0)

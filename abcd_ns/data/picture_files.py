@@ -32,8 +32,11 @@ class Header:
     format: str
 
 
-def check_regular(path: Path) -> None:
+def check_regular(path: Path, kind: str = "photo") -> None:
     """Refuse what must not be opened: a missing file, a folder, a pipe (it would block), no bytes.
+
+    Args:
+        kind: what it is, for the message.
 
     Raises:
         InputError: names `path`.
@@ -43,12 +46,12 @@ def check_regular(path: Path) -> None:
     except OSError as error:
         what = "is a link to nothing" if path.is_symlink() else f"cannot be read ({error.strerror})"
         other = _other_ending(path)
-        fix = "copy the photo there" if other is None else f"{other.name} is there: rename it"
+        fix = f"copy the {kind} there" if other is None else f"{other.name} is there: rename it"
         raise InputError(f"{path} {what}; {fix}.") from None
     if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path} is not a regular file; copy the photo there.")
+        raise InputError(f"{path} is not a regular file; copy the {kind} there.")
     if status.st_size == 0:
-        raise InputError(f"{path} is empty; copy the photo again.")
+        raise InputError(f"{path} is empty; copy the {kind} again.")
 
 
 def _other_ending(path: Path) -> Path | None:
@@ -103,9 +106,7 @@ def read_header(path: Path, check_kind: bool = True) -> Header:
         fix = "reduce the photo and make the model again" if check_kind else "reduce the mask"
         raise InputError(f"{path} has more than 89 Mpx; {fix}.") from None
     except UnidentifiedImageError:
-        raise InputError(
-            f"{path} is not a picture of a known kind; save it as JPEG, PNG, WebP, TIFF or BMP."
-        ) from None
+        raise InputError(f"{path} is not a picture of a known kind; save it as JPEG or PNG.") from None
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); copy the photo again.") from None
 

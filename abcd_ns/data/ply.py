@@ -1,4 +1,7 @@
-"""Reads the points of a .ply file: positions and colours, nothing else."""
+"""Reads the points of a .ply file: positions and colours, nothing else.
+
+Not by plyfile, which takes 20 s for a million points in ascii, where this takes 2 s. nerfstudio writes ascii.
+"""
 
 import io
 from pathlib import Path
@@ -7,16 +10,8 @@ import numpy as np
 
 from abcd_ns.data.input_errors import InputError
 
-_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
+_NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
+_TYPES = dict(zip(_NAMES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
 GREY = 127
@@ -33,27 +28,23 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         InputError: missing, not a .ply with x, y and z in its first element, or not as long as it claims.
     """
     if not path.is_file():
-        raise InputError(
-            f"{path} does not exist; correct ply_file_path, or remove it to start from random points."
-        )
+        raise InputError(f"{path} does not exist; correct ply_file_path, or remove it to start at random.")
     content = path.read_bytes()
     end = content.find(b"end_header", 0, _MAX_HEADER)
     start = content.find(b"\n", end) + 1
-    if not content.startswith(b"ply") or end < 0 or start == 0:
-        raise _bad(path, "is not a .ply file")
-    order, count, row, alone = _parse_header(path, content[:end].decode("ascii", "replace"))
-    points = _read_rows(path, content[start:], order, count, row, alone)
+    try:
+        if not content.startswith(b"ply") or end < 0 or start == 0:
+            raise ValueError("is not a .ply file")
+        order, count, row, alone = _parse_header(content[:end].decode("ascii", "replace"))
+        points = (_read_text if order == "=" else _read_binary)(content[start:], count, row, alone)
+    except ValueError as error:
+        fix = "write the points again, or remove ply_file_path to start from random points"
+        raise InputError(f"{path} {error}; {fix}.") from None
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
     return xyz, _colors(points)
 
 
-def _bad(path: Path, what: str) -> InputError:
-    return InputError(
-        f"{path} {what}; write the points again, or remove ply_file_path to start from random points."
-    )
-
-
-def _parse_header(path: Path, header: str) -> tuple[str, int, np.dtype, bool]:
+def _parse_header(header: str) -> tuple[str, int, np.dtype, bool]:
     """(byte order, rows, type of a row, whether nothing follows the vertices)."""
     order, elements = None, []
     try:
@@ -67,29 +58,27 @@ def _parse_header(path: Path, header: str) -> tuple[str, int, np.dtype, bool]:
         name, count, fields = elements[0]
         row = np.dtype(fields)
     except (KeyError, IndexError, TypeError, ValueError):  # also where no format was given before
-        raise _bad(path, "has a header that cannot be read") from None
+        raise ValueError("has a header that cannot be read") from None
     if order is None or name != "vertex" or count < 0 or not {"x", "y", "z"} <= set(row.names or ()):
-        raise _bad(path, "does not start with vertices that have x, y and z")
+        raise ValueError("does not start with vertices that have x, y and z")
     return order, count, row, len(elements) == 1
 
 
-def _read_rows(path: Path, body: bytes, order: str, count: int, row: np.dtype, alone: bool) -> np.ndarray:
-    if order == "=":
-        lines = body.splitlines()[:count]
-        if len(lines) < count:
-            raise _bad(path, f"claims {count} points but has {len(lines)} lines")
-        try:
-            table = (
-                np.loadtxt(io.BytesIO(b"\n".join(lines)), dtype=row, ndmin=1) if count else np.empty(0, row)
-            )
-        except ValueError:
-            raise _bad(path, "has lines that cannot be read") from None
-        if len(table) != count:
-            raise _bad(path, f"claims {count} points but has {len(table)}")
-        return table
+def _read_text(body: bytes, count: int, row: np.dtype, _alone: bool) -> np.ndarray:
+    lines = body.splitlines()[:count]
+    try:
+        table = np.loadtxt(io.BytesIO(b"\n".join(lines)), row, ndmin=1) if lines else np.empty(0, row)
+    except ValueError:
+        raise ValueError("has lines that cannot be read") from None
+    if len(table) != count:
+        raise ValueError(f"claims {count} points but has {len(table)}")
+    return table
+
+
+def _read_binary(body: bytes, count: int, row: np.dtype, alone: bool) -> np.ndarray:
     needed = count * row.itemsize
     if needed > len(body) or (alone and needed != len(body)):
-        raise _bad(path, f"claims {count} points, {needed} bytes, but has {len(body)}")
+        raise ValueError(f"claims {count} points, {needed} bytes, but has {len(body)}")
     return np.frombuffer(body, dtype=row, count=count)
 
 

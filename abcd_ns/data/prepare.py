@@ -16,9 +16,9 @@ from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_
 from abcd_ns.data.photo_folders import assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
 from abcd_ns.data.picture_files import read_header
-from abcd_ns.data.scene import Frame, Lens, Scene, check_layout
+from abcd_ns.data.scene import Lens, Scene, check_layout
 from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read_transforms
-from abcd_ns.data.undistort import Undistortion, undistortion
+from abcd_ns.data.undistort import undistortion
 from abcd_ns.progress_bar import ProgressBar
 
 MAX_AUTO_SIDE = 1600
@@ -140,13 +140,9 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     problems.raise_if_any()
     sources, lenses = _sources(scene, files)
     poses = np.stack([frame.camera_to_world for frame in scene.frames])
-    similarity = normalizing_similarity(
-        poses,
-        options.orientation_method,
-        options.center_method,
-        options.auto_scale_poses,
-        options.scale_factor,
-    )
+    turned, centered = options.orientation_method, options.center_method
+    scaled = options.auto_scale_poses, options.scale_factor
+    similarity = normalizing_similarity(poses, turned, centered, *scaled)
     points, in_model, more = _points(scene, similarity)
     lists = scene.split_lists
     if lists and (both := len(lists.train & lists.held_out)):
@@ -187,11 +183,11 @@ def check_masks(sources: list[PhotoSource]) -> None:
     def look(row: int) -> list[str]:
         with (found := Problems()).collect():
             photos.mask(row)
-        return found.lines
+        return found
 
     with ThreadPoolExecutor() as pool, ProgressBar("Looking at masks", len(masked)) as bar:
         for lines in pool.map(look, range(len(masked))):
-            problems.lines.extend(lines)
+            problems.extend(lines)
             bar.advance()
     problems.raise_if_any()
 
@@ -221,21 +217,14 @@ def _sources(scene: Scene, files: list[PhotoSource]) -> tuple[list[PhotoSource],
     for frame, lens in zip(scene.frames, lenses, strict=True):
         if lens not in flats:
             flats[lens] = None
-            with problems.collect():
-                flats[lens] = _undistortion(frame, lens) if lens.distorted else None
+            with problems.collect(f"{frame.name}: "):
+                flats[lens] = undistortion(lens) if lens.distorted else None
     problems.raise_if_any()
     sources = [
         replace(file, undistortion=flats[lens], mask_path=frame.mask_path)
         for frame, file, lens in zip(scene.frames, files, lenses, strict=True)
     ]
     return sources, [flats[lens].pinhole if flats[lens] else lens for lens in lenses]
-
-
-def _undistortion(frame: Frame, lens: Lens) -> Undistortion:
-    try:
-        return undistortion(lens)
-    except InputError as error:
-        raise InputError(f"{frame.name}: {error}") from None
 
 
 def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np.ndarray, list[str]]:

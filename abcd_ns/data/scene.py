@@ -105,9 +105,7 @@ def inside(root: Path, relative: str, said_by: Path) -> Path:
         raise InputError(f"{said_by}: no file can have the name {relative}; correct the path.") from None
     path = Path(os.path.abspath(root / relative))
     if not path.is_relative_to(os.path.abspath(root)) or "\0" in relative:
-        raise InputError(
-            f"{said_by}: the path {relative} leads out of {root}; move the file inside and correct the path."
-        )
+        raise InputError(f"{said_by}: the path {relative} leads out of {root}; move the file inside.")
     return path
 
 
@@ -120,20 +118,14 @@ def check_lens(lens: Lens, label: str) -> None:
     values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
     side = max(lens.width, lens.height)
     if not (0 < lens.width <= MAX_SIDE and 0 < lens.height <= MAX_SIDE):
-        raise InputError(
-            f"{label} has the size {lens.width} x {lens.height}; the file is damaged, make the model again."
-        )
+        raise InputError(f"{label} has the size {lens.width} x {lens.height}; make the model again.")
     if not all(math.isfinite(v) for v in values):
         raise InputError(f"{label} has NaN or infinite parameters; make the model again.")
     for name, focal in (("fx", lens.fx), ("fy", lens.fy)):
         if not side / 50 < focal < side * 1000:
-            raise InputError(
-                f"{label} has the focal length {name} = {focal:g} px for {side} px; make the model again."
-            )
+            raise InputError(f"{label} has the focal length {name} = {focal:g} px; make the model again.")
     if not (-side < lens.cx < 2 * side and -side < lens.cy < 2 * side):
-        raise InputError(
-            f"{label} has its principal point at ({lens.cx:g}, {lens.cy:g}), far outside the photo."
-        )
+        raise InputError(f"{label} has a principal point outside the photo, ({lens.cx:g}, {lens.cy:g}).")
 
 
 def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
@@ -143,9 +135,7 @@ def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
         InputError: named `label`: wrong shape, NaN, infinite, a scale, a shear, a reflection, or too far off.
     """
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise InputError(
-            f"{label} must be a 4 x 4 or 3 x 4 matrix, not {' x '.join(map(str, matrix.shape))}."
-        )
+        raise InputError(f"{label} must be a 4 x 4 or 3 x 4 matrix, not {matrix.shape}.")
     if not np.isfinite(matrix).all():
         raise InputError(f"{label} holds NaN or infinity; remove the frame or repair its pose.")
     if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
@@ -156,9 +146,7 @@ def rigid(matrix: np.ndarray, label: str) -> np.ndarray:
     rotation = matrix[:3, :3].astype(np.float64)
     u, stretch, vt = np.linalg.svd(rotation)
     if not np.abs(stretch - 1).max() <= 1e-2 or np.linalg.det(rotation) < 0:
-        raise InputError(
-            f"{label} is no rotation (it scales, shears or mirrors); remove the frame or repair its pose."
-        )
+        raise InputError(f"{label} is no rotation (it scales or mirrors); repair its pose or remove it.")
     return np.concatenate([u @ vt, matrix[:3, 3:].astype(np.float64)], axis=1)
 
 
@@ -169,17 +157,13 @@ def check_layout(scene: Scene) -> None:
         InputError: fewer than two cameras, one name twice, or all cameras at one place.
     """
     if len(scene.frames) < 2:
-        raise InputError(
-            f"{scene.model} has {len(scene.frames)} camera(s); at least 2 are needed: add photos."
-        )
+        raise InputError(f"{scene.model} has {len(scene.frames)} camera(s), and 2 are needed: add photos.")
     problems = Problems()
     for name, times in Counter(frame.name for frame in scene.frames).items():
         if times > 1:
             many = "twice" if times == 2 else f"{times} times"
-            problems.add(f"{scene.model} names the photo {name} {many}; keep one pose of it.")
+            problems.append(f"{scene.model} names the photo {name} {many}; keep one pose of it.")
     problems.raise_if_any()
     centers = np.stack([frame.camera_to_world[:, 3] for frame in scene.frames])
     if np.abs(centers - centers[0]).max() <= 1e-12 * np.abs(centers).max():
-        raise InputError(
-            f"{scene.model} has all cameras at one place; 3D needs photos from different places."
-        )
+        raise InputError(f"{scene.model} has all cameras at one place; add photos from other places.")

@@ -51,7 +51,7 @@ def split_lists(
         if unknown:
             few = ", ".join(unknown[:_NAMED]) + (", ..." if len(unknown) > _NAMED else "")
             photos = "a photo" if len(unknown) == 1 else f"{len(unknown)} photos"
-            problems.add(f"{labels[split]} names {photos} without a pose ({few}); correct the list.")
+            problems.append(f"{labels[split]} names {photos} without a pose ({few}); correct the list.")
     problems.raise_if_any()
     listed = {split: frozenset(known[name] for name in names) for split, names in found.items()}
     held_out = listed.get("val", frozenset()) | listed.get("test", frozenset())
@@ -60,7 +60,9 @@ def split_lists(
         held_out = everything - train
     for side, names in (("train on", train), ("hold out", held_out)):
         if not names:
-            problems.add(f"{next(iter(labels.values()))} leaves nothing to {side}; set --eval-mode interval.")
+            problems.append(
+                f"{next(iter(labels.values()))} leaves nothing to {side}; set --eval-mode interval."
+            )
     problems.raise_if_any()
     return SplitLists(train, held_out)
 

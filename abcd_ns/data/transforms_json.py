@@ -41,32 +41,27 @@ def read_transforms(path: Path) -> Scene:
     root, problems = path.parent, Problems()
     model = str(meta.get("camera_model", "OPENCV"))
     if model not in _PINHOLES + _FISHEYES:
-        fix = "undistort the photos first"
-        raise InputError(
-            f"{path}: camera_model {model} is not one of {', '.join(_PINHOLES + _FISHEYES)}; {fix}."
-        )
+        known = ", ".join(_PINHOLES + _FISHEYES)
+        raise InputError(f"{path}: camera_model {model} is not one of {known}; undistort the photos first.")
     fisheye = model in _FISHEYES or bool(meta.get("is_fisheye", False))
     frames = []
     for number, entry in enumerate(meta["frames"]):
         with problems.collect():
-            frames.append(_frame(path, root, meta, entry, number, fisheye))
+            frames.append(_frame(path, meta, entry, number, fisheye))
     xyz, rgb = np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8)
     with problems.collect():
         if "ply_file_path" in meta:
             xyz, rgb = read_points(inside(root, str(meta["ply_file_path"]), path))
     masks = sum(frame.mask_path is not None for frame in frames)
     if 0 < masks < len(frames):
-        problems.add(
-            f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to every frame or to none."
-        )
+        problems.append(f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to all or none.")
     with problems.collect():
-        transform = rigid(
-            _matrix(meta.get("applied_transform", np.eye(4)), path), f"{path}: applied_transform"
-        )
+        given = _matrix(meta.get("applied_transform", np.eye(4)), path)
+        transform = rigid(given, f"{path}: applied_transform")
     with problems.collect():
         scale = _number(meta, "applied_scale", str(path), default=1.0)
         if scale <= 0:
-            problems.add(f"{path}: applied_scale is {scale:g}; it must be positive.")
+            problems.append(f"{path}: applied_scale is {scale:g}; it must be positive.")
     problems.raise_if_any()
     folder, frames = _photo_folder(root, frames)
     frames.sort(key=lambda frame: frame.name)
@@ -89,9 +84,7 @@ def read_split_transforms(folder: Path) -> Scene:
     for scene in scenes:
         same = np.array_equal(train.applied_transform, scene.applied_transform)
         if not same or train.applied_scale != scene.applied_scale:
-            raise InputError(
-                f"{scene.model} has another applied_transform than {train.model}; make both new."
-            )
+            raise InputError(f"{scene.model} and {train.model} need the same applied_transform; make both.")
         at = os.path.relpath(scene.photo_folder, folder)
         lists.append([replace(f, name=os.path.normpath(f"{at}/{f.name}")) for f in scene.frames])
     frames = sorted((frame for frames in lists for frame in frames), key=lambda frame: frame.name)
@@ -115,15 +108,13 @@ def _load(path: Path) -> dict[str, Any]:
 
 def _split_lists(path: Path, meta: dict[str, Any], folder: Path, names: list[str]) -> SplitLists | None:
     """train_filenames, val_filenames and test_filenames: file_paths of frames, as nerfstudio has it."""
-    found: dict[str, list[str]] = {}
+    found = {}
     for split in SPLITS:
-        key = f"{split}_filenames"
-        if key not in meta:
-            continue
-        listed = meta[key]
+        listed = meta.get(key := f"{split}_filenames", [])
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{path}: {key} must be a list of file_paths.")
-        found[split] = [os.path.normpath(name) for name in listed]
+        if key in meta:
+            found[split] = [os.path.normpath(name) for name in listed]
     called = {str(folder / name): name for name in names}
     # As for the frames' own file_paths, the ending may be left out.
     called |= {call.removesuffix(".png"): name for call, name in called.items()}
@@ -146,8 +137,8 @@ def _matrix(value: Any, label: object) -> np.ndarray:
         raise InputError(f"{label}: a matrix must be rows of numbers, all of one length.") from None
 
 
-def _frame(path: Path, root: Path, meta: dict, entry: dict, number: int, fisheye: bool) -> Frame:
-    name = entry.get("file_path")
+def _frame(path: Path, meta: dict, entry: dict, number: int, fisheye: bool) -> Frame:
+    root, name = path.parent, entry.get("file_path")
     if not isinstance(name, str) or not name:
         raise InputError(f"{path}: frame {number} has no file_path; remove it or name its photo.")
     label = f"{path}: {name}"
@@ -168,29 +159,25 @@ def _lens(values: dict[str, Any], label: str, photo: Path, fisheye: bool) -> Len
         width, height = (int(_number(values, key, label)) for key in ("w", "h"))
     else:
         width, height = read_header(photo).size
-    if "fl_x" in values:
-        fx = _number(values, "fl_x", label)
-    elif "camera_angle_x" in values:
-        fx = _focal(_number(values, "camera_angle_x", label), width, label)
-    else:
+    if "fl_x" not in values and "camera_angle_x" not in values:
         raise InputError(f"{label} has no focal length; give fl_x or camera_angle_x.")
-    if "fl_y" not in values and "camera_angle_y" in values and "fl_x" not in values:
-        fy = _focal(_number(values, "camera_angle_y", label), height, label)
-    else:
-        fy = _number(values, "fl_y", label, default=fx)
-    center = (
-        _number(values, "cx", label, default=width / 2),
-        _number(values, "cy", label, default=height / 2),
+    if "fl_x" not in values:
+        angles = (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height))
+        focals = {name: _focal(values, key, size, label) for name, key, size in angles if key in values}
+        values = focals | values
+    fx = _number(values, "fl_x", label)
+    fy, cx, cy = (
+        _number(values, key, label, default)
+        for key, default in (("fl_y", fx), ("cx", width / 2), ("cy", height / 2))
     )
-    return Lens(width, height, fx, fy, *center, _distortion(values, label, fisheye), fisheye)
+    return Lens(width, height, fx, fy, cx, cy, _distortion(values, label, fisheye), fisheye)
 
 
-def _focal(angle: float, size: int, label: str) -> float:
+def _focal(values: dict[str, Any], key: str, size: int, label: str) -> float:
     """Pixels: size / (2 tan(angle / 2)), for the full angle of view in radians."""
+    angle = _number(values, key, label)
     if not 0 < angle < math.pi:
-        raise InputError(
-            f"{label}: an angle of view of {angle:g} radians is no camera's; it lies between 0 and pi."
-        )
+        raise InputError(f"{label}: {key} is {angle:g} radians; it must lie between 0 and pi.")
     return size / (2 * math.tan(angle / 2))
 
 
@@ -206,9 +193,7 @@ def _distortion(values: dict[str, Any], label: str, fisheye: bool) -> tuple[floa
     if fisheye:
         return (k1, k2, k3, k4)
     if k4 != 0:
-        raise InputError(
-            f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort the photos first."
-        )
+        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
     return (k1, k2, p1, p2, k3)
 
 

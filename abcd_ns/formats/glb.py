@@ -73,14 +73,10 @@ def values(gaussians: Gaussians) -> list[np.ndarray]:
         *gaussians.features_rest.unbind(1),
     ]
     arrays = [value.float().cpu().numpy().astype("<f4") for value in found]
-    color = torch.cat((_linear(gaussians.features_dc * SH_C0 + 0.5), opacities), dim=1)
+    srgb = (gaussians.features_dc * SH_C0 + 0.5).clamp(0, 1)
+    linear = torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    color = torch.cat((linear, opacities), dim=1)
     return [arrays[0], (color * 255).round().to(torch.uint8).cpu().numpy(), *arrays[1:]]
-
-
-def _linear(color: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Of sRGB: COLOR_0 is linear."""
-    color = color.clamp(0, 1)
-    return torch.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def write_glb(
@@ -102,9 +98,7 @@ def write_glb(
     head = 12 + 8 + words + 8
     total = head + starts[-1]
     if total >= _LARGEST:
-        raise UserError(
-            f"{count:,} Gaussians are {bytes_in_words(total)} and a .glb holds 4; use --by-block."
-        )
+        raise UserError(f"{count:,} Gaussians: {bytes_in_words(total)}, and a .glb holds 4; use --by-block.")
     done, low, high = 0, np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
     with path.open("wb") as file:
         file.truncate(total)

@@ -17,9 +17,7 @@ def check_installed() -> None:
     try:
         import gaussforge  # noqa: F401
     except ImportError as error:
-        raise UserError(
-            f"gaussforge, which writes this format, is not there ({error}): pip install 'abcd-ns[export]'."
-        ) from None
+        raise UserError(f"gaussforge is not there ({error}): pip install 'abcd-ns[export]'.") from None
 
 
 def packed(count: int, sh_degree: int, kind: str, parts: Iterable[Gaussians]) -> bytes:

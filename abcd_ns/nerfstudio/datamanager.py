@@ -14,7 +14,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
 )
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch.utils.data import DataLoader
 
@@ -35,7 +35,6 @@ BATCH = "abcd_batch"
 """The key of a camera's metadata under which what to train on travels from here to the model."""
 TROUBLE = (*IMPORT_TROUBLE, ArithmeticError, AssertionError, LookupError)
 """What readers end with where data is not what they expect."""
-
 
 OUR_READER = "abcd-data"
 READERS: dict[str, DataParserConfig] = {
@@ -150,18 +149,15 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def create_train_dataset(self) -> AbcdDataset:
         """The training photos, under their share of RAM."""
         budget = int(self.config.photo_cache_gb * GIB) if self.config.photo_cache_gb else None
-        outputs = self.train_dataparser_outputs
-        return AbcdDataset(outputs, budget_bytes=budget, needs_photos=self._needs_photos)
+        return self._dataset(self.train_dataparser_outputs, budget)
 
-    @property
-    def _needs_photos(self) -> bool:
-        """Whoever views and exports a scene may have no photos."""
-        return self.test_mode != "inference"
+    def _dataset(self, outputs: DataparserOutputs, budget: int | None) -> AbcdDataset:
+        # Viewing and exporting need no photos.
+        return AbcdDataset(outputs, budget_bytes=budget, needs_photos=self.test_mode != "inference")
 
     def create_eval_dataset(self) -> AbcdDataset:
         """The held-out photos; looked at one after the other, so none is kept."""
-        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
-        return AbcdDataset(outputs, budget_bytes=0, needs_photos=self._needs_photos)
+        return self._dataset(self.dataparser.get_dataparser_outputs(split=self.test_split), 0)
 
     def follow(self, coordinator: Trainer) -> None:
         """Serve what this coordinator asks for from now on."""

@@ -148,9 +148,7 @@ def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int
             )
         return (trained if split == "train" else held_out).tolist()
     if config.eval_interval < 2:
-        raise InputError(
-            f"--eval-interval is {config.eval_interval}; it must be at least 2, or --eval-mode all."
-        )
+        raise InputError(f"--eval-interval {config.eval_interval} must be 2 or more; or set --eval-mode all.")
     return [row for row in range(count) if (row % config.eval_interval == 0) == (split != "train")]
 
 

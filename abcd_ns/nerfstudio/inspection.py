@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig
 
 from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
@@ -29,7 +29,9 @@ def inspect(config: DataParserConfig) -> Inspected:
         InputError: the data cannot be used.
     """
     parser = config.setup()
-    parts = [with_photos(_read(parser, split)) for split in ("train", "val")]
+    with reading(config):
+        read = [parser.get_dataparser_outputs(split=split) for split in ("train", "val")]
+    parts = [with_photos(outputs) for outputs in read]
     sources = list(dict.fromkeys(source for part in parts for source in part.metadata[PHOTOS]))
     if not parts[0].image_filenames:
         raise InputError(f"{config.data} has no photos to train on.")
@@ -42,8 +44,3 @@ def factor_of(parser: DataParser) -> int:
     """By which the photos' width and height are divided, once the parser has read; 1 if it does not say."""
     given = (getattr(parser, name, None) for name in ("factor", "downscale_factor", "_downscale_factor"))
     return int(next((factor for factor in given if factor), 1))
-
-
-def _read(parser: DataParser, split: str) -> DataparserOutputs:
-    with reading(parser.config):
-        return parser.get_dataparser_outputs(split=split)

@@ -9,7 +9,7 @@ import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.engine.callbacks import TrainingCallback
 from nerfstudio.model_components import renderers
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
@@ -44,6 +44,7 @@ from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rende
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.viewer import pictures as viewed
 
+Values = dict[str, Any]
 VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
 
@@ -80,9 +81,8 @@ class AbcdModel(SplatfactoModel):
         """Register empty parameters; what a run begins with is made when it begins."""
         empty = Gaussians.empty(self.config.sh_degree)
         self.gauss_params = ParameterDict({name: Parameter(value) for name, value in empty.items()})
-        self.camera_optimizer = self.config.camera_optimizer.setup(
-            num_cameras=self.num_train_data, device="cpu"
-        )
+        cameras = {"num_cameras": self.num_train_data, "device": "cpu"}
+        self.camera_optimizer = self.config.camera_optimizer.setup(**cameras)
         self._tree, self._poses = build_kd(torch.zeros(0, 3), 1), {}
         self.near = NEAR_PLANE
         self.step = 0
@@ -90,10 +90,8 @@ class AbcdModel(SplatfactoModel):
         self.psnr = psnr
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.crop_box: OrientedBox | None = None
-        random = self.config.background_color == "random"
-        self.background_color = (
-            torch.tensor(VIEWER_BACKGROUND) if random else get_color(self.config.background_color)
-        )
+        color = self.config.background_color
+        self.background_color = torch.tensor(VIEWER_BACKGROUND) if color == "random" else get_color(color)
         self.choice = viewed.Choice()
         self._coordinator: Trainer | None = None
         self._rasterizer: Rasterizer | None = None
@@ -240,15 +238,13 @@ class AbcdModel(SplatfactoModel):
         Where the device should not hold them all they are drawn unit by unit, by fragments: these fold to the
         same picture.
         """
-        if self._is_too_large():
+        training, too_large = self._coordinator, self._loaded_is_too_large
+        if training is not None:
+            too_large = training.count() > min(default_pass(self.scene()), self._most_at_once())
+        if too_large:
             return self._by_units(view, "fragments").everything()
         gaussians = self._crop(self.merged(self.device).to(self.device))
-        return self.draws_with()(
-            gaussians,
-            view,
-            sh_degree=self.config.sh_degree,
-            antialiased=self.config.rasterize_mode == "antialiased",
-        )
+        return self.draws_with()(gaussians, view, **vars(self._settings()))
 
     @torch.no_grad()
     def draw_composited(self, view: View) -> Layer:
@@ -309,16 +305,13 @@ class AbcdModel(SplatfactoModel):
             pass_gaussians=most if pass_gaussians is None else pass_gaussians,
             device=self.device,
         )
-        degree = self.config.sh_degree if sh_degree is None else sh_degree
-        settings = PaintSettings(degree, self.config.rasterize_mode == "antialiased")
+        settings = self._settings(sh_degree)
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
         return viewed.BlockPictures(painter, view, settings, training.window_weight)
 
-    def _is_too_large(self) -> bool:
-        """Whether the device should not hold the whole scene at once."""
-        if self._coordinator is None:
-            return self._loaded_is_too_large
-        return self._coordinator.count() > min(default_pass(self.scene()), self._most_at_once())
+    def _settings(self, sh_degree: int | None = None) -> PaintSettings:
+        degree = self.config.sh_degree if sh_degree is None else sh_degree
+        return PaintSettings(degree, self.config.rasterize_mode == "antialiased")
 
     def _most_at_once(self) -> int:
         """Gaussians that the device could draw at once, beside what it holds."""
@@ -332,7 +325,7 @@ class AbcdModel(SplatfactoModel):
 
     # -- loss and metrics ----------------------------------------------------------------------------
 
-    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+    def get_metrics_dict(self, outputs: Values, batch: Values) -> Values:
         """PSNR of what was drawn, a batch's mean, and the number of Gaussians in the scene.
 
         The mean squared error of each picture is left in `outputs`, for the pipeline to take.
@@ -342,9 +335,7 @@ class AbcdModel(SplatfactoModel):
         count = len(self.gauss_params["means"]) if self._coordinator is None else self._coordinator.count()
         return {"psnr": -10 * torch.stack(errors).log10().mean(), "gaussian_count": count}
 
-    def get_loss_dict(
-        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
-    ) -> dict[str, Tensor]:
+    def get_loss_dict(self, outputs: Values, batch: Values, metrics_dict: Values | None = None) -> Values:
         """The coordinator's loss of a training batch; of a whole picture the photometric loss."""
         del metrics_dict
         pictures, photos = self._pairs(outputs, batch)
@@ -358,15 +349,13 @@ class AbcdModel(SplatfactoModel):
         loss = photometric_loss(pictures[0], photos[0], ssim_lambda=self.config.ssim_lambda, **whole)
         return {"main_loss": loss}
 
-    def _pairs(self, outputs: dict[str, Any], batch: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
+    def _pairs(self, outputs: Values, batch: Values) -> tuple[list[Tensor], list[Tensor]]:
         """Pictures and their photos, on the same background."""
         backgrounds = zip(as_list(batch["image"]), as_list(outputs["background"]), strict=True)
         photos = [self.composite_with_background(self.get_gt_img(image), b) for image, b in backgrounds]
         return as_list(outputs["rgb"]), photos
 
-    def get_image_metrics_and_images(
-        self, outputs: dict[str, Any], batch: dict[str, Any]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+    def get_image_metrics_and_images(self, outputs: Values, batch: Values) -> tuple[Values, Values]:
         """Metrics of a whole picture, and photo and picture side by side."""
         (picture,), (photo,) = self._pairs(outputs, batch)
         found = image_metrics(picture, photo, self.config.color_corrected_metrics)
@@ -376,9 +365,6 @@ class AbcdModel(SplatfactoModel):
         """A photo as float32 in 0..1 on the device; samples have theirs reduced already."""
         return (image.float() / 255 if image.dtype == torch.uint8 else image).to(self.device)
 
-    def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
+    def get_training_callbacks(self, *_: Any, **__: Any) -> list[TrainingCallback]:
         """None: the pipeline's callbacks drive the coordinator, which does what splatfacto's would."""
-        del training_callback_attributes
         return []

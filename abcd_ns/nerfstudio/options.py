@@ -44,10 +44,7 @@ SAME = {
         "background": "background-color",
         "poses": "camera-optimizer.mode",
     },
-    DensityConfig: {
-        "refine_every": "refine-every",
-        "cull_alpha_thresh": "cull-alpha-thresh",
-    },
+    DensityConfig: {"refine_every": "refine-every", "cull_alpha_thresh": "cull-alpha-thresh"},
 }
 """By class and field, the flag of splatfacto's under --pipeline.model that means the same; taken too."""
 _HALVES = "each that grows becomes two, large or small"

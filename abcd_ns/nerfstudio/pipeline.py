@@ -5,7 +5,6 @@ import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -39,15 +38,7 @@ from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
-from abcd_ns.nerfstudio.fit import (
-    FITTED,
-    SCAFFOLD,
-    Demand,
-    Fit,
-    RamShares,
-    device_budget,
-    find_fit,
-)
+from abcd_ns.nerfstudio.fit import FITTED, SCAFFOLD, Demand, Fit, RamShares, device_budget, find_fit
 from abcd_ns.nerfstudio.flags import named_too, opens_ours, trains_ours
 from abcd_ns.nerfstudio.inspection import factor_of
 from abcd_ns.nerfstudio.metrics import lpips_missing
@@ -82,20 +73,19 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """How blocks are trained."""
     blocks: int = 0
-    """Number of blocks that space is cut into. 0 takes as few as `device_budget_gb` allows, one where the
-    scene fits, and cuts blocks that outgrow it in two; a number forces so many, which nothing holds in it."""
+    """Number of blocks. 0 takes as few as `device_budget_gb` allows and splits those that outgrow it. A
+    number forces that many blocks; the memory budget is then not enforced."""
     device_budget_gb: float = 0.0
-    """Memory of the device that training may take, GiB, by which `blocks` 0 is decided; 0 takes 0.9 of what
-    is free on a GPU, and a quarter of the machine's RAM on a CPU. Of a GPU's, an eighth is for layers and an
-    eighth for photos."""
+    """Device memory for training, GiB; sets the number of blocks where `blocks` is 0. Of a GPU's, an eighth
+    is for layers and one for photos. 0 takes 90% of a GPU's free memory; on a CPU, a quarter of the RAM."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
     near_plane: float = 0.0
     """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
     the nearest distance at which a photo shows a point."""
     ram_budget_gb: float = 0.0
-    """RAM for photos, blocks and layers that could be read or drawn again, GiB; no result depends on it, but
-    that `workers` 0 is one where it is set. 0 takes 8, or 40% of the machine's memory where that is less."""
+    """RAM for cached photos, blocks and layers, GiB. Does not change results. Setting it turns off automatic
+    workers. 0 takes 8, or 40% of the machine's memory where that is less."""
     workers: int = 0
     """Blocks that are trained at once, each by a process of its own: on a core each, or on a GPU each, which
     needs Ray (pip install 'abcd-ns[cluster]'). 0 takes all cores where there is no GPU, as far as there are
@@ -135,18 +125,15 @@ class AbcdPipeline(VanillaPipeline):
         self._rendered: Rendered | None = None
         self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
 
-    def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
-        """Everything exists by now, checkpoint included: begin, or go on, and drive the coordinator."""
-        trainer = training_callback_attributes.trainer
-        self.coordinator = self._begin(trainer.run, training_callback_attributes.optimizers.optimizers)
+    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
+        """Everything exists by now, checkpoint included: begin or resume, and drive the coordinator."""
+        trainer = attributes.trainer
+        self.coordinator = self._begin(trainer.run, attributes.optimizers.optimizers)
         self.datamanager.follow(self.coordinator)
         self.model.follow(self.coordinator)
         report = ProgressReport(self.coordinator)
+        log = keep_log(trainer.run, self.datamanager.train_dataset.photos, self.coordinator)
         self.coordinator.announce.subscribe(report)
-        photos = self.datamanager.train_dataset.photos
-        log = keep_log(trainer.run, photos, self.coordinator)
         self.coordinator.announce.subscribe(log)
         self.panel.follow(self.coordinator)
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -182,15 +169,13 @@ class AbcdPipeline(VanillaPipeline):
         self.datamanager.take_poses(self.model.poses)
         return super().get_eval_image_metrics_and_images(step)
 
-    def get_average_eval_image_metrics(
-        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
-    ) -> dict[str, Any]:
+    def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """As VanillaPipeline's; while training, it is no training time, and listeners are told."""
         if self.coordinator is not None:
             self.coordinator.pause()
         self.datamanager.take_poses(self.model.poses)
         with _as_a_command():
-            found = super().get_average_eval_image_metrics(step, output_path, get_std)
+            found = super().get_average_eval_image_metrics(*args, **kwargs)
         if self.coordinator is not None:
             self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
         elif "lpips" not in found:  # nerfstudio's writers, while training, want numbers
@@ -245,8 +230,9 @@ class AbcdPipeline(VanillaPipeline):
             return ExactTrainer(run)
         if run.config.recipe.overlap > 0:
             return independent_trainer(run)
-        source, target = LayerSource(run, self._room_for_layers()), self.datamanager.target
-        blocks = run.scene.tree.num_blocks
+        blocks, layers = run.scene.tree.num_blocks, self._ram.layers  # on the CPU, RAM is the device
+        room = LayerRoom(layers) if self._on_cpu else LayerRoom(int(LAYER_SHARE * self._budget), layers)
+        source, target = LayerSource(run, room), self.datamanager.target
         # Where RAM is short, one process: each reads blocks for itself.
         wanted = self.config.workers or int(self.config.ram_budget_gb > 0)
         workers = number_of_workers(wanted, blocks, run.config, self.device)
@@ -263,12 +249,6 @@ class AbcdPipeline(VanillaPipeline):
         """Bytes of the device that training may take, of what is free when it begins."""
         return device_budget(self.config.device_budget_gb, self.device)
 
-    def _room_for_layers(self) -> LayerRoom:
-        """Of the device and of RAM; on the CPU these are one."""
-        if self._on_cpu:
-            return LayerRoom(self._ram.layers)
-        return LayerRoom(int(LAYER_SHARE * self._budget), self._ram.layers)
-
     def _fitted(self, store: ParameterStore, resumed: bool) -> dict[str, int]:
         """The limits that were fitted to the device: as the run began, unless it goes on with a budget of
         its own."""
@@ -281,15 +261,8 @@ class AbcdPipeline(VanillaPipeline):
     def _fit(self, points: int, blocks: int = 1) -> Fit:
         """How many blocks for a scene that goes on with so many Gaussians in so many blocks."""
         config = self.config
-        demand = Demand(
-            self._pixels,
-            points,
-            config.training,
-            most=config.training.density.limit,
-            factor=factor_of(self.datamanager.dataparser),
-            blocks=blocks,
-            on_cpu=self._on_cpu,
-        )
+        most, factor = config.training.density.limit, factor_of(self.datamanager.dataparser)
+        demand = Demand(self._pixels, points, config.training, most, factor, blocks, self._on_cpu)
         return find_fit(self._budget, demand)
 
     @property
@@ -325,11 +298,8 @@ class AbcdPipeline(VanillaPipeline):
         self._tell_of_points(len(everything))
         gaussians = thin_out(everything, training.density.limit, training.seed)
         if len(gaussians) < len(everything):
-            CONSOLE.print(
-                f"Training begins with {len(gaussians):,} of {len(everything):,} Gaussians, the limit "
-                "on Gaussians.",
-                highlight=False,
-            )
+            words = f"Training begins with {len(gaussians):,} of {len(everything):,} Gaussians, the limit."
+            CONSOLE.print(words, highlight=False)
         del everything
         blocks, fitted = self._first_cut(len(gaussians))
         if self.config.partition == "kd":
@@ -366,7 +336,8 @@ class AbcdPipeline(VanillaPipeline):
             words = f"The data has no points: {begun:,} Gaussians begin at random places, as splatfacto's do."
             CONSOLE.print(words, highlight=False)
         if begun < self._points:
-            words = f"{self._points:,} points begin as {begun:,} Gaussians: photos of this size show no more."
+            merged = f"merged {self._points:,} points closer than these photos resolve"
+            words = f"Starting with {begun:,} Gaussians: {merged}."
             CONSOLE.print(words, highlight=False)
 
 

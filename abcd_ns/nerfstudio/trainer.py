@@ -29,15 +29,7 @@ from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STATE, STORE
-from abcd_ns.nerfstudio.run.resuming import (
-    RunRequest,
-    Start,
-    check_blocks,
-    check_folder,
-    find_start,
-    has_begun,
-    pin_name,
-)
+from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_go_on
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
@@ -89,12 +81,11 @@ class AbcdTrainerConfig(TrainerConfig):
         """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
         with at_once(partial(CONSOLE.print, "Stopped before anything was written.")):
             self.check()
-        with exit_on_user_error():
-            try:
-                super().save_config()
-            except OSError as error:
-                words = f"{error.filename} cannot be made: {error.strerror}. Choose another --output-dir."
-                raise UserError(words) from None
+        try:
+            super().save_config()
+        except OSError as error:
+            print_error(f"{error.filename} cannot be made: {error.strerror}. Choose another --output-dir.")
+            raise SystemExit(2) from None
 
     def check(self) -> None:
         """Choose the device, and look at the options, the folder, what the run goes on from, and the data,
@@ -107,8 +98,7 @@ class AbcdTrainerConfig(TrainerConfig):
             CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
         with exit_on_user_error():
             start = find_start(self)
-            check_folder(self.get_base_dir() / STATE / STORE, start)
-            check_blocks(start, self.pipeline.blocks)
+            check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
             check_options(self)
             found = inspect(self.pipeline.datamanager.reader())
             if self.pipeline.blocks == 0:
@@ -117,15 +107,10 @@ class AbcdTrainerConfig(TrainerConfig):
     def _check_fit(self, found: Inspected) -> None:
         """See that some block fits on the device."""
         pipeline, model = self.pipeline, self.pipeline.model
-        demand = Demand(
-            found.pixels,
-            model.num_random if model.random_init else found.points or model.num_random,
-            pipeline.training,
-            most=pipeline.training.density.limit,
-            factor=found.factor,
-            on_cpu=self.machine.device_type == "cpu",
-        )
-        find_fit(device_budget(pipeline.device_budget_gb, self.machine.device_type), demand)
+        points, device = model.num_random if model.random_init else found.points, self.machine.device_type
+        most, of_photos = pipeline.training.density.limit, {"factor": found.factor, "on_cpu": device == "cpu"}
+        demand = Demand(found.pixels, points or model.num_random, pipeline.training, most, **of_photos)
+        find_fit(device_budget(pipeline.device_budget_gb, device), demand)
 
 
 class AbcdTrainer(Trainer):
@@ -152,9 +137,8 @@ class AbcdTrainer(Trainer):
     @property
     def run(self) -> RunRequest:
         """What the pipeline begins."""
-        return RunRequest(
-            self.config, self.base_dir / STATE, self.total_steps, self._options, self.resumed_from
-        )
+        folder, steps = self.base_dir / STATE, self.total_steps
+        return RunRequest(self.config, folder, steps, self._options, self.resumed_from)
 
     @property
     def training_state(self) -> str:
@@ -170,10 +154,8 @@ class AbcdTrainer(Trainer):
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """As nerfstudio's; what the user can mend ends the process with one line and code 2."""
-        with (
-            at_once(partial(self._say_that_it_ended, "Stopped before training began.")),
-            exit_on_user_error(),
-        ):
+        said = "Stopped before training began."
+        with at_once(partial(self._say_that_it_ended, said)), exit_on_user_error():
             super().setup(*args, **kwargs)
         self.pipeline.coordinator.announce.subscribe(self._may_stop)
         at = TrainingCallbackLocation
@@ -202,8 +184,8 @@ class AbcdTrainer(Trainer):
             with exit_on_user_error():
                 self.pipeline.coordinator.save()
             name, step = stopped.received.name, self.pipeline.coordinator.state.step
-            self._say(f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost.")
-            self._say_how_to_go_on()
+            said = f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost."
+            self._say_that_it_ended(said)
             raise SystemExit(stopped.exit_code) from None
         except (UserError, torch.cuda.OutOfMemoryError) as error:
             self._end_report()
@@ -288,9 +270,7 @@ class AbcdTrainer(Trainer):
         try:
             super()._update_viewer_state(step)
         except (ArithmeticError, AssertionError, AttributeError, LookupError, TypeError, ValueError) as error:
-            CONSOLE.print(
-                f"The viewer failed at step {step} ({error!r}); training goes on.", markup=False, emoji=False
-            )
+            self._say(f"The viewer failed at step {step} ({error!r}); training goes on.")
 
     def save_checkpoint(self, step: int) -> None:
         """Save the merged scene for nerfstudio's tools, and everything else in the store.
@@ -339,6 +319,4 @@ def _save_atomically(state: dict[str, Any], path: Path) -> None:
             crash_points.reached(crash_points.CHECKPOINT_WRITTEN)
         fsync_folder(path.parent)
     except (OSError, RuntimeError) as error:  # torch raises the latter for a full disk
-        raise UserError(
-            f"{path} could not be written: {error}. The training itself is safe in the store; free space."
-        ) from error
+        raise UserError(f"{path} could not be written: {error}. Free space; the store is safe.") from error

@@ -40,17 +40,13 @@ def check_workers(config: TrainerConfig) -> None:
     if workers < 0:
         raise UserError(f"--pipeline.workers must be 0 or more, not {workers}.")
     if cluster is not None and not workers:
-        raise UserError(
-            f"--pipeline.cluster {cluster} does not say how many workers: add --pipeline.workers."
-        )
+        raise UserError(f"--pipeline.cluster {cluster} needs a number of workers: add --pipeline.workers.")
     if workers <= 1 and cluster is None:
         return
     if cluster is not None or config.machine.device_type == "cuda":
         check_installed()
     if not _works_at_once(pipeline.training.recipe):
-        raise UserError(
-            "This method trains in one process; leave out --pipeline.workers and --pipeline.cluster."
-        )
+        raise UserError("This method has no workers: leave out --pipeline.workers and --pipeline.cluster.")
     if 0 < blocks <= workers:
         raise UserError(
             f"{workers} workers need more than {blocks} blocks: leave --pipeline.blocks out, or give "

@@ -208,19 +208,15 @@ class ExactTrainer(Trainer):
         owner, slack = self._owner_of_all(), optics.slack(everything.means)
         shapes = everything.means, everything.scales
         for block in range(tree.num_blocks):
-            inside = owner == block
-            if self.config.recipe.ownership == "fragments":
-                inside = inside | reaches(*shapes, tree.cell(block), slack, optics.slant)
+            inside = (owner == block) | reaches(*shapes, tree.cell(block), slack, optics.slant)
             rows = inside.nonzero()[:, 0]
             if len(rows):
                 yield block, rows, everything[rows].to(self.device)
 
     def _draw(self, block: int, gaussians: Gaussians, place: int) -> Raster:
         sample = self._batch.samples[place]
-        window = None
-        if self.config.recipe.ownership == "fragments":
-            grid = self.run.rasterizer.window_grid(sample.crop)
-            window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
+        grid = self.run.rasterizer.window_grid(sample.crop)
+        window = ray_interval(self.scene.tree.cell(block), sample.view, grid, self.device)
         shot = Shot(sample.view, sample.crop, None, window)
         options = {"sh_degree": self._degree, "antialiased": self.config.antialiased, "judge": self._asks}
         return self.run.rasterizer.draw(gaussians, [shot], **options)[0]
@@ -250,9 +246,8 @@ class ExactTrainer(Trainer):
             self.run.density.regularisation(self.params, self.count()).backward()
         for optimizer in self.optimizers.values():
             optimizer.step()
-        clocks = replace(
-            state.clocks, steps=state.clocks.steps + taken, adam_views=state.clocks.adam_views + taken
-        )
+        steps, views = state.clocks.steps + taken, state.clocks.adam_views + taken
+        clocks = replace(state.clocks, steps=steps, adam_views=views)
         clock = self._clock_of(block, len(state), clocks, taken)
         growth = self.run.density.after_step(
             self.params,

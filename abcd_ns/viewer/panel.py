@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import psutil
@@ -13,18 +13,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
-from abcd_ns.engine.events import (
-    Event,
-    LayersDrawn,
-    SweepEnded,
-    VisitBegan,
-    VisitEnded,
-    WorkerSeen,
-    WorkersSeen,
-)
+from abcd_ns.engine import events
+from abcd_ns.engine.events import Event, LayersDrawn, WorkerSeen, WorkersSeen
 from abcd_ns.engine.space.influence import worth_training
-from abcd_ns.engine.space.tree import BlockTree, Box
-from abcd_ns.engine.store.scene import BlockScene
+from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
@@ -32,7 +24,6 @@ from abcd_ns.viewer.boxes import boxes_of, bulk
 from abcd_ns.viewer.chart import curve_image
 from abcd_ns.viewer.controls import CURVE, Controls
 from abcd_ns.viewer.guard import rules_of
-from abcd_ns.viewer.pictures import Choice
 from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, seconds_left, sweep_share
 from abcd_ns.viewer.scenery import Scenery, first_look, views_that_see
 from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, sweep_line, workers_line
@@ -44,17 +35,6 @@ MOST_POINTS = 2000
 """Gaussians of a block that tell which cameras see it."""
 
 
-class Drawn(Protocol):
-    """What the panel wants of a model."""
-
-    tree: BlockTree
-    choice: Choice
-
-    def scene(self) -> BlockScene:
-        """The scene by blocks."""
-        ...
-
-
 class AbcdPanel(ViewerControl):
     """Shows where a run stands, and lets the user choose what is drawn.
 
@@ -62,10 +42,11 @@ class AbcdPanel(ViewerControl):
     training lock: events come from the training thread, which holds it, and the user's choices take it.
 
     Args:
+        model: an AbcdModel: its `tree`, `choice` and `scene()` are read.
         views: gives the training views when asked.
     """
 
-    def __init__(self, model: Drawn, views: Callable[[], list[View]]) -> None:
+    def __init__(self, model: Any, views: Callable[[], list[View]]) -> None:
         self._model, self._views = model, views
         self._coordinator: Trainer | None = None
         self._history = RunHistory()
@@ -88,9 +69,8 @@ class AbcdPanel(ViewerControl):
         if not share and (line := reach(viewer.config.websocket_host)) is not None:
             CONSOLE.print(line, highlight=False)
         # nerfstudio's title bar fetches a picture from its site; viser's offers everyone a public tunnel.
-        server.gui.configure_theme(
-            control_layout="collapsible", dark_mode=True, brand_color=(255, 211, 105), show_share_button=share
-        )
+        look = {"control_layout": "collapsible", "dark_mode": True, "brand_color": (255, 211, 105)}
+        server.gui.configure_theme(**look, show_share_button=share)
         trains = viewer.trainer is not None
         self._controls = Controls(server.gui, viewer.stats_markdown.order + 0.5, self._choose, trains)
         self._scenery = Scenery(server.scene, viewer.config.camera_frustum_scale)
@@ -114,7 +94,7 @@ class AbcdPanel(ViewerControl):
         self._workers = event.workers if isinstance(event, WorkersSeen) else self._workers
         self._layers = f"layers {event.done} of {event.total}" if isinstance(event, LayersDrawn) else ""
         due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
-        if due or isinstance(event, (VisitBegan, VisitEnded, SweepEnded)):
+        if due or isinstance(event, (events.VisitBegan, events.VisitEnded, events.SweepEnded)):
             self._update()
         if isinstance(event, WorkersSeen) or (due and isinstance(event, LayersDrawn)):
             self._let_viewer_draw()
@@ -130,7 +110,7 @@ class AbcdPanel(ViewerControl):
         finally:
             lock.acquire()
 
-    # -- what is shown -------------------------------------------------------------------------------
+    # -- what is shown
 
     def _lay_out(self) -> None:
         """Boxes and the list of blocks, once the cut of space is known, and when blocks were cut in two."""
@@ -225,9 +205,7 @@ class AbcdPanel(ViewerControl):
 
     def _chosen_block(self) -> int | None:
         visit = next(iter(self._history.under_way.values()), None)
-        if self._controls.block is not None or visit is None:
-            return self._controls.block
-        return visit.block
+        return visit.block if self._controls.block is None and visit is not None else self._controls.block
 
     def _show_cameras(self) -> None:
         block = self._chosen_block() if self._controls.cameras.value else None

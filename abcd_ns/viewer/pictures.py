@@ -152,8 +152,7 @@ class BlockPictures:
         if self.painter.ownership == "means":
             return None
         options = {"visible": self.window_weight, "antialiased": self.settings.antialiased}
-        rasterizer, view = self.painter.rasterizer, self.view
-        return rasterizer.depth_window(own, view, crop=view.full, **options)
+        return self.painter.rasterizer.depth_window(own, self.view, crop=self.view.full, **options)
 
     def _around(self, block: int, window: ZWindow | None) -> FrozenLayers:
         painter, view = self.painter, self.view

@@ -146,10 +146,8 @@ class RunHistory:
     def rows(self, counts: Mapping[int, int | None], views: Mapping[int, int]) -> list[BlockRow]:
         """The table: a row for each block of `counts`, in its order."""
         return [
-            BlockRow(
-                block, self.status(block, views.get(block)), count, self.psnr.get(block), views.get(block)
-            )
-            for block, count in counts.items()
+            BlockRow(b, self.status(b, views.get(b)), count, self.psnr.get(b), views.get(b))
+            for b, count in counts.items()
         ]
 
 

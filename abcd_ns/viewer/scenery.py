@@ -66,18 +66,13 @@ class Scenery:
     def _draw_box(self, block: int, box: Box, status: Status, shown: bool) -> list[viser.SceneNodeHandle]:
         active = status is Status.ACTIVE
         vertices, faces = frame_mesh(box, self._thickness * (STRONGER if active else 1))
-        name = f"/abcd/block_{block + 1}"
-        nodes = [
-            self._scene.add_mesh_simple(
-                name, vertices=vertices, faces=faces, color=COLORS[status], visible=shown
-            )
-        ]
+        number, look = block + 1, {"color": COLORS[status], "visible": shown}
+        name, label = f"/abcd/block_{number}", f"/abcd/label_{number}"
+        nodes = [self._scene.add_mesh_simple(name, vertices=vertices, faces=faces, **look)]
         if len(self._boxes) <= MOST_LABELS:
-            text = f"{block + 1} {status.value}" if active else str(block + 1)
+            text = f"{number} {status.value}" if active else str(number)
             position = tuple(((box.lower + box.upper) / 2 * SCENE_SCALE).tolist())
-            nodes.append(
-                self._scene.add_label(f"/abcd/label_{block + 1}", text, position=position, visible=shown)
-            )
+            nodes.append(self._scene.add_label(label, text, position=position, visible=shown))
         return nodes
 
     def show_cameras(self, views: Sequence[View]) -> None:

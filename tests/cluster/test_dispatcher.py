@@ -33,16 +33,12 @@ class Unreliable:
         self._out, self._late = [], []
         self.lost = self.answered_late = 0
 
-    @property
-    def count(self):
-        return self._inner.count
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
 
     @property
     def idle(self):
         return self.count - len(self._out)
-
-    def share(self, value):
-        return self._inner.share(value)
 
     def submit(self, lease):
         assert self.idle > 0
@@ -62,22 +58,11 @@ class Unreliable:
         if fate == "done":
             return late + reports
         self.lost += 1
-        if fate == "late":
-            self._late = [reports[-1]]
+        if fate == "late":  # and with another answer
+            outcome = reports[-1].outcome
+            self._late = [Finished(lease.number, replace(outcome, state=outcome.state.nobody))]
             self.answered_late += 1
         return [*late, Lost(lease.number, fate)]
-
-    def hold(self):
-        return self._inner.hold()
-
-    def go_on(self):
-        self._inner.go_on()
-
-    def seen(self):
-        return self._inner.seen()
-
-    def close(self):
-        pass
 
 
 @pytest.mark.parametrize("options", [{"density": GROWING}, {"density": STILL, "scaffold": 40, "warmup": 0.3}])
@@ -111,26 +96,9 @@ def test_what_a_run_computes_does_not_depend_on_who_is_done_first_or_lost(make, 
         lost = listen(shaken, WorkerLost)
         train(shaken, photos)
         assert len(lost) == workers[0].lost > 0
-        assert workers[0].answered_late >= shaken.refused
+        assert workers[0].answered_late > 0
         assert equal(whole_scene(steady), whole_scene(shaken))
         assert steady.state.to_json() | {"seconds": 0} == shaken.state.to_json() | {"seconds": 0}
-
-
-def test_a_visit_that_is_lent_again_knows_what_time_it_is(make, photos, monkeypatch):
-    run = make(workers=1, density=STILL)
-    submit, wait, lent = run.workers.submit, run.workers.wait, []
-
-    def lose_the_first(seconds):
-        if len(lent) > 1:
-            return wait(seconds)
-        run.stopwatch._before += 100.0
-        return [Lost(run.workers._leases.popleft().number, "it was killed")]
-
-    monkeypatch.setattr(run.workers, "submit", lambda lease: (lent.append(lease.task), submit(lease)))
-    monkeypatch.setattr(run.workers, "wait", lose_the_first)
-    train(run, photos, steps=8)
-    assert lent[0].active.number == lent[1].active.number
-    assert lent[1].seconds > lent[0].seconds + 100.0
 
 
 def test_visits_that_are_out_at_once_train_other_blocks_and_end_in_their_order(make, photos):
@@ -217,68 +185,6 @@ def test_a_run_that_stops_goes_on_with_any_number_of_workers(make, photos, goes_
     train(resumed, photos)
     assert resumed.state.step == 60
     assert len(whole_scene(resumed)) == len(whole_scene(stopped))
-
-
-def test_from_one_worker_to_two_and_back_nobody_is_lost_and_all_can_be_repeated(make, photos):
-    def trained(name: str):
-        for workers, until in ((1, 15), (2, 40), (1, 60)):
-            run = make(name, workers=workers, resume=workers != 1 or until == 60, density=STILL)
-            began = run.state.step
-            while run.state.step < until:
-                train_step(run, photos)
-            assert began < run.state.step
-            assert run.count() == len(whole_scene(run)) == 90
-            if until < 60:
-                assert run.state.in_flight
-                run.save()
-                run.close()
-        assert run.finished
-        assert run.state.step == 60
-        return run
-
-    one, other = trained("one"), trained("other")
-    assert equal(whole_scene(one), whole_scene(other))
-    assert one.state.to_json() | {"seconds": 0} == other.state.to_json() | {"seconds": 0}
-
-
-class CutOff:
-    """Workers in this process, one of whom is cut off once, given up, and heard again with an answer of its
-    own: `healed` waits later, which may be before or after the one who has its visit now."""
-
-    def __init__(self, inner, healed: int) -> None:
-        self._inner, self._healed, self._waits = inner, healed, 0
-        self._answer = None
-
-    def __getattr__(self, name):
-        return getattr(self._inner, name)
-
-    def wait(self, seconds):
-        self._waits += 1
-        reports = []
-        if self._waits == self._healed + 1:
-            reports.append(self._answer)
-        found = self._inner.wait(seconds)
-        if self._waits > 1:
-            return reports + found
-        (self._answer,) = found
-        outcome = self._answer.outcome
-        gaussians = replace(outcome.state.gaussians, means=outcome.state.gaussians.means + 1.0)
-        altered = replace(outcome, state=replace(outcome.state, gaussians=gaussians))
-        self._answer = Finished(self._answer.lease, altered)
-        return [Lost(self._answer.lease, "cut off")]
-
-
-def test_an_answer_that_comes_when_its_lease_has_ended_is_refused(make, photos):
-    steady = make("steady", workers=2, density=STILL)
-    train(steady, photos)
-    for healed in (1, 4):
-        name = f"cut, healed after {healed}"
-        cut = make(
-            name, workers=lambda r, healed=healed: CutOff(in_process(r, photos, 2), healed), density=STILL
-        )
-        train(cut, photos)
-        assert cut.refused == 1
-        assert equal(whole_scene(steady), whole_scene(cut))
 
 
 def test_a_visit_that_ends_every_worker_ends_the_run_with_one_line(make, photos):

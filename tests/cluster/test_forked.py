@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from abcd_ns.cluster import forked_workers
-from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork, last_words
+from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import WorkerLost, WorkersSeen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -95,21 +95,13 @@ def test_whoever_is_killed_is_replaced_and_nothing_is_lost(make, photos, steady)
     assert not any(is_alive(pid) for pid in alive)
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
-def test_full_ram_is_a_loss_whoever_says_so(error):
-    assert repr(last_words(error)) == "MemoryError('out of memory')"
+FULL = [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")]
 
 
-def test_a_visit_that_had_no_memory_is_lent_again(make, photos, steady, tmp_path):
-    run = make(once(tmp_path, raising(MemoryError())))
-    train(run, photos)
-    assert [worker.deaths for worker in run.workers.seen()].count(1) == 1
-    assert equal(steady[0], whole_scene(run))
-
-
-def test_so_is_one_that_nothing_is_heard_of(make, photos, steady, tmp_path, monkeypatch):
+@pytest.mark.parametrize("trouble", [*map(raising, FULL), lambda: time.sleep(600)])
+def test_a_visit_without_memory_or_a_word_is_lent_again(make, photos, steady, tmp_path, monkeypatch, trouble):
     monkeypatch.setattr(forked_workers, "SILENCE", 3.0)
-    run = make(once(tmp_path, lambda: time.sleep(600)))
+    run = make(once(tmp_path, trouble))
     train(run, photos)
     assert sum(worker.deaths for worker in run.workers.seen()) == 1
     assert equal(steady[0], whole_scene(run))

@@ -20,7 +20,7 @@ from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import WorkerLost, WorkersSeen
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.train.training_loop import train
-from abcd_ns.errors import UserError, is_out_of_memory
+from abcd_ns.errors import UserError
 from tests.cluster.conftest import GROWING, make_run
 from tests.reference.scenes import equal, listen, whole_scene
 
@@ -128,31 +128,6 @@ def test_a_worker_that_falls_silent_is_given_up(steady, lent, photos):
     train(lent, photos)
     assert [event.why for event in lost] == ["silent for 60 s"]
     assert equal(whole_scene(lent), steady[0])
-
-
-@pytest.mark.slow  # test_dispatcher has the same without Ray
-def test_one_who_is_heard_again_after_it_was_given_up_changes_nothing(steady, lent, photos, monkeypatch):
-    """A partition that heals: nobody could end it meanwhile, and its answer comes late."""
-    monkeypatch.setattr(ray_workers.ray, "kill", lambda _: None)
-    lent_first(lent)
-    member = lent.workers._members[0]
-    pid, actor, late = member.pid, member.actor, member.asked
-    lent.announce.subscribe(lambda e: os.kill(pid, signal.SIGCONT) if isinstance(e, WorkerLost) else None)
-    try:
-        silence(lent.workers)
-        train(lent, photos)
-        outcome = ray.get(late, timeout=60).outcome
-    finally:
-        os.kill(pid, signal.SIGCONT)
-    assert outcome.done > 0
-    assert equal(whole_scene(lent), steady[0])
-    del actor  # with nobody who knows it, Ray ends it
-
-
-def test_full_ram_is_told_from_other_trouble():
-    assert is_out_of_memory(TRAPS["memory"])
-    assert is_out_of_memory(TRAPS["torch"])
-    assert not is_out_of_memory(TRAPS["cuda"])
 
 
 def test_a_worker_that_runs_out_of_memory_takes_nothing_along(steady, lent, photos, traps):

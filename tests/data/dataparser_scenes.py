@@ -63,6 +63,12 @@ def write_photos(folder: Path, names: list[str] = NAMES, divide: float = 1, roun
         Image.fromarray(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)).save(folder / name)
 
 
+def write_capture(folder: Path, names: list[str] = NAMES, **options) -> pycolmap.Reconstruction:
+    """A model and its photos, where they are looked for."""
+    write_photos(folder / "images", names)
+    return write_model(folder / "sparse/0", names=names, **options)
+
+
 def parser(data: Path, **options) -> AbcdDataParser:
     return AbcdDataParserConfig(data=data, **options).setup()
 

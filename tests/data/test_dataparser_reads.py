@@ -15,8 +15,6 @@ from PIL import Image
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.ply import read_points
-from abcd_ns.engine.events import PhotosWanted
-from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -26,6 +24,7 @@ from tests.data.dataparser_scenes import (
     project,
     project_pycolmap,
     refusal,
+    write_capture,
     write_model,
     write_photos,
     write_transforms,
@@ -36,8 +35,7 @@ from tests.data.dataparser_scenes import (
 @pytest.mark.parametrize("factor", [1, 2])
 @pytest.mark.parametrize("text", [False, True])
 def test_points_project_where_pycolmap_projects_them(tmp_path, text, factor, offset):
-    model = write_model(tmp_path / "sparse/0", text=text, offset=offset)
-    write_photos(tmp_path / "images")
+    model = write_capture(tmp_path, text=text, offset=offset)
     outputs = parser(tmp_path, downscale_factor=factor, eval_mode="all").get_dataparser_outputs()
     assert [path.relative_to(tmp_path / "images").as_posix() for path in outputs.image_filenames] == sorted(
         NAMES
@@ -58,8 +56,7 @@ def test_points_project_where_pycolmap_projects_them(tmp_path, text, factor, off
 def test_geo_referenced_scene_is_the_same_scene(tmp_path, orientation, center):
     outputs = []
     for name, offset in (("near", 0.0), ("far", 5e6)):
-        write_model(tmp_path / name / "sparse/0", offset=offset)
-        write_photos(tmp_path / name / "images")
+        write_capture(tmp_path / name, offset=offset)
         options = {"orientation_method": orientation, "center_method": center}
         outputs.append(parser(tmp_path / name, **options).get_dataparser_outputs())
     near, far = outputs
@@ -69,8 +66,7 @@ def test_geo_referenced_scene_is_the_same_scene(tmp_path, orientation, center):
 
 
 def test_poses_go_back_to_original_coordinates(tmp_path):
-    model = write_model(tmp_path / "sparse/0", offset=5e6)
-    write_photos(tmp_path / "images")
+    model = write_capture(tmp_path, offset=5e6)
     outputs = parser(tmp_path, eval_mode="all").get_dataparser_outputs()
     back = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds)
     for row, name in enumerate(sorted(NAMES)):
@@ -97,13 +93,6 @@ def test_default_frame_is_nerfstudios(scene):
     assert torch.allclose(ours.cameras.camera_to_worlds, theirs.cameras.camera_to_worlds[order], atol=1e-5)
     assert torch.allclose(ours.dataparser_transform.float(), theirs.dataparser_transform, atol=1e-5)
     assert ours.dataparser_scale == pytest.approx(theirs.dataparser_scale, rel=1e-5)
-
-
-def test_held_out_views_are_every_eighth_by_name(scene):
-    train, test = (parser(scene).get_dataparser_outputs(split).image_filenames for split in ("train", "test"))
-    ordered = [scene / "images" / name for name in sorted(NAMES)]
-    assert test == ordered[::8]
-    assert sorted(train + test) == ordered
 
 
 @given(count=st.integers(2, 60), interval=st.integers(2, 12))
@@ -140,12 +129,6 @@ def test_dataset_gives_photos_of_the_cameras_sizes_and_writes_nothing(scene):
         AbcdDataset(outputs, scale_factor=0.5)
 
 
-def test_photo_of_a_pinhole_is_bit_equal(scene):
-    outputs = parser(scene).get_dataparser_outputs()
-    for i, path in enumerate(outputs.image_filenames):
-        assert np.array_equal(AbcdDataset(outputs).get_numpy_image(i), np.array(Image.open(path)))
-
-
 @pytest.mark.parametrize(("kind", "extra"), [("SIMPLE_RADIAL", [0.0]), ("OPENCV", [0.0, 0.0, 0.0, 0.0])])
 def test_zero_distortion_is_a_pinhole(tmp_path, scene, kind, extra):
     def params(w, h):
@@ -156,18 +139,6 @@ def test_zero_distortion_is_a_pinhole(tmp_path, scene, kind, extra):
     shutil.copytree(scene / "images", tmp_path / "zero/images")
     outputs = parser(tmp_path / "zero").get_dataparser_outputs()
     assert all(source.undistortion is None for source in outputs.metadata["photos"])
-
-
-def test_distorted_cameras_become_pinholes(tmp_path):
-    write_model(
-        tmp_path / "sparse/0", params=lambda w, h: ("OPENCV", [w, w, w / 2, h / 2, 0.1, 0.01, 1e-3, 2e-3])
-    )
-    write_photos(tmp_path / "images")
-    outputs = parser(tmp_path).get_dataparser_outputs()
-    assert outputs.cameras.distortion_params is None
-    for i, source in enumerate(outputs.metadata["photos"]):
-        assert source.size == (outputs.cameras.width[i].item(), outputs.cameras.height[i].item())
-        assert AbcdDataset(outputs).get_numpy_image(i).shape == (*source.size[::-1], 3)
 
 
 def test_reduced_folder_is_used_where_it_fits(scene):
@@ -195,16 +166,8 @@ def test_reduced_copies_serve_where_there_are_no_full_photos(scene):
     assert parser(scene, downscale_factor=4).get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 4
 
 
-def test_scene_is_viewed_without_photos(scene):
-    shutil.rmtree(scene / "images")
-    viewing = parser(scene, downscale_factor=2)
-    viewing.downscale_factor = 1  # as FullImageDatamanager does for test_mode="inference"
-    assert viewing.get_dataparser_outputs().cameras.width.max() == SIZES[0][0] // 2
-
-
 def test_scene_without_points_starts_at_random(tmp_path, capsys):
-    write_model(tmp_path / "sparse/0", points=0)
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, points=0)
     assert "points3D_xyz" not in parser(tmp_path).get_dataparser_outputs().metadata
     assert "no points" in capsys.readouterr().out
 
@@ -215,14 +178,6 @@ def test_photos_without_pose_are_mentioned(scene, capsys):
     assert "1 photos in" in capsys.readouterr().out
 
 
-def test_odd_file_names(tmp_path):
-    names = ["a b/ü 1.png", "a b/[red]x.png", "ß/ü 1.png"]
-    write_model(tmp_path / "sparse/0", names=names)
-    write_photos(tmp_path / "images", names=names)
-    outputs = parser(tmp_path, eval_mode="all").get_dataparser_outputs()
-    assert outputs.image_filenames == sorted(tmp_path / "images" / name for name in names)
-
-
 def test_nerfstudios_datamanager_takes_it(tmp_path):
     """Distorted cameras: nerfstudio must find nothing left to undistort."""
     from nerfstudio.data.datamanagers.full_images_datamanager import (
@@ -230,8 +185,7 @@ def test_nerfstudios_datamanager_takes_it(tmp_path):
         FullImageDatamanagerConfig,
     )
 
-    write_model(tmp_path / "sparse/0", params=lambda w, h: ("SIMPLE_RADIAL", [w, w / 2, h / 2, -0.1]))
-    write_photos(tmp_path / "images")
+    write_capture(tmp_path, params=lambda w, h: ("SIMPLE_RADIAL", [w, w / 2, h / 2, -0.1]))
     config = FullImageDatamanagerConfig(
         dataparser=AbcdDataParserConfig(), data=tmp_path, cache_images_type="uint8"
     )
@@ -243,17 +197,6 @@ def test_nerfstudios_datamanager_takes_it(tmp_path):
     camera, data = manager.next_train(0)
     expected = manager.train_dataset.photos.image(camera.metadata["cam_idx"])
     assert torch.equal(data["image"], expected)
-
-
-@pytest.mark.parametrize(("device", "read"), [("cpu", []), ("cuda", [0, 2])])
-def test_photos_of_the_next_steps_are_read_ahead_of_a_device(scene, monkeypatch, device, read):
-    """But for those that are kept there."""
-    manager = AbcdDataManagerConfig(data=scene).setup(device="cpu", test_mode="val")
-    manager.device, manager._on_device["image", 1] = device, torch.empty(0)
-    expected: list[int] = []
-    monkeypatch.setattr(manager.train_dataset.photos, "expect", expected.extend)
-    manager.read_ahead(PhotosWanted((0, 1, 2)))
-    assert expected == read
 
 
 def test_a_scene_is_read_once_for_all_splits(scene):

@@ -86,13 +86,6 @@ def test_channels(tmp_path, channels):
     assert np.array_equal(photo, expected)
 
 
-def test_palette_becomes_its_colors(tmp_path):
-    picture = Image.fromarray(noise(0)).quantize(16)
-    picture.save(tmp_path / "p.png")
-    photos = Photos([PhotoSource(tmp_path / "p.png", picture.size, picture.size)])
-    assert np.array_equal(photos.image(0).numpy(), np.array(picture.convert("RGB")))
-
-
 def test_exif_orientation_is_not_applied(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -153,15 +146,6 @@ def test_kept_photo_is_not_read_again_because_it_is_expected(sources, monkeypatc
     photos.expect([0])
     photos.image(0)
     assert reads == [0]
-
-
-def test_expected_photos_that_nobody_asks_for_are_let_go(sources, monkeypatch):
-    monkeypatch.setattr("abcd_ns.data.photos.FEWEST_AHEAD", 1)
-    photos = Photos(sources, 0)
-    for i in range(len(sources)):
-        photos.expect([i, 0])  # the first alone
-    assert [index for _, index in photos._expected] == [4, 5]
-    assert all(np.array_equal(photos.image(i).numpy(), noise(i)) for i in range(len(sources)))
 
 
 def test_expected_photo_that_is_gone_is_told_to_who_asks(sources):
@@ -232,10 +216,6 @@ def test_mask_may_have_the_reduced_size(tmp_path):
 def test_useless_mask_is_named(tmp_path, mask, message):
     with pytest.raises(InputError, match=message):
         masked(tmp_path, mask, (WIDTH, HEIGHT)).mask(0)
-
-
-def test_photo_without_mask_has_none(sources):
-    assert Photos(sources).mask(0) is None
 
 
 # Distortion
@@ -320,8 +300,8 @@ def test_absurd_distortion_is_refused(coefficients):
         undistortion(Lens(200, 150, 160, 160, 100, 75, padded))
 
 
-def test_lens_scales_with_its_photo():
-    lens = Lens(101, 67, 80, 81, 50, 33).resized(50, 33)
-    assert lens.size == (50, 33)
-    assert (lens.fx, lens.cx) == pytest.approx((80 * 50 / 101, 50 * 50 / 101))
-    assert (lens.fy, lens.cy) == pytest.approx((81 * 33 / 67, 33 * 33 / 67))
+def test_palette_becomes_its_colors(tmp_path):
+    picture = Image.fromarray(noise(0)).quantize(16)
+    picture.save(tmp_path / "p.png")
+    photos = Photos([PhotoSource(tmp_path / "p.png", picture.size, picture.size)])
+    assert np.array_equal(photos.image(0).numpy(), np.array(picture.convert("RGB")))

@@ -30,13 +30,6 @@ def test_who_shows_nowhere_takes_no_room(suffix):
     assert SIZES[suffix](Gaussians.cat([shown, hidden])) == SIZES[suffix](shown)
 
 
-def test_harmonics_that_are_gone_take_next_to_nothing_of_an_spz():
-    every = random_gaussians(3000, sh_degree=3, seed=1)
-    none = Gaussians(**{**dict(every.items()), "features_rest": torch.zeros_like(every.features_rest)})
-    assert ply_bytes(none) == ply_bytes(every)
-    assert spz_bytes(none) < spz_bytes(every) / 2
-
-
 def test_what_cannot_be_packed_has_no_size(monkeypatch):
     gaussians = random_gaussians(10, sh_degree=1, seed=1)
     assert spz_bytes(gaussians[:0]) is None

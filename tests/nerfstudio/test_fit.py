@@ -14,15 +14,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import (
-    FITTED,
-    LEAST_BLOCK,
-    Demand,
-    Fit,
-    RamShares,
-    device_budget,
-    find_fit,
-)
+from abcd_ns.nerfstudio.fit import LEAST_BLOCK, Demand, Fit, RamShares, find_fit
 from abcd_ns.units import GIB
 from tests.reference.scenes import training_config
 
@@ -137,14 +129,6 @@ def test_what_is_set_is_kept():
     assert fit_for(80, 2 * MP, batch_limit=2).batch == 2
 
 
-def test_what_a_run_keeps_are_limits_of_training():
-    limits = fit_for(4, 12 * MP).limits
-    assert tuple(limits) == FITTED
-    fitted = dataclasses.replace(TRAINING.limits, **limits)
-    assert fitted.crop_pixels > 0
-    assert fitted.batch_limit == 1
-
-
 def test_a_scene_that_fits_in_one_block_needs_no_room_for_layers():
     fit = fit_for(0.3, 100_000, 2_000)
     assert (fit.blocks, fit.limit, fit.blocks_at_the_end) == (1, 0, 1)
@@ -162,11 +146,6 @@ def test_the_warm_up_takes_what_a_step_of_a_visit_takes_and_no_more(block, pixel
     visit, warm_up = (DeviceNeeds(pixels, batch, levels=0) for batch in (4, 1))
     assert warm_up.bytes_for(size) <= visit.bytes_for(block) < warm_up.bytes_for(size + 1)
     assert size > block
-
-
-def test_the_warm_up_is_larger_than_a_block_and_smaller_than_a_sole_one():
-    fit = fit_for(8, PIXELS, 30_000_000)
-    assert fit.limit < scaffold_size(TRAINING, fit.limit, PIXELS) < fit.sole
 
 
 def test_the_warm_up_has_the_size_that_is_asked_for():
@@ -216,16 +195,6 @@ def test_a_refusal_names_options_that_help(gb, pixels, points, options):
         assert find_fit(int(gb * GIB), demand.reduced(times)).batch >= 1
     if "--pipeline.training.batch 1" in said:
         assert find_fit(int(gb * GIB), dataclasses.replace(demand, training=TrainingConfig(batch=1)))
-
-
-def test_where_photos_are_all_too_large_smaller_ones_are_proposed():
-    with pytest.raises(UserError, match=r"by --pipeline\.datamanager\.dataparser\.downscale-factor 2, or"):
-        find_fit(2 * GIB, Demand(GARDEN, 400_000, TRAINING))
-
-
-def test_the_budget_is_what_is_wanted_or_a_share_of_what_there_is():
-    assert device_budget(3.0, "cpu") == 3 * GIB
-    assert device_budget(0.0, "cpu") > 0
 
 
 @given(st.integers(1, 2**50))

@@ -91,16 +91,6 @@ def test_with_room_for_some_blocks_they_are_drawn_together(trained, monkeypatch,
     assert several < len(drawn)
 
 
-def test_evaluation_while_training_is_drawn_by_units(trained, monkeypatch, drawn):
-    expected, count = pictures(trained.pipeline), len(trained.pipeline.model.merged())
-    assert set(drawn) == {count}
-    drawn.clear()
-    short_of_memory(monkeypatch)
-    assert_same_pictures(pictures(trained.pipeline), expected)
-    assert max(drawn) < count
-    assert trained.pipeline.get_average_eval_image_metrics()["psnr"] > 0
-
-
 def test_blocks_that_are_all_live_are_drawn_by_units_too(data, tmp_path, monkeypatch, drawn):
     trainer = run(configure(data, tmp_path, methods.abcd_exact, steps=2))
     drawn.clear()

@@ -160,16 +160,6 @@ def test_a_run_that_goes_on_in_its_own_folder_tells_its_past_once(tmp_path):
     assert len({json.dumps(line) for line in lines}) == len(lines)
 
 
-def test_a_visit_that_began_after_the_checkpoint_is_not_told_twice(tmp_path):
-    past = FakeCoordinator()
-    log = RunLog(past, tmp_path / "old.jsonl")
-    for visit in (0, 1):
-        log(VisitBegan(visit, 0, visit, steps=10, views=4, gaussians=50))
-    saved = FakeCoordinator(step=0, visit=1)
-    RunLog(saved, tmp_path / "new.jsonl", earlier=tmp_path / "old.jsonl")
-    assert [line["visit"] for line in lines_of(tmp_path / "new.jsonl") if line["kind"] == "visit"] == [0]
-
-
 def test_samples_thin_out_so_that_a_long_run_has_a_short_log(tmp_path):
     coordinator = FakeCoordinator()
     log = RunLog(coordinator, tmp_path / "log.jsonl")
@@ -180,18 +170,6 @@ def test_samples_thin_out_so_that_a_long_run_has_a_short_log(tmp_path):
     assert gaps[0] == 1.0
     assert max(gaps) == pytest.approx(4 * 3600 / run_log.SAMPLES, rel=0.05)
     assert len(times) < 2000
-
-
-def test_samples_hold_the_mean_psnr_since_the_last_and_pass_over_what_is_no_number(tmp_path):
-    coordinator = FakeCoordinator()
-    log = RunLog(coordinator, tmp_path / "log.jsonl", {"photos": (lambda: 7, 10)})
-    for psnr in (10.0, math.nan, 20.0, math.inf):
-        take_steps(log, coordinator, 1, seconds=0.3, psnr=psnr)
-    take_steps(log, coordinator, 4, seconds=0.3, psnr=math.nan)
-    log.close()
-    samples = [line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "sample"]
-    assert [line["psnr"] for line in samples] == [15.0, None, None]
-    assert samples[0]["held"] == {"photos": 7}
 
 
 def test_the_psnr_of_a_visit_is_that_of_its_later_half(tmp_path):
@@ -227,3 +205,15 @@ def test_a_disk_that_refuses_the_log_is_named_once_and_training_goes_on(tmp_path
     printed = capsys.readouterr().out
     assert printed.count("cannot be written") == 1
     assert "log.jsonl" in printed.replace("\n", "")
+
+
+def test_samples_hold_the_mean_psnr_since_the_last_and_pass_over_what_is_no_number(tmp_path):
+    coordinator = FakeCoordinator()
+    log = RunLog(coordinator, tmp_path / "log.jsonl", {"photos": (lambda: 7, 10)})
+    for psnr in (10.0, math.nan, 20.0, math.inf):
+        take_steps(log, coordinator, 1, seconds=0.3, psnr=psnr)
+    take_steps(log, coordinator, 4, seconds=0.3, psnr=math.nan)
+    log.close()
+    samples = [line for line in lines_of(tmp_path / "log.jsonl") if line["kind"] == "sample"]
+    assert [line["psnr"] for line in samples] == [15.0, None, None]
+    assert samples[0]["held"] == {"photos": 7}

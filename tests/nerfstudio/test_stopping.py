@@ -51,19 +51,6 @@ def test_handlers_are_put_back():
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
-def test_in_another_thread_signals_stay_as_they_are():
-    before, seen = signal.getsignal(signal.SIGTERM), []
-
-    def enter() -> None:
-        with StopSignals():
-            seen.append(signal.getsignal(signal.SIGTERM))
-
-    thread = threading.Thread(target=enter)
-    thread.start()
-    thread.join()
-    assert seen == [before]
-
-
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
@@ -82,3 +69,16 @@ def test_in_another_thread_signals_stay_as_they_are():
 )
 def test_the_command_to_go_on_keeps_the_options(argv, expected):
     assert command_to_go_on(argv.split(), "abcd", Path("my run")) == expected
+
+
+def test_in_another_thread_signals_stay_as_they_are():
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def enter() -> None:
+        with StopSignals():
+            seen.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert seen == [before]

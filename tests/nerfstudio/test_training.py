@@ -19,7 +19,6 @@ from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
-from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig, _save_atomically
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
@@ -150,19 +149,6 @@ def test_the_exported_ply_is_the_merged_scene(trained, tmp_path):
     assert np.array_equal(vertices["f_dc_1"], state["_model.gauss_params.features_dc"][:, 1].numpy())
 
 
-@pytest.mark.parametrize("stop_after", [14, 27])
-def test_a_run_that_is_broken_off_and_resumed_is_the_run_that_was_not(data, tmp_path, trained, stop_after):
-    broken = run(configure(data, tmp_path / "broken"), stop_after=stop_after)
-    resumed = run(configure(data, tmp_path / "resumed", load_dir=broken.checkpoint_dir))
-    expected = torch.load(next(trained.checkpoint_dir.iterdir()), weights_only=True)["pipeline"]
-    (checkpoint,) = resumed.checkpoint_dir.iterdir()
-    assert checkpoint.name == f"step-{STEPS - 1:09d}.ckpt"
-    found = torch.load(checkpoint, weights_only=True)["pipeline"]
-    assert found.keys() == expected.keys()
-    for name, value in expected.items():
-        assert value == found[name] if isinstance(value, dict) else torch.equal(value, found[name]), name
-
-
 def test_resuming_a_finished_run_trains_no_further(data, tmp_path, trained):
     again = run(configure(data, tmp_path, load_dir=trained.checkpoint_dir))
     assert again.pipeline.coordinator.state.step == STEPS
@@ -249,48 +235,18 @@ def test_the_saved_config_is_the_config(trained):
     assert loaded.machine.device_type == ("cuda" if torch.cuda.is_available() else "cpu")
 
 
-@pytest.mark.parametrize(
-    ("spoil", "expected"),
-    [
-        (lambda c: setattr(c.pipeline.model, "warmup_length", 7), "--pipeline.model.warmup-length"),
-        (lambda c: setattr(c.pipeline.model, "sh_degree", 1), "--pipeline.training.sh-degree"),
-        (lambda c: setattr(c.machine, "num_devices", 2), "--pipeline.workers"),
-        (lambda c: setattr(c, "mixed_precision", True), "float32"),
-        (lambda c: setattr(c.pipeline, "blocks", -1), "--pipeline.blocks"),
-        (lambda c: setattr(c, "vis", "viewer_legacy"), "viewer_legacy"),
-        (lambda c: setattr(c.pipeline, "near_plane", -1.0), "--pipeline.near-plane"),
-        (lambda c: setattr(c.pipeline, "ram_budget_gb", -1.0), "--pipeline.ram-budget-gb"),
-        (lambda c: setattr(c.pipeline.training, "warmup", 1.0), "--pipeline.training.warmup"),
-        (lambda c: setattr(c.pipeline.training, "influence_share", 0.0), "training.influence-share"),
-        (lambda c: setattr(c.pipeline.training, "sh_degree", 4), "training.sh-degree must be from 0 to 3"),
-        (lambda c: setattr(c.pipeline.training, "sh_degree", -1), "training.sh-degree must be from 0 to 3"),
-        (lambda c: setattr(c.pipeline.training, "window_weight", 1.0), "training.window-weight"),
-        (lambda c: setattr(c.pipeline.training, "recipe", Recipe(overlap=0.2)), "recipe.overlap is 0.2"),
-        (lambda c: setattr(c.pipeline.training, "warmup", float("nan")), "--pipeline.training.warmup"),
-        (lambda c: setattr(c.pipeline.datamanager, "data", Path("nowhere")), "nowhere"),
-    ],
-)
-def test_what_cannot_work_is_refused_before_anything_is_written(data, tmp_path, capsys, spoil, expected):
-    config = configure(data, tmp_path)
-    spoil(config)
-    config.set_timestamp()
-    with pytest.raises(SystemExit) as stopped:
-        config.save_config()
-    assert stopped.value.code == 2
-    assert expected in capsys.readouterr().out
-    assert not any(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_made_is_one_line(data, tmp_path, capsys):
-    taken = tmp_path / "taken"
-    taken.touch()
-    config = configure(data, taken)
-    config.set_timestamp()
-    with pytest.raises(SystemExit) as stopped:
-        config.save_config()
-    assert stopped.value.code == 2
-    assert f"{taken}" in (said := capsys.readouterr().out)
-    assert "Choose another --output-dir." in said
+def test_what_cannot_work_is_refused_before_anything_is_written(data, tmp_path, capsys):
+    """More of what cannot work is in test_options.py."""
+    options, photos, folder = (configure(data, tmp_path / name) for name in ("options", "photos", "taken"))
+    options.vis, photos.pipeline.datamanager.data = "viewer_legacy", Path("nowhere")
+    folder.output_dir.touch()
+    for config, words in ((options, "viewer_legacy"), (photos, "nowhere"), (folder, "another --output-dir")):
+        config.set_timestamp()
+        with pytest.raises(SystemExit) as stopped:
+            config.save_config()
+        assert stopped.value.code == 2
+        assert words in capsys.readouterr().out
+    assert [*tmp_path.rglob("*")] == [folder.output_dir]
 
 
 def test_no_time_counts_while_the_viewer_has_the_run_paused(data, tmp_path):

@@ -132,15 +132,6 @@ def test_blocks_do_not_matter_with_densification_either(tmp_path, views, photos)
     assert abs(counts[1] - counts[0]) <= 0.05 * counts[0]
 
 
-def test_by_means_the_picture_is_drawn_block_after_block(tmp_path, views, photos):
-    coordinator = exact(tmp_path, scene(torch.float32), views, blocks=4, ownership="means", steps=6)
-    before = whole_scene(coordinator)
-    train(coordinator, photos)
-    after = whole_scene(coordinator)
-    assert len(after) == len(before)
-    assert not torch.equal(by_rotation(after).means, by_rotation(before).means)
-
-
 def test_the_device_holds_nothing_between_steps_and_the_store_all_at_the_end(tmp_path, views, photos):
     coordinator = exact(tmp_path, scene(torch.float32), views, blocks=4, steps=4)
     while not coordinator.finished:

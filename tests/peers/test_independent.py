@@ -9,14 +9,7 @@ from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.peers.independent import (
-    CLEAR,
-    OWN,
-    Surfaces,
-    enlarged,
-    independent_at_rest,
-    independent_trainer,
-)
+from abcd_ns.peers.independent import CLEAR, OWN, Surfaces, enlarged, independent_at_rest, independent_trainer
 from tests.reference.scenes import Photos, listen, make_coordinator, random_gaussians, whole_scene
 
 STILL = DensityConfig(strategy="off")

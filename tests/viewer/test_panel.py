@@ -38,24 +38,17 @@ def draws_meanwhile(panel: AbcdPanel, event) -> bool:
     return meanwhile
 
 
-def test_browsers_get_a_picture_while_layers_are_drawn(monkeypatch):
-    monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)
-    assert draws_meanwhile(watched_panel(), LayersDrawn(0, 1, 9))
-
-
 @pytest.mark.parametrize(
-    ("browsers", "event"),
-    [(0, LayersDrawn(0, 1, 9)), (1, StepTaken(1, 0, 1, 20.0))],
-    ids=["nobody", "a step"],
+    ("browsers", "event", "seconds", "draws"),
+    [
+        (1, LayersDrawn(0, 1, 9), 0.0, True),
+        (0, LayersDrawn(0, 1, 9), 0.0, False),
+        (1, StepTaken(1, 0, 1, 20.0), 0.0, False),
+        (1, LayersDrawn(0, 1, 9), 1e6, False),
+    ],
+    ids=["browsers get a picture while layers are drawn", "nobody", "a step", "once a second at most"],
 )
-def test_otherwise_the_lock_is_kept(browsers, event, monkeypatch):
+def test_the_lock_is_handed_over(monkeypatch, browsers, event, seconds, draws):
     monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)
-    assert not draws_meanwhile(watched_panel(browsers), event)
-
-
-def test_one_picture_a_second_at_most(monkeypatch):
-    monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)
-    panel = watched_panel()
-    panel._updated = panel_module.time.monotonic()
-    monkeypatch.setattr(panel_module, "SECONDS_BETWEEN_UPDATES", 1e6)
-    assert not draws_meanwhile(panel, LayersDrawn(0, 1, 9))
+    monkeypatch.setattr(panel_module, "SECONDS_BETWEEN_UPDATES", seconds)
+    assert draws_meanwhile(watched_panel(browsers), event) == draws

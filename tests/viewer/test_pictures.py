@@ -48,24 +48,24 @@ def test_the_scene_by_units_is_the_scene_at_once(pass_gaussians):
         assert float((getattr(found, name) - getattr(merged, name)).abs().max()) < 2e-3, name
 
 
-def test_the_device_holds_one_unit_at_a_time(monkeypatch):
-    drawn = []
-    draw = TorchRasterizer.draw
-    monkeypatch.setattr(
-        TorchRasterizer, "draw", lambda self, g, *a, **k: drawn.append(len(g)) or draw(self, g, *a, **k)
-    )
+@pytest.fixture
+def drawn(monkeypatch) -> list[int]:
+    """How many Gaussians each drawing was given."""
+    counts, draw = [], TorchRasterizer.draw
+    watched = lambda self, g, *a, **k: counts.append(len(g)) or draw(self, g, *a, **k)  # noqa: E731
+    monkeypatch.setattr(TorchRasterizer, "draw", watched)
+    return counts
+
+
+def test_the_device_holds_one_unit_at_a_time(drawn):
     pictures("means").everything()
     assert len(drawn) == 6
     assert max(drawn) < len(GAUSSIANS) / 4
 
 
-def test_what_cannot_be_seen_is_not_drawn(monkeypatch):
-    wall = replace(
-        GAUSSIANS, opacities=torch.full_like(GAUSSIANS.opacities, 9.0), scales=GAUSSIANS.scales + 3
-    )
-    drawn = []
-    draw = TorchRasterizer.draw
-    monkeypatch.setattr(TorchRasterizer, "draw", lambda self, *a, **k: drawn.append(1) or draw(self, *a, **k))
+def test_what_cannot_be_seen_is_not_drawn(drawn):
+    opaque = torch.full_like(GAUSSIANS.opacities, 9.0)
+    wall = replace(GAUSSIANS, opacities=opaque, scales=GAUSSIANS.scales + 3)
     found = pictures("means", scene=MemoryScene(TREE, wall)).everything()
     assert len(drawn) < 6
     assert float(found.transmittance.max()) < 1e-3
@@ -92,6 +92,7 @@ def test_by_either_ownership_front_and_back_are_what_the_composite_is_made_of(ow
     front, back = made.draw(Show.FRONT, 3), made.draw(Show.BACK, 3)
     whole = made.draw(Show.COMPOSITE, 3)
     assert float(front.transmittance.min()) < 0.9
+    assert torch.allclose(front.depth, FAR * (1 - front.transmittance))  # far behind the boxes
     # F alone over B shows no more than the composite does.
     without = over(front.layer, back.layer)
     assert bool((without.transmittance >= whole.transmittance - 1e-9).all())
@@ -99,12 +100,6 @@ def test_by_either_ownership_front_and_back_are_what_the_composite_is_made_of(ow
         alone = made.draw(Show.BLOCK, 3)
         expected = over(front.layer, over(alone.layer, back.layer))
         assert float((expected.color - whole.color).abs().max()) < 1e-12
-
-
-def test_layers_lie_far_behind_the_boxes():
-    front = pictures().draw(Show.FRONT, 3)
-    alpha = 1 - front.transmittance
-    assert torch.allclose(front.depth, FAR * alpha)
 
 
 def test_an_empty_block_shows_nothing():
@@ -133,18 +128,19 @@ def test_no_client_makes_a_picture_of_any_size():
     assert (nothing.width, nothing.height) == (1, VIEW.height)
 
 
+class Draws(RenderStateMachine):
+    """A thread of the viewer's that does something else."""
+
+    def __init__(self, act) -> None:
+        threading.Thread.__init__(self, target=act)
+
+    run = threading.Thread.run
+
+
 def test_only_the_viewers_threads_draw_for_the_viewer():
     assert not asked_by_viewer()
     answers = []
-
-    class Renders(RenderStateMachine):
-        def __init__(self) -> None:
-            threading.Thread.__init__(self)
-
-        def run(self) -> None:
-            answers.append(asked_by_viewer())
-
-    thread = Renders()
+    thread = Draws(lambda: answers.append(asked_by_viewer()))
     thread.start()
     thread.join()
     assert answers == [True]
@@ -184,15 +180,7 @@ def test_a_process_that_still_draws_for_browsers_ends_in_order():
 def test_who_waits_for_a_picture_is_told(monkeypatch, capsys, seconds, said):
     monkeypatch.setattr("abcd_ns.viewer.pictures.SECONDS_OF_SILENCE", 0.1)
     monkeypatch.setattr("abcd_ns.viewer.pictures.SECONDS_TO_END", 9.1)
-
-    class Draws(RenderStateMachine):
-        def __init__(self) -> None:
-            threading.Thread.__init__(self)
-
-        def run(self) -> None:
-            time.sleep(seconds)
-
-    thread = Draws()
+    thread = Draws(lambda: time.sleep(seconds))
     thread.start()
     end_drawing()
     assert not thread.is_alive()

@@ -128,10 +128,5 @@ KINDS: dict[str, type[Line]] = {
     "end": EndLine,
 }
 """By the value of a line's field "kind"."""
-KIND_OF = {
-    VisitBegan: "visit",
-    SweepEnded: "sweep end",
-    WorkerLost: "worker lost",
-    ShedAtEnd: "shed at end",
-}
+KIND_OF = {VisitBegan: "visit", SweepEnded: "sweep end", WorkerLost: "worker lost", ShedAtEnd: "shed at end"}
 """By what of the engine's events is a line as it is."""

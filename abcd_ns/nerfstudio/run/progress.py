@@ -173,11 +173,9 @@ class ProgressReport:
 
 
 def _shed(event: ShedAtEnd) -> str:
-    if not event.gone:
-        return f"no Gaussian is gone at the end: {event.views} training views would miss each"
     before, cost = event.gaussians + event.gone, event.before - event.after
-    where = f"{event.views} training views"
-    return f"{event.gone:,} of {before:,} Gaussians were hardly missed and are gone: {cost:.2f} dB of {where}"
+    said = f"Pruned {event.gone:,} of {before:,} Gaussians"
+    return f"{said} (costs {cost:.2f} dB on {event.views} training views)." if event.gone else f"{said}."
 
 
 def _block(block: int | None) -> str:

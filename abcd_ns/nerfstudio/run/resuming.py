@@ -82,10 +82,8 @@ class MadeFor:
         """
         different = self.differences(store)
         if different:
-            raise UserError(
-                f"{store.folder} cannot be gone on with: it was made for {different}. Give the same "
-                "data and options as before, or leave out --load-dir."
-            )
+            why = f"Cannot resume {store.folder}: it was made for {different}"
+            raise UserError(f"{why}. Pass its original data and options, or leave out --load-dir.")
 
     def differences(self, store: ParameterStore) -> str:
         """What `store` was made for that is otherwise here, in words; empty where nothing is."""
@@ -127,13 +125,14 @@ def find_start(config: TrainerConfig) -> Start | None:
         if config.load_step is not None:
             raise UserError(f"--load-step {config.load_step} does not say of which run: add --load-dir.")
         return None
-    run = _run_of(config.load_dir)
+    within = (config.load_dir / STATE).is_dir()
+    run = config.load_dir if within else config.load_dir.absolute().parent
     if config.load_step is not None:
         return _at_checkpoint(run / config.relative_model_dir / f"{pin_name(config.load_step)}.ckpt")
     store = run / STATE / STORE
     if not store.is_dir():
         if any((run / config.relative_model_dir).glob("step-*.ckpt")):
-            raise UserError(f"{run} can be viewed but not trained further: the folder {store} is missing.")
+            raise _view_only(run, f"the folder {store} is missing")
         raise UserError(f"There is no run of ABCD in {config.load_dir}: it has no {store}.")
     return _at(store, None)
 
@@ -143,41 +142,29 @@ def pin_name(step: int) -> str:
     return f"step-{step:09d}"
 
 
-def check_folder(folder: Path, start: Start | None) -> None:
-    """See that a run may have its store in `folder`, before it writes anything beside it.
+def check_start(start: Start | None, folder: Path, asked: int) -> None:
+    """Check what a run resumes from before it writes anything.
 
     Args:
-        start: what the run goes on from.
+        folder: for its store.
+        asked: `--pipeline.blocks`; 0 accepts any number.
 
     Raises:
-        UserError: another run's store is there, or another run is writing to it.
+        UserError: `folder` holds another run's store or is being written to; or the run resumed from was
+            begun with another number of blocks.
     """
-    if not manifest_path(folder).exists():
-        return
-    if start is None or not folder.samefile(start.store):
-        raise _is_taken(folder)
-    ParameterStore.open(folder).close()
-
-
-def check_blocks(start: Start | None, asked: int) -> None:
-    """See that a run that goes on is not asked to be cut otherwise, which it could not be.
-
-    Args:
-        asked: `--pipeline.blocks`; 0 is content with any number.
-
-    Raises:
-        UserError: it is; both numbers are shown.
-    """
+    if manifest_path(folder).exists():
+        if start is None or not folder.samefile(start.store):
+            raise _is_taken(folder)
+        ParameterStore.open(folder).close()
     if start is None or asked == 0:
         return
     with ParameterStore.open(start.store, start.pin, read_only=True) as store:
         before = store.header.get(ASKED, asked)  # older runs did not write it down
         there = BlockTree.from_json(store.header["tree"]).num_blocks
     if asked not in (before, there):
-        raise UserError(
-            f"The run in {start.store} was begun with --pipeline.blocks {before}, not {asked}: give that "
-            "number, or begin anew without --load-dir."
-        )
+        begun = f"The run in {start.store} was begun with --pipeline.blocks {before}, not {asked}"
+        raise UserError(f"{begun}: give that number, or leave out --load-dir.")
 
 
 def has_begun(folder: Path) -> bool:
@@ -190,9 +177,7 @@ def has_begun(folder: Path) -> bool:
 
 def _is_taken(folder: Path) -> UserError:
     run = folder.parent.parent
-    return UserError(
-        f"{folder} holds a run already: go on with it by --load-dir {run}, or choose another --timestamp."
-    )
+    return UserError(f"{folder} holds a run already: add --load-dir {run}, or another --timestamp.")
 
 
 def take_over(start: Start, folder: Path, made_for: MadeFor) -> ParameterStore:
@@ -229,8 +214,8 @@ def new_store(folder: Path, header: dict[str, Any]) -> ParameterStore:
         raise _is_taken(folder) from error
 
 
-def _run_of(load_dir: Path) -> Path:
-    return load_dir if (load_dir / STATE).is_dir() else load_dir.absolute().parent
+def _view_only(path: Path, why: str) -> UserError:
+    return UserError(f"{path} can be viewed but not trained further: {why}.")
 
 
 def _at_checkpoint(path: Path) -> Start:
@@ -238,16 +223,14 @@ def _at_checkpoint(path: Path) -> Start:
         raise UserError(f"There is no checkpoint {path}.")
     store = path.absolute().parent.parent / STATE / STORE
     if not store.is_dir():
-        raise UserError(f"{path} can be viewed but not trained further: the folder {store} is missing.")
+        raise _view_only(path, f"the folder {store} is missing")
     if path.stem not in pin_names(store):
-        raise UserError(f"{path} can be viewed but not trained further: {store} has no such moment.")
+        raise _view_only(path, f"{store} has no such moment")
     return _at(store, path.stem)
 
 
 def _at(folder: Path, pin: str | None) -> Start:
     with ParameterStore.open(folder, pin, read_only=True) as store:
         if not store.blocks:
-            raise UserError(
-                f"The run in {folder} was ended before it began: start it anew, without --load-dir."
-            )
+            raise UserError(f"The run in {folder} ended before it began: start it anew, without --load-dir.")
         return Start(folder, pin, store.state.get("step", 0))

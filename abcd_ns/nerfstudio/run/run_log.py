@@ -134,10 +134,7 @@ class RunLog:
         self._psnrs, self._sampled = [], self._coordinator.stopwatch.seconds
 
     def _note(self, kind: str, **fields: Any) -> None:
-        now = {
-            "step": self._coordinator.state.step,
-            "seconds": round(self._coordinator.stopwatch.seconds, 3),
-        }
+        now = {"step": self._coordinator.state.step, "seconds": round(self._coordinator.stopwatch.seconds, 3)}
         self._lines.append(json.dumps({"kind": kind, **asdict(KINDS[kind](**now | fields))}))
         if len(self._lines) >= LINES_KEPT:
             self._flush()

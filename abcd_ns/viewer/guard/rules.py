@@ -53,7 +53,8 @@ class Rules:
         if len(hosts) != 1 or not self.knows(hosts[0]):
             return f"the Host {_quoted(hosts)} is not this viewer's"
         # A browser sends the Origin with every websocket; what sends none is no page.
-        if origins and not (len(origins) == 1 and same_origin(origins[0], hosts[0])):
+        own = (f"http://{hosts[0].lower()}", f"https://{hosts[0].lower()}")
+        if origins and not (len(origins) == 1 and origins[0].lower() in own):
             return f"the Origin {_quoted(origins)} is another page's"
         if not plain_path(path):
             return f"the path {_quoted([path])} is not one of a viewer's file"
@@ -69,7 +70,9 @@ class Rules:
             return True
         with suppress(ValueError):  # it is a name
             return ipaddress.ip_address(name).is_loopback or configured in WILDCARDS
-        if configured in WILDCARDS and name in _own_names():
+        own = _plain_name(socket.gethostname())
+        short = own.partition(".")[0]
+        if configured in WILDCARDS and name in (own, short, f"{short}.local"):
             return True
         return self.share and name.endswith(SHARE_DOMAIN)
 
@@ -89,11 +92,6 @@ class Rules:
 def plain_path(path: str) -> bool:
     """Whether a request's path can name a file below the server's root, and nothing else."""
     return _PATH.fullmatch(path.partition("?")[0]) is not None
-
-
-def same_origin(origin: str, host: str) -> bool:
-    """Whether a page with this Origin came from the server that this Host names."""
-    return origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
 
 
 def is_camera(message: Any) -> bool:
@@ -123,12 +121,6 @@ def content_policy(hosts: Iterable[str]) -> str:
 
 def _plain_name(name: str) -> str:
     return name.strip("[]").lower().rstrip(".")
-
-
-def _own_names() -> tuple[str, ...]:
-    name = _plain_name(socket.gethostname())
-    short = name.partition(".")[0]
-    return name, short, f"{short}.local"
 
 
 def _quoted(values: Iterable[str]) -> str:
