@@ -1,4 +1,4 @@
-"""A run that is killed and gone on with is the run that was not, bit for bit; so is one that a disk refused."""
+"""A run that is killed and resumed is the run that was not, bit for bit; so is one that a disk refused."""
 
 import random
 
