@@ -27,7 +27,7 @@ from abcd_ns.lab.job import AS_IT_IS, Change, Job, Plan, TerrainSettings, Varian
 from abcd_ns.lab.results.records import decode, encode, read_json, write_json
 from abcd_ns.lab.results.results import TERRAIN
 from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.stability.scenarios.real import read_stage
+from abcd_ns.lab.stability.scenarios.captures import read_stage
 from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.units import MIB

@@ -1,21 +1,79 @@
-"""A5, A6, A7: density control that never ends, undoes what was learnt, or never begins."""
+"""A5 to A7, A13, A19: growth, resets, old layers, the number of blocks and the length of visits."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import torch
 
-from abcd_ns.engine.events import Event, StepTaken
+from abcd_ns.engine.events import Event, StepTaken, VisitEnded
+from abcd_ns.engine.gaussians.block_state import BlockState
+from abcd_ns.engine.space.partition import build_grid
+from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
+from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.schedule import passes_of_sweep, views_per_step, views_per_visit
-from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
-from abcd_ns.lab.stability.outcome import Finding, scenario
-from abcd_ns.lab.stability.scenarios.freshness import objectives
+from abcd_ns.engine.train.step.live_block import LiveBlock
+from abcd_ns.engine.types import Gaussians
+from abcd_ns.lab.stability.lab import BUDGET, PAIR, STILL, Lab, Stage, make_stage
+from abcd_ns.lab.stability.outcome import Finding, db, scenario
 from abcd_ns.lab.world.world import ring
+
+
+class OldNeighbours:
+    """The other blocks as they were some visits ago, as a source of layers asks for them.
+
+    Args:
+        every: visits between two looks at the scene; 1 is always fresh.
+    """
+
+    def __init__(self, run: TrainingRun, every: int) -> None:
+        self._run, self._every = run, every
+        self._seen: MemoryScene | None = None
+        self._taken_at = 0
+
+    def __call__(self) -> MemoryScene:
+        visit, scene = self._run.state.visit, self._run.scene
+        if self._seen is None or visit - self._taken_at >= self._every:
+            self._seen, self._taken_at = MemoryScene(scene.tree, scene.everything("cpu")), visit
+        return self._seen
+
+
+class DampedBlock(LiveBlock):
+    """Keeps a share of what a visit did."""
+
+    def __init__(self, run: TrainingRun, damping: float) -> None:
+        super().__init__(run)
+        self._share = damping
+
+    def detached(self) -> BlockState:
+        state, active = super().detached(), self._run.state.active
+        if active is None or active.is_whole:
+            return state
+        before = self._run.scene.gaussians_at_rest(active.geometry.block)
+        mixed = {n: torch.lerp(getattr(before, n), v, self._share) for n, v in state.gaussians.items()}
+        return replace(state, gaussians=Gaussians(**mixed))  # moments are of the path, not of where it ends
+
+
+def stale_coordinator(run: TrainingRun, every: int, damping: float = 1.0) -> Coordinator:
+    """Shows blocks to each other as they were some visits ago.
+
+    The number of Gaussians must stay (strategy "off", `migrate` off is not needed).
+
+    Args:
+        every: visits between two looks at the scene; 1 is always fresh.
+        damping: what a visit did is kept to this share; 1 keeps all.
+    """
+    live = None if damping == 1.0 else DampedBlock(run, damping)
+    return Coordinator(run, source=LayerSource(run, around=OldNeighbours(run, every)), live=live)
+
 
 CAP = 300
 PASSES, VIEWS = TrainingConfig().first_passes, TrainingConfig().visit_views
@@ -134,3 +192,94 @@ def thousands(lab: Lab) -> Finding:  # noqa: ARG001 - a schedule needs no traini
         "splatfacto": f"none at all from {min(never):,} cameras on",
     }
     return Finding(passed, said, {f"least at {cameras}": count for cameras, count in least.items()})
+
+
+BLOCKS = (1, 2, 4, 8, 27)
+CLIFF_DB = 0.5
+VISITS_RISING = 0.05
+RISES_BY = 1e-3
+"""A visit raised the objective if by more than this share of it."""
+SWEEP = 4
+"""Blocks, and so visits in a sweep, of the runs with old layers."""
+
+
+def objectives(lab: Lab, stage: Stage, coordinator: Coordinator) -> list[float]:
+    """Train to the end; the error over all training photos at the start and after each visit."""
+    found = [lab.error(coordinator, stage)]
+
+    def listen(event) -> None:
+        if isinstance(event, VisitEnded):
+            found.append(lab.error(coordinator, stage))
+
+    coordinator.announce.subscribe(listen)
+    lab.finish(coordinator, stage)
+    return found
+
+
+def share_rising(errors: Sequence[float]) -> float:
+    """The share of visits that raised the objective."""
+    rises = [after > (1 + RISES_BY) * before for before, after in pairwise(errors)]
+    return sum(rises) / len(rises)
+
+
+def train_stale(lab: Lab, stage: Stage, every: int, *, damping: float = 1.0) -> tuple[float, float]:
+    """(share of visits that raised the objective, held-out PSNR) with layers up to `every` visits old."""
+    coordinator = lab.coordinator(
+        stage.start(),
+        stage.views,
+        budget=lab.views_drawn(BUDGET // 2),
+        blocks=SWEEP,
+        warmup=0.0,
+        density=STILL,
+        heal=False,  # a visit that is undone raises nothing
+        first_passes=2,
+        recipe=Recipe(last_passes=2),
+        kind=partial(stale_coordinator, every=every, damping=damping),
+    )
+    rising = share_rising(objectives(lab, stage, coordinator))
+    return rising, lab.score(coordinator, stage)
+
+
+@scenario(
+    "A13",
+    "old layers oscillate and diverge",
+    "layers drawn anew for each visit; once a sweep; once a sweep, damped",
+    f"fresh, and damped, the full objective rises in at most {VISITS_RISING:.0%} of visits",
+    cost=4,
+)
+def old_layers(lab: Lab) -> Finding:
+    """A13: a refresh left out, and refreshes once a sweep with and without damping."""
+    stage, numbers, said = make_stage(views=ring(12), points=400), {}, {}
+    cases = {
+        "abcd": {"every": 1},
+        "once a sweep": {"every": SWEEP},
+        "once a sweep, damped": {"every": SWEEP, "damping": 0.5},
+    }
+    for name, options in cases.items():
+        rising, score = train_stale(lab, stage, **options)
+        numbers |= {f"rising {name}": rising, f"psnr {name}": score}
+        said[name] = f"{rising:.0%} of visits raised the objective, {db(score)}"
+    damped = numbers["rising once a sweep, damped"] <= VISITS_RISING
+    return Finding(damped and numbers["rising abcd"] <= VISITS_RISING, said, numbers)
+
+
+@scenario(
+    "A19",
+    "the number of blocks and of steps a visit decide the quality",
+    f"{', '.join(map(str, BLOCKS))} blocks and a grid that cuts the balls, on a budget of 600 views",
+    f"worst within {CLIFF_DB} dB of the best; the charts show visits of 1 to 64 steps too",
+    cost=6,
+)
+def blocks_and_cuts(lab: Lab) -> Finding:
+    """A19: the defaults with 1 to 27 blocks, and with a grid whose planes cut every ball."""
+    stage = make_stage()
+    psnr = {"1 block": lab.compared(stage, "abcd-monolithic", "table")}
+    psnr |= {f"{k} blocks": lab.compared(stage, "abcd", blocks=k) for k in BLOCKS if k > 1}
+    cut = build_grid(stage.start().means.clamp(-0.5, 0.5), counts=(2, 2, 1))
+    psnr["4 that cut the balls"] = lab.compared(stage, "abcd", tree=cut)
+    gap = max(psnr.values()) - min(psnr.values())
+    behind = psnr["1 block"] - min(psnr.values())
+    said = {"abcd": ", ".join(f"{name} {value:.2f}" for name, value in psnr.items()) + " dB"}
+    said["abcd-monolithic"] = db(psnr["1 block"])
+    numbers = {**{f"psnr {name}": value for name, value in psnr.items()}, "best to worst": gap}
+    return Finding(gap <= CLIFF_DB, said, numbers, worse=behind > 0)
