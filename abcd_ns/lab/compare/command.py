@@ -157,7 +157,7 @@ def make_plan(options: Options) -> Plan:
     Raises:
         UserError: an option is missing, out of range or contradicts another.
     """
-    if options.prices or options.vary or options.tiles or len(options.blocks or ()) > 1:
+    if len(options.blocks or ()) > 1 or {"prices", "vary", "tiles"} & options.given.keys():
         options = options.over(Options(methods=("abcd",)))
     given = options.over(DEFAULTS)
     _check_methods(given)
