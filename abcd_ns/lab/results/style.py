@@ -136,8 +136,11 @@ def label_ends(
     """
     low, high = axes.get_ylim()
     heights = spread([y for _, y in ends.values()], gap * (high - low))
-    # Below the axis they would run into its numbers, above it into the title.
-    lift = max(low + gap * (high - low) / 2 - min(heights), 0) or min(high - max(heights), 0)
+    # Above the axis they would run into the title, below it into its numbers.
+    from_top = sorted(range(len(heights)), key=heights.__getitem__, reverse=True)
+    for k, i in enumerate(from_top):
+        heights[i] = min(heights[i], high - k * gap * (high - low))
+    lift = max(low + gap * (high - low) / 2 - min(heights), 0)
     for (name, (x, y)), height in zip(ends.items(), heights, strict=True):
         axes.annotate(
             write(name, y),
