@@ -1,7 +1,7 @@
-"""A land of `abcd scale` as a COLMAP data set, for studies that hold views out.
+"""The terrain of `abcd compare --tiles` as a COLMAP data set, for comparisons that hold views out.
 
 python -m benchmarks.land land --tiles 32
-abcd study blocks --data land --seconds 180 --blocks 1 8 32 --evals 4 --out blocks
+abcd compare --data land --seconds 180 --blocks 1 8 32 --evals 4 --out blocks
 """
 
 from dataclasses import dataclass

@@ -44,11 +44,7 @@ COMMANDS = (
     Command("report", "abcd_ns.cli.report.command:report", "show all about a training run on one HTML page"),
     Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
     Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as a mesh of triangles"),
-    Command(
-        "compare", "abcd_ns.lab.compare.command:compare", "train ABCD and its peers on one scene and compare"
-    ),
-    Command("study", "abcd_ns.lab.study.command:study", "vary one thing: blocks, Gaussians, or any options"),
-    Command("scale", "abcd_ns.lab.scale.command:scale", "memory and time as the scene grows"),
+    Command("compare", "abcd_ns.lab.compare.command:compare", "compare methods, numbers of blocks, options"),
     Command(
         "stability",
         "abcd_ns.lab.stability.command:stability",

@@ -22,6 +22,7 @@ class Settings:
     """The scene, as an absolute path."""
     downscale: int
     blocks: int
+    """0 where each arm has its own."""
     seconds: float | None
     """Of training; None where the budget is in steps."""
     steps: int | None
@@ -48,13 +49,6 @@ class Settings:
     def moments(self) -> tuple[float, ...]:
         """Shares of the run, up to 1, at which held-out views are drawn; denser where quality rises fast."""
         return tuple((k / self.evals) ** 2 for k in range(1, self.evals + 1))
-
-    def words(self, blocks: bool = True) -> list[Any]:
-        """What every command line says of them, `blocks` or not."""
-        words = ["--steps", self.steps] if self.seconds is None else ["--seconds", f"{self.seconds:g}"]
-        words += ["--downscale", self.downscale, "--evals", self.evals]
-        words += ["--blocks", self.blocks] if blocks else []
-        return words + (["--max-gaussians", self.max_gaussians] if self.max_gaussians else [])
 
 
 @dataclass(frozen=True)
@@ -111,6 +105,12 @@ class Job:
     """Folders beside the job that are dropped when it is done."""
 
     @property
+    def blocks(self) -> int:
+        """Of a method that has any."""
+        own = [int(change.value) for change in self.variant.changes if change.path == "blocks"]
+        return own[0] if own else self.settings.blocks
+
+    @property
     def name(self) -> str:
         """For messages."""
         changes = [self.variant.name] if self.variant.changes else []
@@ -123,11 +123,39 @@ class Job:
 
 
 @dataclass(frozen=True)
+class TerrainSettings:
+    """What all runs on a synthetic terrain share."""
+
+    gaussians: int
+    """In each tile."""
+    visits: int
+    """Budget of a run; in one block none."""
+    ram_budget_bytes: int = 16 << 20
+    """For blocks that were read, smaller than any scene; layers and photos have their own."""
+    device_limit_bytes: int = 0
+    """GPU memory that may be taken, as if the card had no more; 0 for all of it."""
+
+
+@dataclass(frozen=True)
+class TerrainJob(Job):
+    """A terrain to train on, by blocks or as one block; its variant says of how many tiles."""
+
+    settings: TerrainSettings
+    worker = "abcd_ns.lab.runs.terrain"
+    scratch = ("store", "layers")  # gigabytes; what they took is in the run
+
+    @property
+    def tiles(self) -> int:
+        """A power of 2."""
+        return self.variant.number
+
+
+@dataclass(frozen=True)
 class Plan:
     """All runs of an experiment."""
 
     kind: str
-    """What the folder holds, in a word or a few; what is of another kind goes into another folder."""
+    """What the folder holds, in a few words; another kind needs another folder."""
     settings: Any
     """What all runs share: a frozen dataclass of JSON's scalars."""
     out: Path
@@ -136,18 +164,11 @@ class Plan:
     first seed first."""
     command: str
     """The command line that makes the same."""
-    notes: tuple[str, ...] = ()
-    """What a reader of the table has to know of the jobs."""
 
     @property
     def methods(self) -> tuple[str, ...]:
         """In their order."""
         return tuple(dict.fromkeys(job.method for job in self.jobs))
-
-    @property
-    def variants(self) -> tuple[Variant, ...]:
-        """In their order."""
-        return tuple(dict.fromkeys(job.variant for job in self.jobs))
 
     @property
     def seeds(self) -> tuple[int, ...]:

@@ -22,12 +22,12 @@ from abcd_ns.cli.doctor.hardware import look_at_hardware
 from abcd_ns.cli.report.run_folder import CHECKPOINTS
 from abcd_ns.engine.render import make_rasterizer, self_check
 from abcd_ns.lab.compare.command import Options, impossible, make_plan
-from abcd_ns.lab.job import AS_IT_IS, Change, Job, Variant
+from abcd_ns.lab.compare.terrain import terrain_jobs
+from abcd_ns.lab.job import AS_IT_IS, Change, Job, Plan, TerrainSettings, Variant
 from abcd_ns.lab.results.records import decode, encode, read_json, write_json
+from abcd_ns.lab.results.results import TERRAIN
 from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.scale import command as scale
-from abcd_ns.lab.scale.worker import LandSettings
-from abcd_ns.lab.stability.scenarios.real import read_stage
+from abcd_ns.lab.stability.scenarios.captures import read_stage
 from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.units import MIB
@@ -141,12 +141,12 @@ def compare(task: Task, by_steps: bool) -> Iterator[Found]:
 
 
 def extent(task: Task) -> Iterator[Found]:
-    """`abcd scale`, small scenes first, by blocks and as one."""
+    """As `abcd compare --tiles`, by blocks and as one, within a limit of GPU memory."""
     size = task.size
-    settings = LandSettings(size.gaussians, 3, 16 * MIB, size.device_limit_mb * MIB)
-    plan = scale.make_plan(Path(task.work), settings, size.tiles, size.tiles, task.seed)
-    plan = replace(plan, jobs=tuple(sorted(plan.jobs, key=lambda job: job.tiles)))
-    for results in experiment.run_jobs(plan, Console(), leave_out=scale.too_large):
+    settings = TerrainSettings(size.gaussians, 3, device_limit_bytes=size.device_limit_mb * MIB)
+    jobs = terrain_jobs(settings, size.tiles, ("abcd", "abcd-monolithic"), (task.seed,))
+    plan = Plan(TERRAIN, settings, Path(task.work), jobs, "python -m benchmarks.gpu --parts extent")
+    for results in experiment.run_jobs(plan, Console(), leave_out=impossible):
         yield {"results": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
 
 

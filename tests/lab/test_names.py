@@ -1,6 +1,5 @@
 """Scenes, folders and options may be called anything: no table and no chart breaks."""
 
-import dataclasses
 from io import StringIO
 
 import pytest
@@ -9,12 +8,10 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.console import Console
 
-from abcd_ns.lab.compare.charts import draw_speed_accuracy
+from abcd_ns.lab.compare.charts import draw_charts
+from abcd_ns.lab.results.results import Arm
 from abcd_ns.lab.results.tables import markdown, print_rows
-from abcd_ns.lab.study.charts import draw_study
-from tests.lab.compare.records import made_up_results, made_up_run, made_up_settings
-from tests.lab.study.records import made_up_arm, options_study
-from tests.lab.svg import texts_of
+from tests.lab.compare.records import made_up, made_up_run, made_up_settings
 
 NAMES = st.text("ab |$\\\n\r[]/_^{}#%&<>`*:=", min_size=1, max_size=12)
 MARKDOWN = MarkdownIt("commonmark").enable("table")
@@ -42,15 +39,10 @@ def test_a_table_in_the_terminal_shows_names_as_they_are(names):
     assert all(name.rstrip() in stream.getvalue() for name in names)
 
 
-@pytest.mark.parametrize("scene", ["$a$", "a$\\frac{$", "x_$^_$", "a|b", "<&>"])
-def test_a_charts_title_is_the_scenes_name_and_no_formula(tmp_path, scene):
-    results = made_up_results(made_up_run(), settings=made_up_settings(data=scene))
-    draw_speed_accuracy(results, tmp_path)
-    assert any(text.startswith(f"{scene}, 1/4 size") for text in texts_of(tmp_path / "speed_accuracy.svg"))
-
-
-def test_a_studys_changes_are_no_formulae(tmp_path):
-    base, name = options_study(), "training.x=$\\frac{$|"
-    arms = (base.arms[0], made_up_arm(name, None, {0: 23.0}))
-    (picture,) = (p for p in draw_study(dataclasses.replace(base, arms=arms), tmp_path) if p.suffix == ".svg")
-    assert any(name in text for text in texts_of(picture))
+@pytest.mark.parametrize("name", ["$a$", "a$\\frac{$", "x_$^_$", "a|b", "<&>"])
+def test_a_chart_says_names_as_they_are_and_no_formulae(name, tmp_path, drawn):
+    arms = [Arm("abcd", variant, None, (made_up_run(),)) for variant in ("default", f"training.x={name}")]
+    draw_charts(made_up("comparison", *arms, settings=made_up_settings(data=name)), tmp_path)
+    texts = drawn["speed_accuracy.png"]
+    assert any(text.startswith(f"{name}, 1/4 size") for text in texts)
+    assert any(text.startswith(f"x={name}") for text in texts)

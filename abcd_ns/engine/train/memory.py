@@ -1,8 +1,8 @@
 """How many Gaussians fit on the device: a model to plan with, and a look before memory is taken.
 
 The model adds up what a visit must hold, part by part, and rounds up. `tests/simulated/test_memory.py`
-holds it against live tensors, by pixel and by Gaussian, and `abcd scale` measures what a run takes; what a
-GPU took is in docs/results/gpu.
+holds it against live tensors, by pixel and by Gaussian, and `abcd compare --tiles` measures what a run
+takes; what a GPU took is in docs/results/gpu.
 """
 
 import math

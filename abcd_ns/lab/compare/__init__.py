@@ -1,4 +1,4 @@
-"""`abcd compare`: ABCD and its peers on one scene, under one protocol, each in its own process.
+"""`abcd compare`: methods, numbers of blocks, prices, options and sizes under one protocol, a process each.
 
-`command` says which, `charts` and `pictures` show what came of it.
+`command` makes the plan, `terrain` that of a synthetic terrain; `charts` and `pictures` show what came of it.
 """

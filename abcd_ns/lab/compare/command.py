@@ -1,26 +1,31 @@
-"""`abcd compare`: train ABCD and its peers on one scene and compare."""
+"""`abcd compare`: train several arms on one scene under one protocol and compare them."""
 
 import dataclasses
+import math
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy
+from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.pictures import draw_pictures
-from abcd_ns.lab.job import METHODS, Job, Method, Plan
+from abcd_ns.lab.compare.terrain import terrain_plan, too_large
+from abcd_ns.lab.job import METHODS, Change, Job, Method, Plan, Settings, Variant
 from abcd_ns.lab.results.records import decode, read_toml
-from abcd_ns.lab.results.results import LeftOut, Results
+from abcd_ns.lab.results.results import TERRAIN, LeftOut, Results
 from abcd_ns.lab.results.run import Failure, Run
 from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.runs.checks import Flag, make_settings, words
+from abcd_ns.lab.runs.checks import LOWEST, Flag, check_numbers, check_ranges, words
 
 PICTURES = "pictures"
+PRICE = "training.density.price"
+BLOCKS = "blocks"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,17 +38,28 @@ class Options:
     """Folder for the results; absent, empty, or one of an earlier comparison under the same protocol."""
     methods: Annotated[tuple[Method, ...] | None, words("METHOD ...")] = None
     """Of abcd-monolithic, abcd, abcd-ablated (these are the default), abcd-partition, abcd-exact, abcd-paper
-    (needs steps) and splatfacto (needs CUDA)."""
+    (needs steps) and splatfacto (needs CUDA). Where something else than methods has arms: abcd."""
     seconds: Annotated[float | None, words("S")] = None
     """Budget of a run: seconds of training; evaluation, saving and compiling do not count."""
     steps: Annotated[int | None, words("N")] = None
     """Budget of a run: optimisation steps. Give either this or seconds."""
     seeds: Annotated[tuple[int, ...] | None, words("N ...", "--seed")] = None
-    """One run of every method for each. Default: 0."""
+    """One run of every arm for each. Default: 0."""
     downscale: Annotated[int | None, words("N")] = None
     """Divides the photos' width and height. Default: 1."""
-    blocks: Annotated[int | None, words("N")] = None
-    """Blocks of every method that has any. Default: 8."""
+    blocks: Annotated[tuple[int, ...] | None, words("N ...")] = None
+    """Blocks of every method that has any; an arm for each of several numbers. Default: 8."""
+    prices: Annotated[tuple[float, ...] | None, words("PIXELS ...")] = None
+    """An arm for each: what a Gaussian must contribute to stay, see training.density.price."""
+    vary: Annotated[tuple[str, ...] | None, words("NAME=VALUE ...")] = None
+    """An arm for each change of an option. Names: `ns-train abcd --help`, under --pipeline. Several
+    at once stand in quotes, as in --vary training.warmup=0 "partition=grid blocks=27"."""
+    tiles: Annotated[tuple[int, ...] | None, words("N ...")] = None
+    """An arm for each size of a synthetic terrain, which takes the place of data: a block for each tile."""
+    tile_gaussians: Annotated[int | None, words("N")] = None
+    """In each tile of the terrain. Default: 20,000."""
+    visits: Annotated[int | None, words("N")] = None
+    """Budget of a run on the terrain. Default: 3."""
     evals: Annotated[int | None, words("N")] = None
     """Points of the curve of held-out PSNR over time, the last at the end. Default: 8."""
     max_gaussians: Annotated[int | None, words("N")] = None
@@ -53,19 +69,29 @@ class Options:
     pictures: Annotated[int | None, words("N")] = None
     """Held-out views to show. Default: 3."""
 
+    @property
+    def given(self) -> dict[str, Any]:
+        """Those that were given, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None and value is not False}
+
     def over(self, other: "Options") -> "Options":
         """These options, and `other`'s where these were not given."""
-        given = {
-            name: value for name, value in vars(self).items() if value is not None and value is not False
-        }
-        if "seconds" in given or "steps" in given:
+        if "seconds" in self.given or "steps" in self.given:
             # A budget on the command line takes the place of the file's, whatever its unit.
             other = dataclasses.replace(other, seconds=None, steps=None)
-        return dataclasses.replace(other, **given)
+        return dataclasses.replace(other, **self.given)
 
 
 DEFAULTS = Options(
-    methods=METHODS[:3], seeds=(0,), downscale=1, blocks=8, evals=8, max_gaussians=0, pictures=3
+    methods=METHODS[:3],
+    seeds=(0,),
+    downscale=1,
+    blocks=(8,),
+    prices=(),
+    vary=(),
+    evals=8,
+    max_gaussians=0,
+    pictures=3,
 )
 
 
@@ -76,12 +102,23 @@ def compare(
     config: Annotated[Path | None, words("FILE.toml")] = None,
     overwrite: Flag = False,
 ) -> int:
-    """Train several methods on one scene under one protocol, and write what came of it.
+    """Train several arms on one scene under one protocol, and write what came of it.
 
-    Each run has a process of its own, one after the other. OUT gets results.json, table.md, charts of
-    accuracy over training time (speed_accuracy.png and .svg) and over the number of Gaussians
-    (size_accuracy), and pictures of held-out views. Called again with the same OUT, it reuses the runs that
-    are finished.
+    Arms are methods, each with every number of blocks, and each as it is, with every price, and with every
+    change. Each run has a process of its own, one after the other. OUT gets results.json, table.md, charts of
+    PSNR over training time (speed_accuracy.png), PSNR over Gaussians (size_accuracy.png) and memory over
+    Gaussians (memory.png), and pictures of held-out views. Called again with the same OUT, it reuses the runs
+    that are finished, so that more seeds and arms may be added later.
+
+    abcd compare --data scene --seconds 60 --seeds 0 1 --out methods
+
+    abcd compare --data scene --seconds 60 --methods abcd --blocks 1 2 4 8 16 27 --out blocks
+
+    abcd compare --data scene --seconds 60 --prices 0 1 4 16 64 --out prices
+
+    abcd compare --data scene --seconds 60 --vary training.warmup=0 training.batch=1 --out options
+
+    abcd compare --tiles 2 4 8 16 32 64 --methods abcd abcd-monolithic --out sizes
 
     Args:
         options: what is compared, and under which conditions.
@@ -91,11 +128,14 @@ def compare(
     Raises:
         UserError: an option or the scene cannot be used, or OUT holds something else.
     """
-    # Here and not above: nerfstudio takes seconds to import, and `--help` has no use for it.
-    from abcd_ns.lab.runs.configs import check_scene
-
     plan = make_plan(options.over(read_options(config)) if config else options)
-    check_scene(plan.jobs[0])
+    if plan.kind != TERRAIN:
+        # Here and not above: nerfstudio takes seconds to import, and `--help` has no use for it.
+        from abcd_ns.lab.runs.configs import check_options, check_scene
+
+        for job in plan.jobs:
+            check_options(job)
+        check_scene(plan.jobs[0])
     return carry_out(plan, Console(), overwrite)
 
 
@@ -105,7 +145,10 @@ def read_options(path: Path) -> Options:
     Raises:
         UserError: the file is absent, is no TOML, or has a key or value that does not fit.
     """
-    return decode(Options, read_toml(path, f"--config {path} does not exist."), str(path))
+    values = read_toml(path, f"--config {path} does not exist.")
+    if isinstance(values.get(BLOCKS), int):
+        values[BLOCKS] = [values[BLOCKS]]
+    return decode(Options, values, str(path))
 
 
 def make_plan(options: Options) -> Plan:
@@ -114,40 +157,67 @@ def make_plan(options: Options) -> Plan:
     Raises:
         UserError: an option is missing, out of range or contradicts another.
     """
+    if len(options.blocks or ()) > 1 or {"prices", "vary", "tiles"} & options.given.keys():
+        options = options.over(Options(methods=("abcd",)))
     given = options.over(DEFAULTS)
-    for method in given.methods:
-        if method not in METHODS:
-            raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
-    if not given.methods or len(set(given.methods)) < len(given.methods):
-        raise UserError("Give at least one of --methods, and each once.")
-    if "abcd-paper" in given.methods and given.steps is None:
-        raise UserError(
-            "abcd-paper gives each cell a fixed number of steps: use --steps instead of --seconds."
-        )
-    shared = {n: v for n, v in vars(given).items() if n not in ("methods", "no_densify")}
-    settings = make_settings(**shared, densify=not given.no_densify)
+    _check_methods(given)
+    check_numbers("--seeds", given.seeds, 0)
+    if given.out is None:
+        raise UserError("Give the folder for the results with --out FOLDER.")
     methods = [method for method in METHODS if method in given.methods]
-    jobs = tuple(Job(method, seed, settings) for seed in given.seeds for method in methods)
-    out = Path(given.out)
-    line = ["abcd", "compare", "--data", settings.scene, "--methods", *methods, "--seeds", *given.seeds]
-    line += settings.words()
-    line += [] if settings.densify else ["--no-densify"]
-    line += ["--pictures", settings.pictures, "--out", out.name]
-    return Plan("comparison", settings, out, jobs, shlex.join(map(str, line)))
+    if given.tiles is not None:
+        return terrain_plan(options.given, methods, given.seeds)
+    settings, varied = _settings(given), variants(given)
+    jobs = tuple(
+        Job(method, seed, settings, variant)
+        for seed in given.seeds
+        for method in methods
+        for variant in dict.fromkeys(_for_method(variant, method, settings) for variant in varied)
+    )
+    return Plan("comparison", settings, Path(given.out), jobs, _command(given, methods, settings))
+
+
+def variants(given: Options) -> list[Variant]:
+    """Every number of blocks, if there are several, with every change: none, each price, each of --vary.
+
+    Raises:
+        UserError: an option does not exist, or a value does not fit.
+    """
+    check_numbers("--blocks", given.blocks, 1)
+    for price in given.prices:
+        if not 0 <= price < math.inf:
+            raise UserError(f"--prices {price:g}: a price is 0 or more, in pixels.")
+    changes = [(Change(PRICE, f"{price:g}"),) for price in given.prices]
+    if given.vary:
+        # Here and not above: `--help` has no use for nerfstudio.
+        from abcd_ns.lab.runs.configs import registered
+        from abcd_ns.lab.runs.options import parse_variant
+
+        pipeline = registered("abcd").pipeline
+        changes += [parse_variant(text, pipeline).changes for text in given.vary]
+    if (twice := [change for change in changes if changes.count(change) > 1]) or (
+        len(given.blocks) > 1 and (twice := [c for c in changes if any(one.path == BLOCKS for one in c)])
+    ):
+        raise UserError(f"{Variant(twice[0]).name!r} is given twice.")
+    sizes = [(Change(BLOCKS, str(number)),) for number in sorted(given.blocks)]
+    sizes = sizes if len(sizes) > 1 else [()]
+    return [Variant((*size, *change)) for size in sizes for change in [(), *changes]]
 
 
 def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     """Do all runs of the plan and write what came of them; exit code 1 if a run failed."""
 
     def draw(results: Results, out: Path) -> list[Path]:
-        charts = [*draw_speed_accuracy(results, out), *draw_size_accuracy(results, out)]
-        return [*charts, *draw_pictures(first_runs(results, plan), out / PICTURES)]
+        pictures = [] if plan.kind == TERRAIN else draw_pictures(shown(results, plan), out / PICTURES)
+        return [*draw_charts(results, out), *pictures]
 
     return experiment.carry_out(plan, console, draw, overwrite, impossible)
 
 
-def impossible(job: Job, outcome: Run | Failure | None = None) -> LeftOut | None:  # noqa: ARG001
+def impossible(job: Job, outcome: Run | Failure | None = None) -> LeftOut | None:
     """Why the job's method cannot run on this machine or under this protocol, if it cannot."""
+    if not isinstance(job.settings, Settings):
+        return too_large(job, outcome)
     if job.method != "splatfacto":
         return None
     if not torch.cuda.is_available():
@@ -157,9 +227,72 @@ def impossible(job: Job, outcome: Run | Failure | None = None) -> LeftOut | None
     return None
 
 
-def first_runs(results: Results, plan: Plan) -> list[tuple]:
-    """A run of each method, of one seed where they share any, with the folder of its pictures."""
-    seeds = [{run.seed for run in arm.runs} for arm in results.arms]
+def shown(results: Results, plan: Plan) -> list[tuple[Run, Path]]:
+    """A run of each method's first arm, of one seed where they share any, and the folder of its pictures."""
+    arms = [results.of(method)[0] for method in results.methods]
+    seeds = [{run.seed for run in arm.runs} for arm in arms]
     shared = [seed for seed in results.seeds if all(seed in each for each in seeds)]
-    first = [next(r for r in arm.runs if not shared or r.seed == shared[0]) for arm in results.arms]
-    return [(run, Job(run.method, run.seed, plan.settings).folder(plan.out) / PICTURES) for run in first]
+    folders = {(job.method, job.variant.name, job.seed): job.folder(plan.out) for job in plan.jobs}
+    runs = [(arm, next(run for run in arm.runs if not shared or run.seed == shared[0])) for arm in arms]
+    return [(run, folders[arm.method, arm.variant, run.seed] / PICTURES) for arm, run in runs]
+
+
+def _check_methods(given: Options) -> None:
+    for method in given.methods:
+        if method not in METHODS:
+            raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
+    if not given.methods or len(set(given.methods)) < len(given.methods):
+        raise UserError("Give at least one of --methods, and each once.")
+    if "abcd-paper" in given.methods and given.steps is None:
+        raise UserError(
+            "abcd-paper gives each cell a fixed number of steps: use --steps instead of --seconds."
+        )
+
+
+def _settings(given: Options) -> Settings:
+    # Here and not above: torch takes seconds to import, and `--help` has no use for it.
+    from abcd_ns.engine.space.partition import MAX_BLOCKS
+
+    if given.data is None:
+        raise UserError("Give the scene with --data FOLDER.")
+    if not Path(given.data).exists():
+        raise UserError(f"--data {given.data} does not exist.")
+    if (given.seconds is None) == (given.steps is None):
+        raise UserError("Give each run's budget: either --seconds or --steps.")
+    if given.seconds is not None and not 0 < given.seconds < math.inf:
+        raise UserError(f"--seconds is {given.seconds}; it must be above 0 and finite.")
+    check_ranges({name: getattr(given, name) for name in LOWEST})
+    if max(given.blocks, default=1) > MAX_BLOCKS:
+        raise UserError(f"--blocks is {max(given.blocks)}; it must be at most {MAX_BLOCKS}.")
+    return Settings(
+        data=str(Path(given.data).resolve()),
+        downscale=given.downscale,
+        blocks=given.blocks[0] if len(given.blocks) == 1 else 0,
+        seconds=given.seconds,
+        steps=given.steps,
+        evals=given.evals,
+        max_gaussians=given.max_gaussians,
+        densify=not given.no_densify,
+        pictures=given.pictures,
+    )
+
+
+def _for_method(variant: Variant, method: str, settings: Settings) -> Variant:
+    """What of a variant applies to a method: one block is one block, and splatfacto has its own options."""
+    if method == "splatfacto":
+        return Variant()
+    if method == "abcd-monolithic" and not settings.blocks:
+        return Variant(tuple(change for change in variant.changes if change.path != BLOCKS))
+    return variant
+
+
+def _command(given: Options, methods: Sequence[str], settings: Settings) -> str:
+    """The command line that makes the same, with the names of folders instead of where they are."""
+    line = ["abcd", "compare", "--data", settings.scene, "--methods", *methods, "--seeds", *given.seeds]
+    line += ["--steps", given.steps] if given.seconds is None else ["--seconds", f"{given.seconds:g}"]
+    line += ["--downscale", given.downscale, "--evals", given.evals, "--blocks", *given.blocks]
+    line += ["--prices", *(f"{price:g}" for price in given.prices)] if given.prices else []
+    line += ["--vary", *given.vary] if given.vary else []
+    line += ["--max-gaussians", given.max_gaussians] if given.max_gaussians else []
+    line += ["--no-densify"] if given.no_densify else []
+    return shlex.join(map(str, [*line, "--pictures", given.pictures, "--out", Path(given.out).name]))

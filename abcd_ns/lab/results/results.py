@@ -1,5 +1,6 @@
 """results.json: everything that an experiment found, with what is needed to do it again."""
 
+import re
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -10,6 +11,8 @@ from abcd_ns.machine import Machine, Versions
 SCHEMA = 2
 """Raised whenever a field changes its name or meaning."""
 RESULTS_FILE = "results.json"
+TERRAIN = "comparison of sizes"
+"""The kind of results of `abcd compare --tiles`, where nothing is held out."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ class Results:
 
     schema: int
     kind: str
-    """Of the experiment: "comparison", "study of blocks"."""
+    """Of the experiment: "comparison", "stability report"; older ones have "study of ..." too."""
     date: str
     """ISO 8601, UTC."""
     command: str
@@ -131,6 +134,23 @@ class Results:
         return tuple(arm for arm in self.arms if arm.method == method)
 
     @property
+    def labels(self) -> dict[str, str]:
+        """By name of an arm, what a chart calls it: `abcd, 8 blocks, warmup=0`; of one method `8 blocks`."""
+        found = {}
+        for arm in self.arms:
+            words = [re.sub(r"^[\w.]+\.(\w+=)", r"\1", word) for word in arm.variant.split()]
+            words = [re.sub(r"^(block|tile)s=(\d+)$", r"\2 \1s", word) for word in words]
+            words = [re.sub(r"^1 (\w+)s$", r"1 \1", word) for word in words if word != "default"]
+            found[arm.name] = ", ".join([arm.method] * (len(self.methods) > 1) + words) or arm.method
+        return found
+
+    def baseline(self, arm: Arm) -> Arm | None:
+        """The arm of the same method and number of blocks without the changes, if there is any."""
+        arms = {other.variant: other for other in self.of(arm.method) if other is not arm}
+        blocks = " ".join(word for word in arm.variant.split() if word.startswith("blocks="))
+        return arms.get(blocks, arms.get("default"))
+
+    @property
     def methods(self) -> tuple[str, ...]:
         """Those with a run."""
         return tuple(dict.fromkeys(arm.method for arm in self.arms))
@@ -139,8 +159,3 @@ class Results:
     def runs(self) -> tuple[Run, ...]:
         """Of all arms."""
         return tuple(run for arm in self.arms for run in arm.runs)
-
-
-def find_default(results: Results) -> Arm | None:
-    """The arm of the method as it is; None where its runs failed."""
-    return next((arm for arm in results.arms if arm.variant == "default"), None)

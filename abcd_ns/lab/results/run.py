@@ -48,8 +48,8 @@ class Run:
     total_seconds: float
     """Of the process, from its start to the end of saving; evaluation not."""
     psnr: float
-    """Composited, dB. Likewise `ssim` and `lpips`. Where nothing is held out (`abcd scale`), of the crops
-    trained on, mean of the last visit's steps."""
+    """Composited, dB. Likewise `ssim` and `lpips`. With `abcd compare --tiles` nothing is held out: of the
+    crops trained on, mean of the last visit's steps."""
     ssim: float | None
     lpips: float | None
     lpips_reason: str | None
@@ -82,15 +82,15 @@ class Run:
     did not ask."""
     parameters: int | None = None
     """Of how many numbers the Gaussians are: harmonics count up to the degree that each has. None in results
-    of versions that gave all the same degree, and of `abcd scale`."""
+    of versions that gave all the same degree, and of `abcd compare --tiles`."""
     ply_bytes: int | None = None
     """Of the scene as a .ply; None in results of versions that did not ask, of more than four million
-    Gaussians, and of `abcd scale`."""
+    Gaussians, and of `abcd compare --tiles`."""
     spz_bytes: int | None = None
     """Likewise as an .spz in the run's frame, in which harmonics that are nothing take next to nothing; None
     also where the package is missing that packs it."""
     memory: "Footing | None" = None
-    """What `abcd scale` asks beyond."""
+    """What `abcd compare --tiles` asks beyond."""
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,10 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "text.parse_math": False,  # names are anyone's: two $ in one are no formula
-    "svg.fonttype": "none",  # text stays text: searchable, and set in the paper's font
+    "svg.fonttype": "none",  # in a report's page text stays text
     "svg.hashsalt": "abcd",  # the same chart gives the same bytes
 }
-FORMATS, DPI = ("png", "svg"), 300
+DPI = 300
 LABEL_GAP = 0.06
 """Least distance of two labels, as a share of the axis' height."""
 
@@ -63,12 +63,11 @@ def spread(wanted: Sequence[float], gap: float) -> list[float]:
     return result.tolist()
 
 
-def save(figure: Figure, out: Path, name: str) -> list[Path]:
-    """Write the chart as name.png and name.svg; returns their paths."""
-    paths = [out / f"{name}.{ending}" for ending in FORMATS]
-    for path in paths:
-        figure.savefig(path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
-    return paths
+def save(figure: Figure, out: Path, name: str) -> Path:
+    """Write the chart as name.png; returns its path."""
+    path = out / f"{name}.png"
+    figure.savefig(path, dpi=DPI)
+    return path
 
 
 def in_style(draw: Callable[P, R]) -> Callable[P, R]:
@@ -93,11 +92,6 @@ def plot(axes: Axes, x: Sequence[float], y: Sequence[float], method: str, **more
     look = {"markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5, "linewidth": 1.4}
     (line,) = axes.plot(x, y, **{**look, "color": COLORS[method], "marker": MARKERS[method], **more})
     return line
-
-
-def scatter(axes: Axes, x: Sequence[float], y: Sequence[float], color: str) -> None:
-    """Single runs as small dots behind the means."""
-    axes.scatter(x, y, s=9, color=color, alpha=0.4, linewidths=0)
 
 
 def write_beside(
@@ -142,7 +136,10 @@ def label_ends(
     """
     low, high = axes.get_ylim()
     heights = spread([y for _, y in ends.values()], gap * (high - low))
-    # Below the axis they would run into its numbers.
+    # Above the axis they would run into the title, below it into its numbers.
+    from_top = sorted(range(len(heights)), key=heights.__getitem__, reverse=True)
+    for k, i in enumerate(from_top):
+        heights[i] = min(heights[i], high - k * gap * (high - low))
     lift = max(low + gap * (high - low) / 2 - min(heights), 0)
     for (name, (x, y)), height in zip(ends.items(), heights, strict=True):
         axes.annotate(

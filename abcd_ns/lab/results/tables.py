@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import attrgetter
+from functools import reduce
 from pathlib import Path
 from statistics import fmean, stdev
 
@@ -14,9 +14,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from abcd_ns.lab.job import HELD_OUT_EVERY
-from abcd_ns.lab.results.findings import find_difference
-from abcd_ns.lab.results.frontier import label_of
-from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results, find_default
+from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.machine import Machine
 from abcd_ns.units import GIB, MIB
@@ -60,62 +58,41 @@ MEASURES = (
     Measure("peak GPU memory, reserved (GiB)", "peak_reserved_bytes", 2, GIB),
     Measure("peak RAM (GiB)", "peak_rss_bytes", 2, GIB),
     Measure("blocks on disk (MiB)", "store_bytes", 1, MIB),
-)
-"""Of a comparison."""
-SCALE_MEASURES = (
-    Measure("Gaussians", "gaussians", 0),
-    Measure("peak RAM (MiB)", "peak_rss_bytes", 0, MIB),
-    Measure("peak GPU memory (MiB)", "peak_device_bytes", 0, MIB),
-    Measure("blocks on disk (GiB)", "store_bytes", 2, GIB),
     Measure("visit (s)", "memory.visit_seconds", 1),
-    Measure("of it, layers (s)", "memory.layer_seconds", 1),
+    Measure("of a visit, layers (s)", "memory.layer_seconds", 1),
 )
-_SIZE = ("gaussians", "parameters", "ply_bytes", "spz_bytes")
-_QUALITY = ("psnr_merged", "ssim_merged", "psnr", *_SIZE, "steps", "train_seconds")
-_MEMORY = ("peak_rss_bytes", "peak_device_bytes", "store_bytes")
-_OF_OPTIONS = ("psnr_merged", "ssim_merged", "gaussians", "parameters", "steps", "train_seconds")
-
-
-def measures_of(fields: Sequence[str]) -> tuple[Measure, ...]:
-    """Those of a comparison that show these fields, in the order of the fields."""
-    return tuple(measure for field in fields for measure in MEASURES if measure.field == field)
-
-
-COLUMNS: dict[str, tuple[str, tuple[Measure, ...]]] = {
-    "study of blocks": ("blocks", measures_of((*_QUALITY, *_MEMORY))),
-    "study of gaussians": ("Gaussians by", measures_of((*_QUALITY, *_MEMORY))),
-    "study of options": ("changed", measures_of(_OF_OPTIONS)),
-    "study of scale": ("tiles", SCALE_MEASURES),
-}
-"""The title of the first column, and the measures that follow, by kind of results."""
+"""Of an arm."""
+MOST_COLUMNS = 5
+"""Arms that stand beside each other; more stand below each other."""
 
 
 def cell(runs: Sequence[Run], measure: Measure) -> str:
     """The measure of an arm's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
-    values = [attrgetter(measure.field)(run) for run in runs]
+    values = [_value(run, measure.field) for run in runs]
     if not values or any(value is None for value in values):
         return NOTHING
-    values = [value / measure.unit for value in values]
-    text = f"{fmean(values):,.{measure.digits}f}"
-    return text if len(values) == 1 else f"{text} ± {stdev(values):,.{measure.digits}f}"
+    return mean_of([value / measure.unit for value in values], f",.{measure.digits}f")
+
+
+def mean_of(values: Sequence[float], form: str) -> str:
+    """Mean and standard deviation (n - 1), the latter of several values only, in a format of Python's."""
+    deviation = "" if len(values) == 1 else f" ± {stdev(values):{form.lstrip('+')}}"
+    return f"{fmean(values):{form}}{deviation}"
 
 
 def rows(results: Results) -> Rows:
-    """A row for each arm; of a comparison a row for each measure. Columns that know nothing are left out."""
-    if results.kind not in COLUMNS:
-        titles = ["", *(arm.name for arm in results.arms)]
-        return [titles, *([m.title, *(cell(arm.runs, m) for arm in results.arms)] for m in MEASURES)]
-    first, measures = COLUMNS[results.kind]
-    measures = [m for m in measures if any(cell(arm.runs, m) != NOTHING for arm in results.arms)]
-    options, several = results.kind == "study of options", len(results.methods) > 1
-    titles = ["method"] * several + [first] + ["difference (dB)"] * options
-    body = []
-    for arm in results.arms:
-        name = arm.variant if options or arm.value is None else f"{arm.value:,}"
-        name = label_of(arm) if results.kind == "study of gaussians" else name
-        begin = [arm.method] * several + [name] + [_difference(arm, results)] * options
-        body.append([*begin, *(cell(arm.runs, measure) for measure in measures)])
-    return [[*titles, *(measure.title for measure in measures)], *body]
+    """A column for each arm, or a row where there are many. What nobody knows is left out."""
+    table = [["", *(arm.name for arm in results.arms)]]
+    for measure in MEASURES:
+        table.append([measure.title, *(cell(arm.runs, measure) for arm in results.arms)])
+        if measure.field == "psnr_merged":
+            table.append(["difference (dB)", *(_difference(arm, results) for arm in results.arms)])
+    if results.settings is None:
+        table = [row for row in table if row[0] != MEASURES[0].title]  # of crops that were trained on
+    table = [row for row in table if set(row[1:]) != {NOTHING}]
+    return (
+        table if len(results.arms) <= MOST_COLUMNS else [list(column) for column in zip(*table, strict=True)]
+    )
 
 
 def notes(results: Results) -> list[str]:
@@ -129,10 +106,11 @@ def notes(results: Results) -> list[str]:
         found.append("Evaluation, saving and compiling are left out of the training time.")
     if len(results.seeds) > 1:
         found.append("Numbers are means over the seeds ± their standard deviation.")
-    if results.kind == "study of options":
-        found.append("Differences are those of merged PSNR, taken seed by seed.")
+    if any(results.baseline(arm) for arm in results.arms):
+        found.append("Differences are those of merged PSNR to the method as it is, taken seed by seed.")
+        found += ["One seed: a few tenths of a dB may be chance."] if len(results.seeds) == 1 else []
     reasons = {}
-    for run in results.runs if results.kind == "comparison" else ():
+    for run in results.runs if results.settings is not None else ():
         told = {"LPIPS": run.lpips_reason, "peak GPU memory": run.peak_device_note}
         reasons |= {name: reason for name, reason in told.items() if reason}
         if run.ordering_gap_note:
@@ -151,9 +129,7 @@ def _protocol(results: Results) -> str:
     budget = s.budget if s.seconds is None else f"{s.budget} of training"
     seeds = ("seed " if len(results.seeds) == 1 else "seeds ") + ", ".join(map(str, results.seeds))
     conditions = [f"{budget} a run", seeds]
-    if results.kind != "comparison" and len(results.methods) == 1:
-        conditions.insert(0, results.methods[0])
-    if results.kind != "study of blocks" and set(results.methods) != {"abcd-monolithic"}:
+    if s.blocks and set(results.methods) != {"abcd-monolithic"}:
         conditions.append(f"{s.blocks} blocks")
     conditions += [] if s.densify else ["the number of Gaussians fixed"]
     conditions += [f"at most {s.max_gaussians:,} Gaussians"] if s.max_gaussians else []
@@ -216,11 +192,16 @@ def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: 
 
 
 def _difference(arm: Arm, results: Results) -> str:
-    default = find_default(results)
-    found = None if default is None or arm is default else find_difference(arm, default)
-    if found is None:
-        return NOTHING
-    return f"{found.mean:+.2f}" + ("" if found.deviation is None else f" ± {found.deviation:.2f}")
+    """Of merged PSNR to the arm without changes, over the seeds that both have."""
+    base = results.baseline(arm)
+    theirs = {run.seed: run.psnr_merged for run in base.runs} if base and results.settings else {}
+    pairs = [run.psnr_merged - theirs[run.seed] for run in arm.runs if run.seed in theirs]
+    return mean_of(pairs, "+.2f") if pairs else NOTHING
+
+
+def _value(run: Run, field: str) -> float | None:
+    """A field, after a dot of a part that a run may lack."""
+    return reduce(lambda record, name: getattr(record, name, None), field.split("."), run)
 
 
 def _of_outcomes(outcomes: Sequence[Outcome]) -> Rows:

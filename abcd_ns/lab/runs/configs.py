@@ -55,6 +55,8 @@ def check_options(job: Job) -> None:
     Raises:
         UserError: they do not.
     """
+    if not job.variant.changes:
+        return
     pipeline = _abcd(job).pipeline
     mirror(pipeline.training, pipeline.model)
     if not 1 <= pipeline.blocks <= MAX_BLOCKS:
@@ -75,7 +77,7 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
         pipeline.blocks = settings.blocks
     if job.method == "abcd-paper":
         # One visit to each cell; cells that no view sees leave their steps to the others.
-        training, steps = pipeline.training, -(-settings.steps // settings.blocks)
+        training, steps = pipeline.training, -(-settings.steps // job.blocks)
         training.recipe = dataclasses.replace(training.recipe, visit_steps=steps)
     pipeline.max_seconds = settings.seconds
     pipeline.training.seed = job.seed

@@ -60,7 +60,7 @@ def run_jobs(
 
 def gather(plan: Plan, found: Found, machine: Machine, left_out: Sequence[LeftOut] = ()) -> Results:
     """What came of the plan's jobs, with its findings."""
-    runs: dict[tuple, list[Run]] = {(m, v): [] for m in plan.methods for v in plan.variants}
+    runs: dict[tuple, list[Run]] = {(job.method, job.variant): [] for job in plan.jobs}
     for job, outcome in found:
         if isinstance(outcome, Run):
             runs[job.method, job.variant].append(outcome)
@@ -74,7 +74,6 @@ def gather(plan: Plan, found: Found, machine: Machine, left_out: Sequence[LeftOu
         arms=tuple(Arm(m, v.name, v.number, tuple(of)) for (m, v), of in runs.items() if of),
         failures=tuple(outcome for _, outcome in found if isinstance(outcome, Failure)),
         left_out=tuple(left_out),
-        notes=plan.notes,
     )
     return dataclasses.replace(results, findings=findings_of(results))
 

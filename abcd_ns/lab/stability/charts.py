@@ -18,8 +18,8 @@ ONE_BLOCK = "abcd-monolithic"
 
 @in_style
 def draw_curves(results: Results, out: Path) -> list[Path]:
-    """Write each curve's chart as png and svg into `out`; returns their paths."""
-    return [path for curve in results.curves for path in save(_draw(curve), out, curve.name)]
+    """Write each curve's chart as png into `out`; returns their paths."""
+    return [save(_draw(curve), out, curve.name) for curve in results.curves]
 
 
 def _draw(curve: Curve) -> Figure:

@@ -25,21 +25,12 @@ from abcd_ns.lab.stability.charts import draw_curves
 from abcd_ns.lab.stability.curves import Study, studies
 from abcd_ns.lab.stability.lab import Lab
 from abcd_ns.lab.stability.outcome import Scenario
-from abcd_ns.lab.stability.scenarios import (
-    borders,
-    cameras,
-    captures,
-    emptiness,
-    freshness,
-    growth,
-    sizes,
-    values,
-)
-from abcd_ns.lab.stability.scenarios.real import MOST_POINTS, read_stage, real_scenarios
+from abcd_ns.lab.stability.scenarios import blocks, cameras, captures, gaussians, schedules
+from abcd_ns.lab.stability.scenarios.captures import MOST_POINTS, read_stage, real_scenarios
 from abcd_ns.machine import describe_machine
 
 KIND = "stability report"
-_MODULES = (values, sizes, emptiness, growth, cameras, captures, freshness, borders)
+_MODULES = (gaussians, blocks, schedules, cameras, captures)
 _FOUND = {one.id: one for module in _MODULES for one in vars(module).values() if isinstance(one, Scenario)}
 SCENARIOS = {id: _FOUND[id] for id in sorted(_FOUND, key=lambda id: int(id[1:]))}
 """By id, A1 to A22."""

@@ -8,7 +8,7 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.lab.results.results import Curve, Line
 from abcd_ns.lab.stability.lab import PAIR, Lab, Method, Stage, make_stage
 from abcd_ns.lab.stability.scenarios.captures import with_gains, with_noisy_poses
-from abcd_ns.lab.stability.scenarios.freshness import BLOCKS, train_stale
+from abcd_ns.lab.stability.scenarios.schedules import BLOCKS, train_stale
 
 VIEWS = (3, 8, 16)
 VISIT_STEPS = (1, 4, 16, 64)

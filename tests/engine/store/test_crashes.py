@@ -1,7 +1,4 @@
-"""A run that is killed and gone on with is the run that was not, bit for bit; so is one that a disk refused.
-
-`python -m benchmarks.faults` does the same at many more moments.
-"""
+"""A run that is killed and resumed is the run that was not, bit for bit; so is one that a disk refused."""
 
 import random
 

@@ -64,6 +64,12 @@ def made_up(kind: str, *arms: Arm, **fields) -> Results:
     return dataclasses.replace(results, findings=findings_of(results))
 
 
+def made_up_arm(variant: str, value: int | None, psnrs: dict[int, float], method="abcd", **fields) -> Arm:
+    """An arm whose runs end at `psnrs`, by seed."""
+    runs = (made_up_run(method, seed, psnr_merged=psnr, psnr=psnr, **fields) for seed, psnr in psnrs.items())
+    return Arm(method, variant, value, tuple(runs))
+
+
 def made_up_results(*runs: Run, **fields) -> Results:
     """A comparison with these runs."""
     methods = dict.fromkeys(run.method for run in runs)

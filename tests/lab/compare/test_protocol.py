@@ -10,7 +10,7 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.command import Options, make_plan, read_options
 from abcd_ns.lab.job import METHODS, Settings
 from abcd_ns.lab.results.records import own_configs
-from abcd_ns.lab.runs.configs import trainer_config
+from abcd_ns.lab.runs.configs import check_options, trainer_config
 
 CONFIGS = own_configs(trains=False)
 
@@ -40,7 +40,7 @@ def test_every_method_runs_with_every_seed_in_its_own_folder(tmp_path):
 
 @pytest.mark.parametrize("method", [method for method in METHODS if method != "splatfacto"])
 def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, method):
-    (job,) = make_plan(options(tmp_path, methods=(method,), steps=90, blocks=4)).jobs
+    (job,) = make_plan(options(tmp_path, methods=(method,), steps=90, blocks=(4,))).jobs
     config = trainer_config(job, tmp_path)
     training = config.pipeline.training
     assert config.method_name == method
@@ -61,8 +61,16 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"steps": 0}, "--steps is 0"),
         ({"steps": None, "seconds": 0.0}, "--seconds is 0.0"),
         ({"steps": None, "seconds": float("nan")}, "--seconds is nan"),
-        ({"blocks": 0}, "--blocks is 0"),
-        ({"blocks": 65_537}, "--blocks is 65537; it must be at most 65536"),
+        ({"blocks": (0,)}, "--blocks 0: give different numbers from 1 up"),
+        ({"blocks": (2, 2)}, "--blocks 2 2: give different numbers"),
+        ({"blocks": ()}, "--blocks: give different numbers"),
+        ({"blocks": (1, 65_537)}, "--blocks is 65537; it must be at most 65536"),
+        ({"prices": (-1.0,)}, "--prices -1: a price is 0 or more"),
+        ({"prices": (float("nan"),)}, "--prices nan: a price is 0 or more"),
+        ({"prices": (1.0, 1.0000001)}, "'training.density.price=1' is given twice"),  # told to six digits
+        ({"vary": ("training.batch=1", "training.btach=2")}, "no option 'training.btach'"),
+        ({"vary": ("blocks=2", "blocks=2")}, "'blocks=2' is given twice"),
+        ({"vary": ("blocks=2",), "blocks": (1, 8)}, "'blocks=2' is given twice"),
         ({"downscale": 0}, "--downscale is 0"),
         ({"evals": 0}, "--evals is 0"),
         ({"max_gaussians": -1}, "--max-gaussians is -1"),
@@ -81,11 +89,71 @@ def test_what_cannot_be_run_is_refused_in_one_line(tmp_path, given, message):
 
 
 def test_the_command_line_goes_before_the_file():
-    file = Options(steps=100, blocks=4, methods=("abcd",), downscale=2)
-    merged = Options(seconds=5.0, blocks=2).over(file)
+    file = Options(steps=100, blocks=(4,), methods=("abcd",), downscale=2)
+    merged = Options(seconds=5.0, blocks=(2,)).over(file)
     assert (merged.seconds, merged.steps) == (5.0, None)
-    assert (merged.blocks, merged.downscale, merged.methods) == (2, 2, ("abcd",))
+    assert (merged.blocks, merged.downscale, merged.methods) == ((2,), 2, ("abcd",))
     assert Options().over(file) == file
+
+
+def names_of(plan) -> list[tuple[str, str]]:
+    return [(job.method, job.variant.name) for job in plan.jobs]
+
+
+def test_several_numbers_of_blocks_are_an_arm_each_of_every_method_that_has_any(tmp_path):
+    plan = make_plan(options(tmp_path, methods=("abcd", "abcd-monolithic"), blocks=(4, 1), seeds=(0, 1)))
+    once = [("abcd-monolithic", "default"), ("abcd", "blocks=1"), ("abcd", "blocks=4")]
+    assert names_of(plan) == 2 * once
+    assert [trainer_config(job, tmp_path).pipeline.blocks for job in plan.jobs[:3]] == [1, 1, 4]
+    assert plan.jobs[1].folder(Path("out")) == Path("out/runs/abcd/blocks=1-seed-0")
+    assert "--blocks 4 1" in plan.command
+
+
+def test_prices_and_changes_are_arms_beside_the_method_as_it_is(tmp_path):
+    given = {"prices": (8, 0.5), "vary": ("training.warmup=0", "partition=grid blocks=27")}
+    plan = make_plan(options(tmp_path, blocks=(4,), **given))
+    price = "training.density.price"
+    changes = ["default", f"{price}=8", f"{price}=0.5", "training.warmup=0", "partition=grid blocks=27"]
+    assert names_of(plan) == [("abcd", name) for name in changes]
+    configs = [trainer_config(job, tmp_path).pipeline for job in plan.jobs]
+    assert [c.training.density.price for c in configs][1:3] == [8.0, 0.5]
+    assert [c.blocks for c in configs] == [4, 4, 4, 4, 27]
+    assert "--prices 8 0.5 --vary training.warmup=0 'partition=grid blocks=27'" in plan.command
+
+
+def test_every_change_is_made_with_every_number_of_blocks(tmp_path):
+    plan = make_plan(options(tmp_path, blocks=(1, 8), vary=("training.batch=1",)))
+    sizes = [(f"blocks={n}", f"blocks={n} training.batch=1") for n in (1, 8)]
+    assert [name for _, name in names_of(plan)] == [name for pair in sizes for name in pair]
+
+
+def test_splatfacto_has_none_of_the_options(tmp_path):
+    plan = make_plan(options(tmp_path, methods=("abcd", "splatfacto"), prices=(4.0,), blocks=(1, 2)))
+    assert [name for method, name in names_of(plan) if method == "splatfacto"] == ["default"]
+
+
+def test_more_seeds_and_arms_may_join_the_same_folder(tmp_path):
+    first, more = (make_plan(options(tmp_path, blocks=blocks)) for blocks in ((1, 2), (8, 1, 2)))
+    assert first.settings == more.settings
+    assert set(first.jobs) < set(more.jobs)
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        ("blocks=0", "blocks must be 1 to 65536, not 0"),
+        ("blocks=65537", "blocks must be 1 to 65536, not 65537"),
+        ("model.num_downscales=1", "has no effect here"),
+    ],
+)
+def test_changes_that_cannot_be_trained_are_refused(tmp_path, vary, message):
+    with pytest.raises(UserError, match=message):
+        check_options(make_plan(options(tmp_path, vary=(vary,))).jobs[1])
+
+
+def test_a_single_number_of_blocks_in_a_file_is_one(tmp_path):
+    (tmp_path / "compare.toml").write_text("blocks = 3")
+    assert read_options(tmp_path / "compare.toml").blocks == (3,)
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -102,7 +170,7 @@ def test_there_are_examples():
     ("text", "message"),
     [
         ("bloks = 3", "unknown field 'bloks'; did you mean 'blocks'"),
-        ("blocks = 'three'", r"Expected int \| null, got str - at blocks"),
+        ("blocks = 'three'", r"Expected array \| null, got str - at blocks"),
         ("methods = ['abcd', 3]", r"got int - at methods\[1\]"),
         ("seeds = 0", r"Expected array \| null, got int - at seeds"),
         ("blocks = ", "cannot be read as TOML"),

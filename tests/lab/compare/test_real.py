@@ -27,7 +27,7 @@ def compared(tmp_path_factory):
         out=str(folder / "out"),
         methods=("abcd-monolithic", "abcd"),
         steps=STEPS,
-        blocks=2,
+        blocks=(2,),
         evals=3,
         pictures=1,
     )
@@ -110,7 +110,7 @@ def test_reports_are_there_and_a_second_call_trains_nothing(compared):
     results, plan, _ = compared
     pictures = [path.name for path in (plan.out / "pictures").iterdir()]
     assert pictures == ["view-0001.png"]
-    for name in ("table.md", "speed_accuracy.png", "speed_accuracy.svg", "size_accuracy.png"):
+    for name in ("table.md", "speed_accuracy.png", "size_accuracy.png", "memory.png"):
         assert (plan.out / name).stat().st_size > 0
     stream = StringIO()
     assert carry_out(plan, Console(file=stream, width=100)) == 0

@@ -4,7 +4,6 @@ import dataclasses
 import re
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,51 +13,16 @@ from PIL import Image
 from rich.console import Console
 
 from abcd_ns.engine.train.schedule import evenly
-from abcd_ns.lab.compare.charts import draw_size_accuracy, draw_speed_accuracy, mean_curve
-from abcd_ns.lab.compare.command import first_runs
+from abcd_ns.lab.compare.charts import colors_of, draw_charts, mean_curve
+from abcd_ns.lab.compare.command import shown
 from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
-from abcd_ns.lab.job import METHODS
-from abcd_ns.lab.results.results import Arm
+from abcd_ns.lab.job import METHODS, Job, Plan
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS, spread
 from abcd_ns.lab.results.tables import MEASURES, cell, notes, print_table, rows, write_table
-from tests.lab.compare.records import made_up, made_up_results, made_up_run
-from tests.lab.svg import texts_of
+from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run
 
-# The chart
-
-
-def test_chart_shows_every_method_in_its_own_colour_with_units(tmp_path):
-    results = made_up_results(*(made_up_run(method, psnr=20.0 + i) for i, method in enumerate(METHODS)))
-
-    paths = draw_speed_accuracy(results, tmp_path)
-
-    assert sorted(path.name for path in paths) == ["speed_accuracy.png", "speed_accuracy.svg"]
-    texts = texts_of(tmp_path / "speed_accuracy.svg")
-    for method in METHODS:
-        assert sum(text.startswith(f"{method}  ") for text in texts) == 1
-    assert {"training time (s)", "held-out PSNR (dB)"} <= set(texts)
-    source = (tmp_path / "speed_accuracy.svg").read_text().lower()
-    assert all(COLORS[method].lower() in source for method in METHODS)
-    assert len(set(COLORS.values())) == len(set(MARKERS.values())) == len(METHODS)
-    with Image.open(tmp_path / "speed_accuracy.png") as image:
-        colours = {pixel for _, pixel in image.convert("RGB").getcolors(1 << 24)}
-    assert all(tuple(bytes.fromhex(COLORS[method][1:])) in colours for method in METHODS)
-
-
-def test_chart_is_the_same_file_every_time(tmp_path):
-    results = made_up_results(made_up_run(), made_up_run("abcd-monolithic"))
-    drawn = []
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        draw_speed_accuracy(results, tmp_path / name)
-        drawn.append((tmp_path / name / "speed_accuracy.svg").read_bytes())
-    assert drawn[0] == drawn[1]
-
-
-def test_no_run_no_chart(tmp_path):
-    assert draw_speed_accuracy(made_up_results(), tmp_path) == []
-    assert list(tmp_path.iterdir()) == []
+# The charts
 
 
 def counted(*counts: int, **fields):
@@ -69,18 +33,46 @@ def counted(*counts: int, **fields):
     return dataclasses.replace(base, curve=tuple(points))
 
 
-def test_the_way_through_numbers_of_gaussians_has_a_chart(tmp_path):
-    results = made_up_results(counted(100, 900, 2000), counted(100, 500, 800, method="abcd-monolithic"))
-    paths = draw_size_accuracy(results, tmp_path)
-    assert [path.name for path in paths] == ["size_accuracy.png", "size_accuracy.svg"]
-    texts = texts_of(paths[1])
-    assert {"held-out PSNR (dB)", "2,000"} <= set(texts)
-    assert any(text.startswith("Gaussians in the scene") for text in texts)
+def test_charts_show_every_method_in_its_own_colour_with_units(tmp_path, drawn):
+    runs = (counted(9, 90, 200 + i, method=method, psnr=20.0 + i) for i, method in enumerate(METHODS))
+    paths = draw_charts(made_up_results(*runs), tmp_path)
+    assert [path.name for path in paths] == ["speed_accuracy.png", "size_accuracy.png", "memory.png"]
+    for name, axis in (("speed_accuracy", "training time (s)"), ("size_accuracy", "Gaussians in the scene")):
+        texts = drawn[f"{name}.png"]
+        for method in METHODS:
+            assert sum(text.startswith(f"{method}  ") for text in texts) == 1
+        assert any(text.startswith(axis) for text in texts)
+        assert "held-out PSNR (dB)" in texts
+    assert {"abcd, RAM", "peak memory (MiB)"} <= set(drawn["memory.png"])
+    assert len(set(COLORS.values())) == len(set(MARKERS.values())) == len(METHODS)
+    with Image.open(tmp_path / "speed_accuracy.png") as image:
+        colours = {pixel for _, pixel in image.convert("RGB").getcolors(1 << 24)}
+    assert all(tuple(bytes.fromhex(COLORS[method][1:])) in colours for method in METHODS)
 
 
-def test_runs_that_counted_no_gaussians_have_no_such_chart(tmp_path):
-    assert draw_size_accuracy(made_up_results(counted(1, 2), made_up_run()), tmp_path) == []
-    assert draw_size_accuracy(made_up_results(), tmp_path) == []
+def test_arms_of_one_method_are_called_by_what_is_set_and_have_their_own_shades(tmp_path, drawn):
+    arms = [made_up_arm(f"blocks={n}", n, {0: 25.0 - n, 1: 24.0 - n}, gaussians=n) for n in (1, 8)]
+    arms.append(made_up_arm("training.density.price=4", None, {0: 21.0}))
+    results = made_up("comparison", *arms, seeds=(0, 1))
+    assert list(results.labels.values()) == ["1 block", "8 blocks", "price=4"]
+    assert len(set(colors_of(results.arms).values())) == 3
+    draw_charts(results, tmp_path)
+    assert any(text.startswith("8 blocks  ") for text in drawn["speed_accuracy.png"])
+
+
+def test_memory_is_that_of_the_card_too_where_there_is_one(tmp_path, drawn):
+    draw_charts(made_up_results(made_up_run(peak_device_bytes=2 << 30)), tmp_path)
+    assert {"abcd, RAM", "abcd, GPU"} <= set(drawn["memory.png"])
+
+
+def test_no_run_no_chart(tmp_path):
+    assert draw_charts(made_up_results(), tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_that_counted_no_gaussians_have_no_chart_of_them(tmp_path):
+    paths = draw_charts(made_up_results(counted(1, 2), made_up_run()), tmp_path)
+    assert [path.name for path in paths] == ["speed_accuracy.png", "memory.png"]
 
 
 def test_mean_curve_is_the_mean_of_seeds_and_keeps_every_end():
@@ -105,31 +97,68 @@ def test_labels_keep_their_distance_and_their_order(wanted):
 # The table
 
 
-def test_table_has_a_column_per_method_and_a_row_per_measure(tmp_path):
-    results = made_up_results(made_up_run("abcd-monolithic", psnr=25.0), made_up_run(psnr=24.0))
+def test_table_has_a_column_per_method_and_a_row_per_known_measure(tmp_path):
+    lpips = {"lpips": 0.25}
+    results = made_up_results(made_up_run("abcd-monolithic", psnr=25.0), made_up_run(psnr=24.0, **lpips))
     titles, *body = rows(results)
     assert titles == ["", "abcd-monolithic", "abcd"]
     table = {row[0]: row[1:] for row in body}
     assert table["PSNR, composited (dB)"] == ["24.90", "23.90"]
     assert table["Gaussians"] == ["12,345", "12,345"]
-    assert table["LPIPS, composited"] == ["-", "-"]
+    assert table["LPIPS, composited"] == ["-", "0.250"]
+    assert "peak GPU memory (GiB)" not in table
     assert table["peak RAM (GiB)"] == ["1.50", "1.50"]
     assert table["blocks on disk (MiB)"] == ["256.0", "256.0"]
-    wanted = "PSNR SSIM LPIPS merged gap Gaussians steps training layers process GPU RAM disk"
+    wanted = "PSNR SSIM LPIPS merged gap Gaussians steps training layers process RAM disk"
     assert all(any(word in title for title in table) for word in wanted.split())
 
     write_table(results, tmp_path / "table.md")
     lines = (tmp_path / "table.md").read_text().splitlines()
     widths = {line.count("|") for line in lines if line.startswith("|")}
     assert widths == {4}
-    assert len([line for line in lines if line.startswith("|")]) == 2 + len(MEASURES)
+    assert len([line for line in lines if line.startswith("|")]) == 2 + len(body)
 
 
-def test_table_has_a_column_for_each_way_that_a_method_is_set():
-    arms = [("abcd-monolithic", "default"), ("abcd", "default"), ("abcd", "blocks=2")]
-    titles, *body = rows(made_up("comparison", *(Arm(*arm, None, (made_up_run(arm[0]),)) for arm in arms)))
-    assert titles == ["", "abcd-monolithic", "abcd", "abcd blocks=2"]
-    assert {len(row) for row in body} == {len(titles)}
+def test_many_arms_have_a_row_each():
+    arms = [made_up_arm(f"blocks={n}", n, {0: 24.0}) for n in range(1, 7)]
+    titles, *body = rows(made_up("comparison", *arms))
+    assert {"PSNR, merged (dB)", "Gaussians"} <= set(titles)
+    assert [row[0] for row in body] == [f"abcd blocks={n}" for n in range(1, 7)]
+
+
+def test_changes_have_their_difference_to_the_method_as_it_is_seed_by_seed():
+    default = made_up_arm("default", None, {0: 20.0, 1: 24.0, 2: 9.0})
+    other = made_up_arm("training.batch=1", None, {0: 21.0, 1: 25.5})
+    results = made_up("comparison", default, other, seeds=(0, 1, 2))
+    (differences,) = (row for row in rows(results) if row[0] == "difference (dB)")
+    assert differences == ["difference (dB)", "-", "+1.25 ± 0.35"]
+    assert any("seed by seed" in note for note in notes(results))
+    assert not any(row[0] == "difference (dB)" for row in rows(made_up("comparison", default)))
+    alone = made_up("comparison", made_up_arm("training.batch=1", None, {7: 20.0}))
+    assert not any(row[0] == "difference (dB)" for row in rows(alone))
+
+
+def test_a_change_is_held_against_the_same_number_of_blocks():
+    names = ("blocks=1", "blocks=1 training.batch=1", "blocks=8", "blocks=8 training.batch=1")
+    results = made_up("comparison", *(made_up_arm(name, None, {0: 20.0}) for name in names))
+    bases = [base and base.variant for base in map(results.baseline, results.arms)]
+    assert bases == [None, "blocks=1", None, "blocks=8"]
+    varied = [made_up_arm(name, None, {0: 20.0}) for name in ("default", "partition=grid blocks=27")]
+    assert made_up("comparison", *varied).baseline(varied[1]) is varied[0]
+
+
+def test_a_method_with_several_arms_has_its_best_and_worst_and_the_fewest_gaussians_said():
+    sizes = {"blocks=1": (25.0, 9000), "blocks=2": (24.9, 4000), "blocks=27": (24.4, 2000)}
+    arms = [made_up_arm(n, None, {0: psnr}, gaussians=count) for n, (psnr, count) in sizes.items()]
+    (finding,) = made_up("comparison", *arms, made_up_arm("default", None, {0: 9.0}, "splatfacto")).findings
+    for part in (
+        "Best: abcd, 1 block, 25.00 dB.",
+        "Worst: abcd, 27 blocks, 24.40 dB.",
+        "Gap: 0.60 dB.",
+        "within 0.2 dB of the best: 4,000 (abcd, 2 blocks, 24.90 dB)",
+    ):
+        assert part in finding
+    assert made_up("comparison", arms[0]).findings == ()
 
 
 def test_several_seeds_give_mean_and_deviation():
@@ -220,13 +249,11 @@ def test_every_view_that_all_runs_drew_gets_a_figure(tmp_path):
 
 
 def test_where_a_seed_failed_pictures_are_of_one_that_all_methods_have_and_titles_count_what_is_there():
-    results = made_up_results(
-        *(made_up_run(seed=seed) for seed in (0, 1)), made_up_run("abcd-monolithic", seed=1), seeds=(0, 1)
-    )
-    plan = SimpleNamespace(settings=results.settings, out=Path("out"))
-    assert [(run.method, run.seed) for run, _ in first_runs(results, plan)] == [
-        ("abcd", 1),
-        ("abcd-monolithic", 1),
-    ]
+    runs = [made_up_run(seed=0), made_up_run(seed=1), made_up_run("abcd-monolithic", seed=1)]
+    results = made_up_results(*runs, seeds=(0, 1))
+    jobs = tuple(Job(run.method, run.seed, results.settings) for run in runs)
+    plan = Plan("comparison", results.settings, Path("out"), jobs, "abcd")
+    found = [(run.method, run.seed, folder) for run, folder in shown(results, plan)]
+    assert found == [(m, 1, Path(f"out/runs/{m}/seed-1/pictures")) for m in ("abcd", "abcd-monolithic")]
     assert results.means_of == "mean of 1 to 2 seeds"
     assert made_up_results(made_up_run()).means_of == ""

@@ -95,7 +95,7 @@ def test_a_comparison_with_a_failure_still_writes_everything(plan, worker):
     results = read_results(plan.out / "results.json")
     assert [found.method for found in results.runs] == ["abcd-monolithic"]
     assert [failure.method for failure in results.failures] == ["abcd"]
-    for name in ("table.md", "speed_accuracy.png", "speed_accuracy.svg"):
+    for name in ("table.md", "speed_accuracy.png", "memory.png"):
         assert (plan.out / name).stat().st_size > 0
     assert "ValueError: the scene is empty" in (plan.out / "table.md").read_text()
     assert "PSNR" in stream.getvalue()
@@ -180,6 +180,29 @@ def test_a_scene_that_cannot_be_read_is_refused_before_the_first_run(plan, worke
     assert "holds no model" in " ".join(capsys.readouterr().err.split())
     assert not plan.out.exists()
     assert worker.calls() == []
+
+
+def test_a_wrong_name_on_the_command_line_is_one_line_and_nothing_is_written(plan, capsys):
+    words = ["compare", "--data", plan.settings.data, "--out", str(plan.out), "--steps", "5"]
+    assert cli.main([*words, "--vary", "training.batch=1", "trainin.warmup=0"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["error: There is no option 'trainin.warmup'; did you mean training.warmup?"]
+    assert not plan.out.exists()
+
+
+def test_a_change_that_failed_is_named_and_the_others_are_reported(plan, worker):
+    worker.behave({"training.batch=1": "raises"})
+    options = Options(data=plan.settings.data, out=str(plan.out), steps=10)
+    varied = make_plan(dataclasses.replace(options, vary=("training.batch=1", "training.warmup=0")))
+    assert carry_out(varied, Console(file=StringIO())) == 1
+    assert worker.calls() == ["abcd", "abcd training.batch=1", "abcd training.warmup=0"]
+    results = read_results(plan.out / "results.json")
+    assert [arm.variant for arm in results.arms] == ["default", "training.warmup=0"]
+    assert [failure.variant for failure in results.failures] == ["training.batch=1"]
+    text = (plan.out / "table.md").read_text()
+    assert "abcd, training.batch=1, seed 0 failed" in text
+    assert carry_out(varied, Console(file=StringIO())) == 1
+    assert worker.calls() == ["abcd training.batch=1"]  # the others are reused
 
 
 def test_splatfacto_is_left_out_with_a_reason_where_it_cannot_run(plan, worker, monkeypatch):

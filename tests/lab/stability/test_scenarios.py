@@ -14,7 +14,7 @@ import torch
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.lab.stability.command import SCENARIOS
 from abcd_ns.lab.stability.lab import Lab
-from abcd_ns.lab.stability.scenarios.borders import alpha_in_air
+from abcd_ns.lab.stability.scenarios.blocks import alpha_in_air
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 SLOW = {"A3", "A6", "A8", "A9", "A11", "A12", "A13", "A14", "A15", "A16", "A19"}

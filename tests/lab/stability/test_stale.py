@@ -5,7 +5,7 @@ from functools import partial
 import torch
 
 from abcd_ns.lab.stability.lab import STILL, Lab, make_stage
-from abcd_ns.lab.stability.scenarios.stale import stale_coordinator
+from abcd_ns.lab.stability.scenarios.schedules import stale_coordinator
 
 
 def means_after_a_visit(folder, damping):

@@ -16,7 +16,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health.health_rules import unsound
 from abcd_ns.lab.stability.lab import PAIR, Lab, make_stage
 from abcd_ns.lab.stability.outcome import Finding, scenario
-from abcd_ns.lab.stability.scenarios.emptiness import equal
+from abcd_ns.lab.stability.scenarios.blocks import equal
 from abcd_ns.lab.world.world import TABLE, camera, ring
 from abcd_ns.machine import threads_wanted
 

@@ -1,4 +1,4 @@
-"""`abcd scale`: the land is what it claims to be, and a measurement can be made and read back."""
+"""`abcd compare --tiles`: the terrain is what it claims to be; a run is made and read back."""
 
 import shlex
 from dataclasses import replace
@@ -8,14 +8,16 @@ import torch
 
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
+from abcd_ns.lab.compare.charts import draw_charts
+from abcd_ns.lab.compare.command import Options, compare, make_plan
+from abcd_ns.lab.compare.terrain import AS_ONE, terrain_jobs, too_large
+from abcd_ns.lab.job import TerrainJob, TerrainSettings
 from abcd_ns.lab.results.findings import find_growth
 from abcd_ns.lab.results.records import decode, encode, read_json
-from abcd_ns.lab.results.results import Arm, Results
+from abcd_ns.lab.results.results import TERRAIN, Arm, Results
 from abcd_ns.lab.results.run import Failure, Footing, Run
-from abcd_ns.lab.results.tables import notes, rows, write_table
-from abcd_ns.lab.scale.charts import draw_scale
-from abcd_ns.lab.scale.command import make_plan, scale
-from abcd_ns.lab.scale.worker import AS_ONE, LandJob, LandSettings, run
+from abcd_ns.lab.results.tables import notes, write_table
+from abcd_ns.lab.runs.terrain import run
 from abcd_ns.lab.world.land import Land, color_of
 from tests.lab.compare.records import made_up, made_up_run, read_results
 from tests.lab.in_process import jobs_in_this_process
@@ -37,10 +39,14 @@ def test_each_block_of_the_land_is_one_tile(tiles):
         )
 
 
+def options(out, **given) -> Options:
+    return Options(out=str(out), **given)
+
+
 def test_the_command_that_is_kept_can_be_given_again(tmp_path):
-    plan = make_plan(tmp_path / "my land; x", LandSettings(300, 1, MIB), [2, 4], [2], 0)
-    words = ["abcd", "scale", "--blocks", "2", "4", "--gaussians", "300", "--visits", "1"]
-    words += ["--ram-budget-mb", "1", "--monolithic-limit", "600", "--seed", "0", "--out", "my land; x"]
+    plan = make_plan(options(tmp_path / "my land; x", tiles=(4, 2), tile_gaussians=300, visits=1))
+    words = ["abcd", "compare", "--tiles", "2", "4", "--methods", "abcd", "--seeds", "0"]
+    words += ["--tile-gaussians", "300", "--visits", "1", "--out", "my land; x"]
     assert shlex.split(plan.command) == words
 
 
@@ -83,9 +89,8 @@ def test_cameras_see_their_own_tile():
 
 @pytest.mark.parametrize("method", ["abcd", AS_ONE])
 def test_a_measurement_trains_and_says_what_it_took(tmp_path, method):
-    jobs = make_plan(tmp_path, LandSettings(300, 1, MIB), [2], [2], 0).jobs
-    job = next(job for job in jobs if job.method == method)
-    assert decode(LandJob, encode(job), "here") == job
+    (job,) = terrain_jobs(TerrainSettings(300, 1, MIB), [2], [method], [0])
+    assert decode(TerrainJob, encode(job), "here") == job
     found = run(job, tmp_path)
     assert (found.gaussians, found.blocks) == (600, 1 if method == AS_ONE else 2)
     assert found.peak_rss_bytes >= found.memory.base_rss_bytes > 0
@@ -106,7 +111,7 @@ def made_up_land(tiles: int, peak: int, method: str = "abcd", device: int | None
 
 
 def results_of(*arms: Arm) -> Results:
-    return made_up("study of scale", *arms, settings=None)
+    return made_up(TERRAIN, *arms, settings=None)
 
 
 def test_growth_is_from_the_smallest_to_the_largest():
@@ -120,73 +125,72 @@ def test_growth_is_from_the_smallest_to_the_largest():
     assert results_of(arms[0]).findings == ()
 
 
-def test_results_are_written_in_words_and_drawn(tmp_path):
+def test_results_are_written_in_words_and_drawn(tmp_path, drawn):
     sizes = ((2, 500, "abcd"), (8, 520, "abcd"), (2, 450, AS_ONE), (8, 900, AS_ONE))
     results = results_of(*(made_up_land(*size) for size in sizes))
     write_table(results, tmp_path / "table.md")
     text = (tmp_path / "table.md").read_text()
-    assert "| abcd | 8 | 8,000 | 520 |" in text
     assert "grows by 4.0%" in text
-    assert len(rows(results)) == 5
+    assert "| visit (s) | 2.0 | 2.0 | - | - |" in text
+    assert "PSNR" not in text
     assert any("400 MiB" in note for note in notes(results))
-    assert all(path.stat().st_size > 1000 for path in draw_scale(results, tmp_path))
+    assert [path.name for path in draw_charts(results, tmp_path)] == ["memory.png"]
+    assert {"abcd, RAM", "abcd-monolithic, RAM", "RAM before any scene"} <= set(drawn["memory.png"])
 
 
 @pytest.mark.parametrize(
-    ("options", "expected"),
+    ("given", "expected"),
     [
-        ({"blocks": (2, 6)}, "powers of 2"),
-        ({"blocks": (4, 4)}, "different"),
-        ({"blocks": (0,)}, "from 1 on"),
-        ({"gaussians": 0}, "--gaussians"),
-        ({"visits": 0}, "--visits"),
-        ({"device_limit_mb": -1}, "--device-limit-mb is -1; it must be at least 0"),
-        ({"monolithic_limit": -1}, "--monolithic-limit is -1; it must be at least 0"),
-        ({"blocks": (2**18,), "gaussians": 10**6}, "GiB free"),
+        ({"tiles": (2, 6)}, "powers of 2"),
+        ({"tiles": (4, 4)}, "different"),
+        ({"tiles": (0,)}, "from 1 on"),
+        ({"tiles": ()}, "different"),
+        ({"tile_gaussians": 0}, "--tile-gaussians is 0"),
+        ({"visits": 0}, "--visits is 0"),
+        ({"data": "scene"}, "--data does not go with --tiles"),
+        ({"steps": 9, "vary": ("training.batch=1",)}, "--steps does not go with --tiles"),
+        ({"methods": ("abcd", "abcd-exact")}, "not abcd-exact"),
+        ({"tiles": (2**18,), "tile_gaussians": 10**6}, "GiB free"),
     ],
 )
-def test_what_cannot_be_measured_is_refused_before_anything_is_written(tmp_path, options, expected):
+def test_what_cannot_be_measured_is_refused(tmp_path, given, expected):
     with pytest.raises(UserError, match=expected):
-        scale(tmp_path / "out", **options)
-    assert not (tmp_path / "out").exists()
+        make_plan(options(tmp_path / "out", **{"tiles": (2, 4), **given}))
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(UserError, match="not empty"):
-        scale(tmp_path, blocks=(2, 4))
-
-
-def test_where_the_gpu_is_too_small_for_one_block_it_is_said_and_larger_ones_are_not_tried(
-    tmp_path, monkeypatch
-):
+def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, monkeypatch):
     """No GPU here: the processes' ends are made up."""
     tried = []
 
-    def made_up_end(job: LandJob, *_) -> Run | Failure:
+    def made_up_end(job: TerrainJob, *_) -> Run | Failure:
         tried.append((job.tiles, job.method))
-        assert job.settings.device_limit_bytes == 512 * MIB
         if job.method == AS_ONE and job.tiles > 2:
             reason = "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
             return Failure(job.method, job.seed, reason, "log.txt")
         return made_up_land(job.tiles, 500, job.method, device=100).runs[0]
 
     monkeypatch.setattr("abcd_ns.lab.runs.experiment.finish_job", made_up_end)
-    assert scale(tmp_path, blocks=(2, 4, 8), gaussians=10, device_limit_mb=512) == 0
-    assert tried == [(2, "abcd"), (4, "abcd"), (8, "abcd"), (2, AS_ONE), (4, AS_ONE)]
+    both = {"methods": ("abcd", AS_ONE), "tile_gaussians": 10}
+    assert compare(options(tmp_path, tiles=(2, 4, 8), **both)) == 0
+    assert tried == [(2, "abcd"), (2, AS_ONE), (4, "abcd"), (4, AS_ONE), (8, "abcd")]
     found = read_results(tmp_path / "results.json")
     assert (found.failures, len(found.arms)) == ((), 4)
     assert "as one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
-    assert "--device-limit-mb 512" in found.command
+
+
+def test_one_block_is_not_tried_where_it_would_be_huge():
+    small, large = terrain_jobs(TerrainSettings(10**6, 1), (4, 8), (AS_ONE,), (0,))
+    assert too_large(small) is None
+    assert "more than 4,000,000 Gaussians" in too_large(large).reason
 
 
 def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):
     jobs_in_this_process(monkeypatch)
-    out = tmp_path / "out"
-    assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
-    first = read_json(out / "results.json")
-    assert [(arm["method"], arm["value"]) for arm in first["arms"]] == [("abcd", 2), ("abcd", 4), (AS_ONE, 2)]
-    assert scale(out, blocks=(2, 4), gaussians=200, visits=1, monolithic_limit=400) == 0
-    assert read_json(out / "results.json")["arms"] == first["arms"]
-    assert not list(out.glob("runs/*/*/store"))
+    given = options(tmp_path / "out", tiles=(2, 4), tile_gaussians=200, visits=1)
+    assert compare(given) == 0
+    first = read_json(tmp_path / "out" / "results.json")
+    assert [(arm["method"], arm["value"]) for arm in first["arms"]] == [("abcd", 2), ("abcd", 4)]
+    assert compare(given) == 0
+    assert read_json(tmp_path / "out" / "results.json")["arms"] == first["arms"]
+    assert not list(tmp_path.glob("out/runs/*/*/store"))
     assert "peak RAM grows by" in capsys.readouterr().out.replace("\n", " ")

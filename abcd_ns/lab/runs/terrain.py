@@ -1,9 +1,8 @@
-"""One measurement in a process of its own: `python -m abcd_ns.lab.scale.worker JOB.json`."""
+"""One run on a synthetic terrain in a process of its own: `python -m abcd_ns.lab.runs.terrain JOB.json`."""
 
 import math
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
@@ -25,47 +24,18 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
-from abcd_ns.lab.job import Job
+from abcd_ns.lab.job import TerrainJob
 from abcd_ns.lab.results.run import Footing, Run
 from abcd_ns.lab.runs.work import memory_of_run, work
 from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run import STORE
 
-AS_ONE = "abcd-monolithic"
 WHOLE_STEPS = 12
 """Enough for Adam's moments and the drawing of the largest view to be there."""
 
 
-@dataclass(frozen=True)
-class LandSettings:
-    """What all measurements of a folder share."""
-
-    gaussians: int
-    """In each tile."""
-    visits: int
-    """To make; as one block none."""
-    ram_budget_bytes: int
-    """For blocks that were read; layers and photos have their own."""
-    device_limit_bytes: int = 0
-    """GPU memory that may be taken, as if the card had no more; 0 for all of it."""
-
-
-@dataclass(frozen=True)
-class LandJob(Job):
-    """A land to train on, by ABCD or as one block; its variant says of how many tiles."""
-
-    settings: LandSettings
-    worker = "abcd_ns.lab.scale.worker"
-    scratch = (STORE, "layers")  # gigabytes; what they took is in the run
-
-    @property
-    def tiles(self) -> int:
-        """A power of 2."""
-        return self.variant.number
-
-
-def run(job: LandJob, folder: Path) -> Run:
+def run(job: TerrainJob, folder: Path) -> Run:
     """Make the scene on disk, train some visits, and say what they took."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if job.settings.device_limit_bytes and device.type == "cuda":
@@ -97,7 +67,7 @@ def run(job: LandJob, folder: Path) -> Run:
     )
     return Run(
         method=job.method,
-        scene="land",
+        scene="terrain",
         seed=job.seed,
         blocks=scene.tree.num_blocks,
         steps=coordinator.state.step,
@@ -118,9 +88,9 @@ def run(job: LandJob, folder: Path) -> Run:
     )
 
 
-def make_scene(job: LandJob, land: Land, folder: Path) -> StoredScene:
+def make_scene(job: TerrainJob, land: Land, folder: Path) -> StoredScene:
     """The land at rest: tile by tile, or all tiles as one block, which takes the RAM that it takes."""
-    whole = job.method == AS_ONE
+    whole = job.method == "abcd-monolithic"
     tree = build_kd(torch.zeros(0, 3), 1) if whole else land.tree()
     store = ParameterStore.create(folder, {"tree": tree.to_json()})
     if whole:
@@ -133,7 +103,7 @@ def make_scene(job: LandJob, land: Land, folder: Path) -> StoredScene:
     return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
 
 
-def _coordinator(job: LandJob, land: Land, scene: StoredScene, rasterizer, device) -> Coordinator:
+def _coordinator(job: TerrainJob, land: Land, scene: StoredScene, rasterizer, device) -> Coordinator:
     config = TrainingConfig(
         recipe=Recipe(sh_ramp=0.0),
         # As large blocks have it. Small ones may draw more at once, for speed, which small lands do not have.
@@ -179,4 +149,4 @@ class _Watch:
 
 
 if __name__ == "__main__":
-    sys.exit(work(LandJob, run))
+    sys.exit(work(TerrainJob, run))
