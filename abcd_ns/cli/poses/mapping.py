@@ -1,4 +1,4 @@
-"""Structure from motion by pycolmap, in a process of its own, as pycolmap does not stop at Ctrl-C."""
+"""Structure from motion by pycolmap, in a process of its own, as pycolmap stops late at Ctrl-C."""
 
 import multiprocessing
 import sqlite3
