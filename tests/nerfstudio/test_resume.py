@@ -154,6 +154,7 @@ def test_a_signal_commits_and_says_how_to_go_on(
 def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypatch):
     config = configure(data, tmp_path / "signal")
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
 
     def interrupt(happened) -> None:
         if isinstance(happened, StepTaken) and happened.step == 17:
@@ -162,6 +163,7 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypa
 
     with pytest.raises(SystemExit) as ended:
         run(config, listener=interrupt)
+    signal.signal(signal.SIGINT, before)
     assert ended.value.code == 130
     said = capsys.readouterr().out
     assert "Stopped at once" in said

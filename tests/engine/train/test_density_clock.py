@@ -25,7 +25,7 @@ def refinements(run: int, views: int, taken: int = 1, **changes) -> list[int]:
     return found[1:]
 
 
-@given(st.integers(600, 30_000), st.integers(1, 15_000), st.integers(1, 4))
+@given(st.integers(1000, 30_000), st.integers(1, 15_000), st.integers(1, 4))
 @settings(max_examples=20, deadline=None)
 def test_every_run_is_refined_about_4_to_150_times(run, views, taken):
     assert LEAST_REFINEMENTS - 1 <= len(refinements(run, views, taken)) <= 150
@@ -83,5 +83,4 @@ def test_a_block_among_others_refines_early_in_its_visits_and_makes_up_for_what_
     assert control.is_due(clock(steps=132, **{**late, "spent": 0.1}))
     assert not control.is_due(clock(steps=132, **late))
     assert control.is_due(clock(steps=190, **{**late, "spent": 0.0}))  # overdue: no multiple of 30 is here
-    few = {**late, "refined": 0, "spent": 0.0, "views": 40, "progress": 0.05}
-    assert not control.is_due(clock(steps=19, **few))
+    assert not control.is_due(clock(steps=19, **{**late, "refined": 0, "spent": 0.0, "views": 40}))

@@ -232,7 +232,7 @@ def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
     clock = coordinator.visit.live.density_clock(4, coordinator.batch, None)
     assert (clock.views, min(clock.views, clock.visit)) == (seen, expected)
     control = DensityControl(DensityConfig(refine_every=1))
-    due = replace(clock, progress=0.1, refined=0, first=False)
+    due = replace(clock, progress=0.02, refined=0, first=False)
     assert control.is_due(replace(due, steps=expected))
     assert not control.is_due(replace(due, steps=expected - 1))
 

@@ -39,7 +39,7 @@ GATHER, REFINE = 1, 6
 REFINE_UNTIL = 0.5
 """Share of a visit after which a block is not refined: the rest makes good what growing upset."""
 LEAST_REFINEMENTS = 4
-"""Of a block in a whole run, however many views show it."""
+"""Of a block in a run of 30,000 steps, however many views show it."""
 MOST_NEW = 0.1
 """Gaussians that one refinement may add, as a share of the block's; at least one."""
 MCMC_MIN_OPACITY = 0.005
@@ -66,8 +66,8 @@ class DensityConfig:
     """Share of the run after which none becomes two; a block grows in its first visit all the same,
     unless that is in the last third. Who fills less than the `price` goes later, too."""
     refine_every: int = 100
-    """Views drawn to train a block between its refinements; more where more show it, fewer where a run would
-    refine it fewer than 4 times."""
+    """Views drawn to train a block between its refinements; as many as show it if these are more, but no more
+    than a quarter of those drawn while it grows."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
     split_pixels: float = 8.0
@@ -110,15 +110,15 @@ class DensityControl:
 
     def is_due(self, clock: DensityClock) -> bool:
         """Whether this step refines."""
-        if not (self.config.refine_start <= clock.progress and self._grows(clock.progress, clock.first)):
+        if not self.config.refine_start <= clock.progress < self._ends(clock.first):
             return False
         return clock.spent <= REFINE_UNTIL and clock.steps - clock.refined >= self._every(clock)
 
     def _every(self, clock: DensityClock) -> int:
         """Views between refinements."""
         views = clock.views if clock.visit is None else min(clock.views, clock.visit)
-        growing = max(self.config.refine_stop - self.config.refine_start, 0.0) * clock.pace
-        every = max(min(max(self.config.refine_every, views), int(growing / LEAST_REFINEMENTS)), 1)
+        growing = max(self._ends(clock.first) - self.config.refine_start, 0.0) * clock.pace
+        every = max(self.config.refine_every, min(views, int(growing / LEAST_REFINEMENTS)), 1)
         if clock.first and clock.visit is not None:  # it was last refined in the warm-up, perhaps just now
             every = min(every, max(int(REFINE_UNTIL * clock.visit) - clock.taken, 1))
         return every
@@ -138,11 +138,12 @@ class DensityControl:
             progress: share of the run that is done.
             first: whether a block among others is in its first visit.
         """
-        return self.config.strategy == "default" and self._grows(progress, first)
+        return self.config.strategy == "default" and progress < self._ends(first)
 
-    def _grows(self, progress: float, first: bool) -> bool:
+    def _ends(self, first: bool) -> float:
+        """Share of the run after which nothing grows."""
         begins, ends = self.config.refine_start, self.config.refine_stop
-        return progress < (max(ends, LAST) if first and begins < ends else ends)
+        return max(ends, LAST) if first and begins < ends else ends
 
     def after_step(
         self,
