@@ -28,8 +28,8 @@ FULL_PASS = 0.999
 LAST = 0.7
 """Share of the run after which nothing that fills anything goes, nor a block grows for being new."""
 FAINT, FAINTER = 0.1, 0.25
-"""Who fills more than most is haze with an opacity under the first, and under this share of the median: after
-a reset of opacities all are faint."""
+"""What fills more than most is haze if its opacity is below the first, and below this share of the median: at
+first all are faint."""
 PASSES = 4
 """A block that is the whole scene is judged whenever each of its views was drawn so often."""
 
