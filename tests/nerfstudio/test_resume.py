@@ -161,9 +161,11 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypa
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
 
-    with pytest.raises(SystemExit) as ended:
-        run(config, listener=interrupt)
-    signal.signal(signal.SIGINT, before)
+    try:
+        with pytest.raises(SystemExit) as ended:
+            run(config, listener=interrupt)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert ended.value.code == 130
     said = capsys.readouterr().out
     assert "Stopped at once" in said
