@@ -12,7 +12,7 @@ from abcd_ns.engine.store.settle import rows_for_visit, state_for_visit
 from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import Infos
 from abcd_ns.engine.train.density.degrees import GONE, START, are_gone, lower
-from abcd_ns.engine.train.density.shedding import faded
+from abcd_ns.engine.train.density.shedding import LAST, faded
 from abcd_ns.engine.train.density.splitting import is_full
 from abcd_ns.engine.train.density.worth import Judged
 from abcd_ns.engine.train.memory import check_room
@@ -53,6 +53,8 @@ class LiveBlock:
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
         if active.done == 0 and not (active.saved or active.is_whole or active.sole):
             self._lower_degrees()
+        if active.done == 0 and not active.saved and self.clocks.visits == 0:
+            run.health.hold_back_giants(run.views.values())
 
     def detached(self) -> BlockState:
         """The live block, on the CPU; it stays live."""
@@ -151,5 +153,7 @@ class LiveBlock:
         return grown and is_full(len(self), 1, self._run.config.limits)
 
     def hold_back_giants(self) -> None:
-        """Shrink what is too large for every camera."""
-        self._run.health.hold_back_giants(self._run.views.values())
+        """Shrink what is too large for every camera, while there is time to make good what is missed: a plain
+        background may be nothing but oversized Gaussians."""
+        if self._run.share < LAST:
+            self._run.health.hold_back_giants(self._run.views.values())
