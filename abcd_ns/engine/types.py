@@ -137,6 +137,10 @@ class View:
     """Gaussians whose mean has a smaller camera z are not drawn; world units."""
     reduction: int = 1
     """A pixel is a square of so many pixels of the photo, wide and high."""
+    distance: float = 1.0
+    """Median camera z of the points that it sees, world units: Gaussians' means move in proportion to it."""
+    nearest: float = 0.0
+    """Least camera z of these points, but for wrong matches; 0 where none is known."""
 
     @property
     def full(self) -> Crop:

@@ -9,7 +9,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError
-from abcd_ns.engine.space.near_plane import near_plane
+from abcd_ns.engine.space.near_plane import near_plane, with_distances
 from abcd_ns.engine.types import View
 
 
@@ -54,5 +54,6 @@ def training_views(cameras: Cameras, points: Float[Tensor, "n 3"] | None, near: 
         near: from where on they see; 0 finds that by the points.
     """
     views = views_of(cameras)
-    near = near or near_plane(torch.zeros(0, 3) if points is None else points.cpu(), views)
-    return [replace(view, near=near) for view in views]
+    points = torch.zeros(0, 3) if points is None else points.cpu()
+    near = near or near_plane(points, views)
+    return [replace(view, near=near) for view in with_distances(points, views)]

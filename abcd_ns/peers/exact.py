@@ -81,6 +81,7 @@ class ExactTrainer(Trainer):
     def __init__(self, run: TrainingRun) -> None:
         super().__init__(run)
         self._pace = Pace(run.optimizers, run.config.recipe.fast_start)
+        self._reach = run.reach(run.views)
         self._batch: Batch | None = None
         self._degree = 0
         self._layers_of: list[dict[int, Layer]] = []
@@ -96,7 +97,7 @@ class ExactTrainer(Trainer):
     def next_batch(self) -> Batch:
         """Set the learning rate and say what to train on next: whole views, or random parts."""
         self.stopwatch.start()
-        decay = exponential_decay(self.progress, self.config.means_lr_decay)
+        decay = exponential_decay(self.progress, self.config.means_lr_decay) * self._reach
         self._pace.set(self.batch, self.state.step * self.batch, decay)
         step, views = self.state.step, self.run.views_at(self.run.reduction)
         rows, samples, first = tuple(sorted(views)), [], step * self.batch

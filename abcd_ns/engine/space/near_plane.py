@@ -5,11 +5,12 @@ view that is not, from a place that no photo was taken from, may be lost to a ha
 is a fair guess at what other views show there. Photos do tell how near things come to a camera.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from statistics import median
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from abcd_ns.engine.types import NEAR_PLANE, View
@@ -27,15 +28,37 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
 
     Args:
         points: of the sparse reconstruction, world units.
-        views: what is nearer than their own near planes is not looked at.
 
     Returns:
-        Camera z, world units; gsplat's own where there is nothing to tell by, and never less.
+        Camera z, world units; gsplat's own where there is nothing to tell by. Never below NEAR_PLANE of the
+        typical distance, where that is less than 1: a scene of two far villages is scaled down to fit.
     """
+    depths = [found for _, found in _depths(points, views[:: -(-len(views) // MOST_VIEWS) or 1])]
+    if not depths:
+        return NEAR_PLANE
+    nearest = min(float(torch.quantile(found, OUTLIERS)) for found in depths)
+    typical = float(torch.stack([found.median() for found in depths]).median())
+    return max(SHARE * nearest, NEAR_PLANE * min(typical, 1.0))
+
+
+def with_distances(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:
+    """The views, each with its nearest and its median distance of the points that it sees; where it sees none,
+    with the median of the others'."""
+    found = {
+        view.index: (float(torch.quantile(depths, OUTLIERS)), float(depths.median()))
+        for view, depths in _depths(points, views)
+    }
+    if not found:
+        return list(views)
+    others = 0.0, median(distance for _, distance in found.values())
+    seen = ((view, *found.get(view.index, others)) for view in views)
+    return [replace(view, nearest=nearest, distance=distance) for view, nearest, distance in seen]
+
+
+def _depths(points: Float[Tensor, "n 3"], views: Sequence[View]) -> Iterator[tuple[View, Float64[Tensor, "_n"]]]:
+    """Camera z of the points that each view sees, for those that see any."""
     points = points[:: -(-len(points) // MOST_POINTS) or 1].double()
-    nearest = math.inf
-    for view in views[:: -(-len(views) // MOST_VIEWS) or 1]:
-        depths, seen = view.depths_of(points)
+    for view in views:
+        depths, seen = replace(view, near=0.0).depths_of(points)
         if bool(seen.any()):
-            nearest = min(nearest, float(torch.quantile(depths[seen], OUTLIERS)))
-    return max(SHARE * nearest, NEAR_PLANE) if math.isfinite(nearest) else NEAR_PLANE
+            yield view, depths[seen]

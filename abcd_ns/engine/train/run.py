@@ -1,6 +1,8 @@
 """What all parts of a training share: options, the scene at rest, live parameters, where the run stands."""
 
+from collections.abc import Iterable
 from dataclasses import replace
+from statistics import median
 
 import torch
 
@@ -73,6 +75,11 @@ class TrainingRun:
         """Views stand where `poses` has them from now on."""
         self.views = {i: replace(view, viewmat=self.poses.of(i)) for i, view in self.views.items()}
         self._reduced = {1: self.views}
+
+    def reach(self, views: Iterable[int]) -> float:
+        """What the rate of means is given for, world units: in proportion to what these views see from
+        how far, by the median, wherever other cameras stand."""
+        return MEANS_REACH * median(self.views[view].distance for view in views)
 
     @property
     def reduction(self) -> int:

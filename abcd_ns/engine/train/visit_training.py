@@ -67,6 +67,7 @@ class VisitTraining:
         self._pace = Pace(run.optimizers, run.config.recipe.fast_start)
         self._backgrounds = Backgrounds(run.config, run.device)
         self._order: tuple[int, ...] = ()
+        self._reach = 1.0
         self._rendered: Rendered | None = None
         self._residuals = Residuals()
 
@@ -85,6 +86,7 @@ class VisitTraining:
         run, state = self.run, self.run.state
         self.live.attach(active, self.batch)
         block, seen = None if active.is_whole else active.geometry.block, len(active.trained_on)
+        self._reach = run.reach(active.trained_on)
         run.scene.set_live(block, self._visits.attached(active, run.params))
         gaussians, self.influence = len(self.live), None
         if active.is_whole:
@@ -113,7 +115,7 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next; listeners are told the views of the steps to
         come, too."""
         run = self.run
-        decay = exponential_decay(run.share, run.config.means_lr_decay)
+        decay = exponential_decay(run.share, run.config.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
         settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views
