@@ -4,7 +4,7 @@ The coordinator is made of what gives it blocks (`Visits`), layers (`LayerSource
 (`VisitTraining`). What is not live lies at rest in the store; listeners are told what happens.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +12,8 @@ from torch import Tensor
 from abcd_ns.engine.events import SweepEnded, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
-from abcd_ns.engine.space.influence import influence
+from abcd_ns.engine.space.influence import Influence, influence
+from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import crash_points
 from abcd_ns.engine.store.settle import settle
 from abcd_ns.engine.store.special_blocks import LIVE, BlockName
@@ -27,6 +28,7 @@ from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.train.step.pose_rounds import PoseRounds
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.train.visit_training import VisitTraining
+from abcd_ns.engine.types import Gaussians
 
 AT_ONCE = 1e-3
 """Seconds: what a long visit puts to rest is written as soon as no other write is under way. The last one may
@@ -152,9 +154,7 @@ class Coordinator(Trainer):
         """From now on it is known what views show of which block."""
         known, unknown = self.visit.influence.found()
         self.visit.influence = None  # it holds on to what was live
-        views = [self.views[view] for view in sorted(unknown)]
-        live, options = live_gaussians(self.params).detach(), {"antialiased": self.config.antialiased}
-        others = influence(live, self.scene.tree.assign(live.means), views, self.run.rasterizer, **options)
+        others = influence_on(self.run, live_gaussians(self.params).detach(), self.scene.tree, sorted(unknown))
         self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
 
     # -- at rest -------------------------------------------------------------------------------------
@@ -189,6 +189,17 @@ class Coordinator(Trainer):
             self._read_ahead()
 
 
+def influence_on(run: TrainingRun, whole: Gaussians, tree: BlockTree, views: Iterable[int]) -> Influence:
+    """The influence of every block on these views.
+
+    Args:
+        whole: all Gaussians of the scene, on the device.
+    """
+    shown = [run.views[view] for view in views]
+    owner = tree.assign(whole.means)
+    return influence(whole, owner, shown, run.rasterizer, antialiased=run.config.antialiased)
+
+
 def rest_after_visit(
     run: TrainingRun, active: ActiveVisit, state: BlockState, updates: dict[BlockName, BlockState], sweep: int
 ) -> None:
@@ -200,6 +211,8 @@ def rest_after_visit(
         sweep: that it belongs to.
     """
     tree, parts = cut_full(run.scene, updates, run.state, run.config.limits, run.announce)
+    if active.sole and tree.num_blocks > 1:
+        run.state.influence = influence_on(run, state.gaussians.to(run.device), tree, run.views)
     run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
     block = None if active.is_whole else active.geometry.block
     staying = len(state) if block is None else len(updates[block])

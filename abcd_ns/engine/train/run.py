@@ -77,9 +77,9 @@ class TrainingRun:
         self._reduced = {1: self.views}
 
     def reach(self, views: Iterable[int]) -> float:
-        """What the rate of means is given for, world units: in proportion to what these views see from
-        how far, by the median, wherever other cameras stand."""
-        return MEANS_REACH * median(self.views[view].distance for view in views)
+        """What the means' rate is multiplied by, world units: how far these views see, by the median. It does
+        not depend on how far from them other cameras are."""
+        return median(self.views[view].distance for view in views)
 
     @property
     def reduction(self) -> int:

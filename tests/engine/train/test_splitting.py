@@ -112,6 +112,9 @@ def test_a_block_that_is_alone_may_be_larger_until_it_is_cut(tmp_path, views, ph
     alone, *others = (visit.gaussians for visit in ended)
     assert 0.75 * 200 < alone <= 200
     assert 0 < max(others) <= 90
+    shares = coordinator.state.influence  # known, so that each part is trained on the views that show it
+    assert {view for shown in shares.values() for view in shown} == {view.index for view in views}
+    assert len(shares) > 1
 
 
 def test_a_block_that_has_room_is_not_cut(tmp_path, views, photos, start):
