@@ -38,7 +38,7 @@ from abcd_ns.engine.store.special_blocks import BlockName, initial_of
 from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.planner import NothingSeenError, Visits
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, VisitKind
 from abcd_ns.engine.train.schedule import plan_sweep
 from abcd_ns.engine.train.step.batch import Batch
 from abcd_ns.engine.types import Crop, Gaussians, View
@@ -138,6 +138,7 @@ class BlocksAlone(Visits):
         self._look(block)
         state.active = ActiveVisit(
             number=state.visit,
+            kind=VisitKind.ISOLATED,
             geometry=VisitGeometry(block, self._crops),
             sh_degree=0,
             steps=UNLIMITED,

@@ -8,7 +8,7 @@ from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded,
 from abcd_ns.engine.layers.survey import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState, VisitKind
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
 from abcd_ns.viewer.run_history import MOST_POINTS, BlockRow, RunHistory, Status, seconds_left, sweep_share
@@ -37,7 +37,7 @@ def step(psnr: float, visit: int = 0) -> StepTaken:
 
 def active(block: int, done: int = 0, steps: int = 10) -> ActiveVisit:
     geometry = VisitGeometry(block, {0: Crop(0, 0, 8, 8)})
-    return ActiveVisit(0, geometry, sh_degree=0, steps=steps, views=(0,), done=done)
+    return ActiveVisit(0, VisitKind.BLOCK, geometry, sh_degree=0, steps=steps, views=(0,), done=done)
 
 
 def test_a_block_is_untrained_then_active_then_done():

@@ -42,7 +42,7 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
 
 
 def with_distances(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:
-    """The views, each with its nearest and its median distance of the points that it sees; where it sees none,
+    """The views, each with the nearest and the median distance of the points that it sees; where it sees none
     with the median of the others'."""
     found = {
         view.index: (float(torch.quantile(depths, OUTLIERS)), float(depths.median()))
@@ -55,7 +55,9 @@ def with_distances(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[
     return [replace(view, nearest=nearest, distance=distance) for view, nearest, distance in seen]
 
 
-def _depths(points: Float[Tensor, "n 3"], views: Sequence[View]) -> Iterator[tuple[View, Float64[Tensor, "_n"]]]:
+def _depths(
+    points: Float[Tensor, "n 3"], views: Sequence[View]
+) -> Iterator[tuple[View, Float64[Tensor, "_n"]]]:
     """Camera z of the points that each view sees, for those that see any."""
     points = points[:: -(-len(points) // MOST_POINTS) or 1].double()
     for view in views:

@@ -154,7 +154,9 @@ class Coordinator(Trainer):
         """From now on it is known what views show of which block."""
         known, unknown = self.visit.influence.found()
         self.visit.influence = None  # it holds on to what was live
-        others = influence_on(self.run, live_gaussians(self.params).detach(), self.scene.tree, sorted(unknown))
+        others = influence_on(
+            self.run, live_gaussians(self.params).detach(), self.scene.tree, sorted(unknown)
+        )
         self.state.influence = {b: known.get(b, {}) | others.get(b, {}) for b in {**known, **others}}
 
     # -- at rest -------------------------------------------------------------------------------------
@@ -211,7 +213,7 @@ def rest_after_visit(
         sweep: that it belongs to.
     """
     tree, parts = cut_full(run.scene, updates, run.state, run.config.limits, run.announce)
-    if active.sole and tree.num_blocks > 1:
+    if active.is_joint and tree.num_blocks > 1:
         run.state.influence = influence_on(run, state.gaussians.to(run.device), tree, run.views)
     run.rest(tree, parts, 0.0 if run.progress >= 1.0 else run.config.commit_seconds)
     block = None if active.is_whole else active.geometry.block

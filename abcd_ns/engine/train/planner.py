@@ -14,7 +14,7 @@ from abcd_ns.engine.store.special_blocks import RESERVE, WHOLE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState
+from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState, VisitKind
 from abcd_ns.engine.train.schedule import (
     VisitPlan,
     passes_of_visit,
@@ -118,7 +118,7 @@ class Planner(Visits):
         """The visit in which the scaffold of all blocks is trained."""
         crops = {index: view.full for index, view in self._run.views.items()}
         geometry = VisitGeometry(WHOLE, crops)
-        return ActiveVisit(0, geometry, sh_degree, UNLIMITED, geometry.views, began=began)
+        return ActiveVisit(0, VisitKind.COARSE, geometry, sh_degree, UNLIMITED, geometry.views, began=began)
 
     def _next_visit(self, state: RunState, sh_degree: int, began: float, at_once: int) -> ActiveVisit:
         while True:
@@ -167,6 +167,7 @@ class Planner(Visits):
         geometry = VisitGeometry(block, {view: found.crops[view] for view in (*chosen, *looked_at)})
         return ActiveVisit(
             number=state.visit,
+            kind=VisitKind.BLOCK,
             geometry=geometry,
             sh_degree=self._config.sh_degree if self._config.recipe.sh_restart else sh_degree,
             steps=plan.steps,
@@ -183,7 +184,7 @@ class Planner(Visits):
         block may grow anywhere."""
         steps = UNLIMITED if self._budget.steps is None else self._budget.steps - state.step
         geometry = VisitGeometry(block, {view: self._run.views[view].full for view in showing})
-        return ActiveVisit(state.visit, geometry, sh_degree, steps, geometry.views, sole=True)
+        return ActiveVisit(state.visit, VisitKind.JOINT, geometry, sh_degree, steps, geometry.views)
 
     def _known_to_show(self, state: RunState, block: int, views: Iterable[int]) -> tuple[int, ...]:
         """Of the views that may see the block, those that show nearly all that is to be seen of it, as far as

@@ -110,7 +110,7 @@ class TrainingRun:
     def sh_degree(self) -> int:
         """The degree of spherical harmonics in use."""
         active = self.state.active
-        restarts = self.config.recipe.sh_restart and active is not None and not active.sole
+        restarts = self.config.recipe.sh_restart and active is not None and not active.is_joint
         share = active.done / active.steps if restarts else self.share
         return sh_degree_at(share, self.config.recipe.sh_ramp, self.config.sh_degree)
 

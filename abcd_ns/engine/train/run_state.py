@@ -4,18 +4,32 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any
 
 import msgspec
 
 from abcd_ns.engine.layers.survey import VisitGeometry
 from abcd_ns.engine.space.influence import Influence
-from abcd_ns.engine.store.special_blocks import WHOLE, from_text
+from abcd_ns.engine.store.special_blocks import from_text
 from abcd_ns.engine.train.health_record import BlockHealth, Ledger
 from abcd_ns.engine.train.schedule import VisitPlan
 
 UNLIMITED = 2**31
 """Steps of a visit that something else ends."""
+
+
+class VisitKind(str, Enum):
+    """What a visit trains."""
+
+    BLOCK = "block"
+    """One of several blocks, between layers of the others."""
+    JOINT = "joint"
+    """A block that is the whole scene: it lasts as long as the run, if the block need not be cut."""
+    COARSE = "coarse"
+    """The warm-up's coarse model of all blocks."""
+    ISOLATED = "isolated"
+    """A block with nothing around it, which is merged later."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +57,7 @@ class ActiveVisit:
     """The visit that is under way."""
 
     number: int
+    kind: VisitKind
     geometry: VisitGeometry
     sh_degree: int
     """In use from the visit's first step to its last, so that its layers stay right."""
@@ -59,9 +74,6 @@ class ActiveVisit:
     """Whether the live block was put to rest in the middle of the visit, see special_blocks.LIVE."""
     batch: int = 0
     """Views in each of its steps; 0 for as many as steps have at most."""
-    sole: bool = False
-    """Whether the block is the whole scene: then the visit lasts as long as the run, if the block need not be
-    cut."""
     layer_seconds: float = 0.0
     """Training time that went into drawing F and B."""
     began: float = 0.0
@@ -79,19 +91,24 @@ class ActiveVisit:
         return self.showing or self.geometry.views
 
     @property
+    def is_joint(self) -> bool:
+        """Whether the block is the whole scene."""
+        return self.kind is VisitKind.JOINT
+
+    @property
     def is_whole(self) -> bool:
-        """Whether this is the warm-up, in which the scaffold of all blocks is trained at once."""
-        return self.geometry.block == WHOLE
+        """Whether this is the warm-up, in which the coarse model of all blocks is trained at once."""
+        return self.kind is VisitKind.COARSE
 
     @property
     def is_all(self) -> bool:
         """Whether all that there is of the scene by now is in training."""
-        return self.is_whole or self.sole
+        return self.is_whole or self.is_joint
 
     @property
     def is_alone(self) -> bool:
-        """Whether what is trained has nothing around it, and may go on for as long as it likes."""
-        return self.is_all or self.steps >= UNLIMITED
+        """Whether what is trained has nothing around it, and nobody knows how many steps it will have."""
+        return self.kind is not VisitKind.BLOCK
 
     def share(self, progress: float) -> float:
         """Share of the visit's part of the run that is done, 0..1; that part is mostly all of it.

@@ -117,7 +117,7 @@ class VisitTraining:
         run = self.run
         decay = exponential_decay(run.share, run.config.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
-        settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
+        settles = run.config.recipe.fast_start and (run.active.is_joint or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views
         damping = settling(run.progress, trained) if settles else 1.0
         self._pace.set(self.batch, trained, decay, damping)

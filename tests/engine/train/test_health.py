@@ -148,7 +148,9 @@ def test_giants_are_held_back_in_visits_that_refine_nothing(tmp_path, views, pho
     assert {event.what for event in told} == {"giants"}
     scene = whole_scene(coordinator)
     nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
-    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.GIANT_ANGLE  # of e^5
+    assert (
+        float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.GIANT_ANGLE
+    )  # of e^5
 
 
 @pytest.mark.parametrize("blocks", [1, 2])

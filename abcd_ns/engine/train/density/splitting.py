@@ -111,7 +111,7 @@ def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
     active = state.active
     for block in range(scene.tree.num_blocks) if limits.block_limit else ():
         in_visit = active is not None and (active.is_whole or active.geometry.block == block)
-        if in_visit and not active.sole:
+        if in_visit and not active.is_joint:
             continue
         lives = in_visit and active.saved
         rows = scene.rows(LIVE) if lives else scene.count(block)
@@ -124,5 +124,5 @@ def cut_at_rest(scene: StoredScene, state: RunState, limits: Limits) -> None:
             large = {block: with_mail(scene, block), **inbox_without(scene, {block})}
         tree, parts = cut_full(scene, large, state, limits, Announcer())
         if tree is not scene.tree:
-            state.active = active = None if active is None or active.sole else active
+            state.active = active = None if active is None or active.is_joint else active
             scene.rest(tree, parts, state.to_json())

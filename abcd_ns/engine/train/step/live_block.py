@@ -51,7 +51,7 @@ class LiveBlock:
         attach(rest, run.params, run.optimizers, batch=batch)
         run.health.begin_visit(active, run.state.health)
         self.growth, self.clocks = {name: value.clone() for name, value in rest.growth.items()}, rest.clocks
-        if active.done == 0 and not (active.saved or active.is_whole or active.sole):
+        if active.done == 0 and not (active.saved or active.is_whole or active.is_joint):
             self._lower_degrees()
         if active.done == 0 and not active.saved and self.clocks.visits == 0:
             run.health.hold_back_giants(run.views.values())
@@ -149,7 +149,7 @@ class LiveBlock:
     @property
     def has_outgrown(self) -> bool:
         """Whether the one block of the scene has just grown to where it must be cut."""
-        grown = self._run.active.sole and self.clocks.refined == self.clocks.steps
+        grown = self._run.active.is_joint and self.clocks.refined == self.clocks.steps
         return grown and is_full(len(self), 1, self._run.config.limits)
 
     def hold_back_giants(self) -> None:
