@@ -62,7 +62,7 @@ def translucent(count: int, size: float = 0.1, dtype=torch.float64) -> Gaussians
         (torch.float64, 1e-12, 1, "kd"),
         (torch.float64, 1e-12, 4, "kd"),
         (torch.float64, 1e-12, 4, "grid"),
-        (torch.float64, 1e-12, 4, "empty"),
+        (torch.float64, 1e-12, 4, "thin"),
         (torch.float64, 1e-12, 16, "thin"),
         (torch.float32, 1e-6, 4, "kd"),
     ],
@@ -74,7 +74,6 @@ def test_folding_cells_by_fragments_gives_the_merged_picture(primitive, tree, dt
         "kd": lambda: build_kd(gaussians.means, 7),
         "grid": lambda: build_grid(gaussians.means, counts=(2, 2, 2)),
         "thin": lambda: build_grid(gaussians.means, counts=(6, 1, 1)),
-        "empty": lambda: build_kd(gaussians.means, 4).split(0, axis=2, threshold=-50.0),
     }[tree]()
     views = views_in_and_out(dtype)
     draw = DRAWS[primitive, side]
@@ -165,6 +164,19 @@ def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pa
                 (inside,) = draw.draw(own[:0], [Shot(view, view.full, cut.inside, window)], sh_degree=1)
             layers = (cut.front, inside.layer, cut.back)
             assert difference(fold(list(layers)), merged(frozen, view, draw)) < 1e-12
+
+
+def test_the_picture_does_not_depend_on_names_order_or_empty_blocks():
+    gaussians = random_gaussians(150, size=0.1)
+    (view,) = ring_of_views(1)
+    tree = build_kd(gaussians.means, 4)
+    expected = painter(tree, gaussians, [view]).picture(view, SETTINGS)
+    generator = torch.Generator().manual_seed(3)
+    shuffled = gaussians[torch.randperm(150, generator=generator)]
+    halved = tree.split(2, axis=0, threshold=float(tree.cell(2).contains(gaussians.means).float().mean()))
+    with_empty = tree.split(0, axis=2, threshold=-50.0)
+    for other_tree, scene in ((tree, shuffled), (halved, gaussians), (with_empty, gaussians)):
+        assert difference(painter(other_tree, scene, [view]).picture(view, SETTINGS), expected) < 1e-6
 
 
 def test_a_crop_of_a_layer_is_the_layers_crop():

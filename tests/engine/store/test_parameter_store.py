@@ -30,7 +30,7 @@ def test_what_was_committed_is_there_after_reopening(store):
 
 
 @given(st.data())
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_any_tensor_survives(tmp_path_factory, data):
     tensors = {}
     for name in data.draw(st.lists(st.text("abcdef._é", min_size=1, max_size=8), max_size=4, unique=True)):

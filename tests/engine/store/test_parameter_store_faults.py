@@ -9,9 +9,8 @@ import resource
 import shutil
 import signal
 import struct
-import subprocess
-import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -271,39 +270,40 @@ def test_leftovers_of_a_killed_writer_are_removed(store):
     assert names_in(store.folder) == before
 
 
-HOLDER = """
-import os, pathlib, runpy, sys, time
-lock = runpy.run_path(sys.argv[1])["FolderLock"](pathlib.Path(sys.argv[2]))
-worker = os.fork()  # shares the open lock file, as a data loader's worker does
-if worker:
-    print(worker, flush=True)
-time.sleep(60)
-"""
+def hold_locked(folder: Path, writes: int) -> None:
+    """The body of a process that holds the lock, and has a worker, whose number it writes."""
+    try:
+        lock = atomic.FolderLock(folder)
+        worker = os.fork()  # shares the open lock file, as a data loader's worker does
+        if worker:
+            os.write(writes, str(worker).encode())
+        time.sleep(60)
+        del lock
+    finally:
+        os._exit(1)
 
 
 def test_a_second_writer_is_refused_until_the_first_is_killed(store):
     with pytest.raises(FolderLockedError, match=f"process {os.getpid()}"):
         ParameterStore.open(store.folder)
     store.close()
-    # atomic.py alone: importing the package would take seconds.
-    command = [sys.executable, "-c", HOLDER, atomic.__file__, str(store.folder)]
-    holder = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    worker = None
+    reads, writes = os.pipe()
+    holder = os.fork()
+    if holder == 0:
+        hold_locked(store.folder, writes)
+    os.close(writes)
+    worker = int(os.read(reads, 20))
+    os.close(reads)
     try:
-        worker = int(holder.stdout.readline())
-        with pytest.raises(FolderLockedError, match=f"{store.folder}.*process {holder.pid}"):
+        with pytest.raises(FolderLockedError, match=f"{store.folder}.*process {holder}"):
             ParameterStore.open(store.folder)
         assert_block(ParameterStore.open(store.folder, read_only=True), 0, 3, 1.0)
-        holder.kill()
-        holder.wait()
+        os.kill(holder, signal.SIGKILL)
+        os.waitpid(holder, 0)
         with ParameterStore.open(store.folder) as again:  # though the worker lives on
             again.commit({0: block(1, 1.0)})
     finally:
-        holder.kill()
-        holder.wait()
-        holder.stdout.close()
-        if worker is not None:
-            os.kill(worker, signal.SIGKILL)
+        os.kill(worker, signal.SIGKILL)
 
 
 def test_a_reader_of_a_replaced_generation_is_told(store):
