@@ -11,14 +11,11 @@ from abcd_ns.cluster.lease import Finished, Lost, StepsSeen, WorkersError
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.events import SweepEnded, VisitBegan, VisitEnded, WorkerLost
 from abcd_ns.engine.store.settle import with_mail
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train, train_step
 from tests.cluster.conftest import GROWING, in_process
-from tests.reference.scenes import equal, listen, whole_scene
-
-STILL = DensityConfig(strategy="off")
+from tests.reference.scenes import STILL, equal, listen, stop, whole_scene
 
 
 class Unreliable:
@@ -177,8 +174,7 @@ def test_a_run_that_stops_goes_on_with_any_number_of_workers(make, photos, goes_
     while stopped.state.step < 20 or not stopped.state.in_flight:
         train_step(stopped, photos)
     out = [visit.geometry.block for visit in stopped.state.in_flight]
-    stopped.save()
-    stopped.close()
+    stop(stopped)
     resumed = make(workers=goes_on_with, resume=True, density=STILL)
     assert resumed.state.step == stopped.state.step
     assert [plan.block for plan in resumed.state.queue][: len(out)] == out
@@ -254,8 +250,7 @@ def test_what_was_trained_here_leaves_the_device_before_anything_is_lent(make, p
     alone = make("run", **options)
     train(alone, photos, steps=3)
     assert alone.state.active is not None
-    alone.save()
-    alone.close()
+    stop(alone)
     run = make("run", workers=2, resume=True, **options)
     while not run.trains_elsewhere:
         train(run, photos, steps=1)

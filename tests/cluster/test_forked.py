@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from contextlib import suppress
 from multiprocessing import Event
@@ -203,27 +201,32 @@ def test_any_other_error_ends_the_run_in_one_line(make, photos, tmp_path, error,
     assert not any(is_alive(pid) for pid in pids)
 
 
-@pytest.mark.parametrize("then", ["", "run.workers.hold()"])
-def test_no_worker_outlives_the_training_process(tmp_path, then):
+@pytest.mark.parametrize("held", [False, True])
+def test_no_worker_outlives_the_training_process(tmp_path, views, held):
     """Not even one that is killed; `kill -9` runs no handler. Nor does one that stands still."""
-    script = f"""
-import os, sys, time
-from pathlib import Path
-sys.path.insert(0, {os.getcwd()!r})
-from tests.cluster.test_forked import *
-from tests.reference.scenes import ring_of_views
-worker = lambda run: VisitWorker(setup_of(run), TorchRasterizer(), lambda s: time.sleep(600))
-run = make_run(Path({str(tmp_path)!r}), ring_of_views(8), lambda run: ForkedWorkers(2, worker(run)))
-run._lend()
-{then}
-print(*run.workers.pids, flush=True)
-time.sleep(600)
-"""
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
-        pids = [int(pid) for pid in process.stdout.readline().split()]
-        assert len(pids) == 2
-        assert all(map(is_alive, pids))
-        process.kill()
+
+    def workers_of(run):
+        return ForkedWorkers(2, VisitWorker(setup_of(run), TorchRasterizer(), lambda _: time.sleep(600)))
+
+    reads, writes = os.pipe()
+    driver = os.fork()
+    if driver == 0:
+        try:
+            run = make_run(tmp_path / "run", views, workers_of)
+            run._lend()
+            if held:
+                run.workers.hold()
+            os.write(writes, " ".join(map(str, run.workers.pids)).encode())
+            time.sleep(600)
+        finally:
+            os._exit(1)
+    os.close(writes)
+    pids = [int(pid) for pid in os.read(reads, 100).split()]
+    os.close(reads)
+    assert len(pids) == 2
+    assert all(map(is_alive, pids))
+    os.kill(driver, signal.SIGKILL)
+    os.waitpid(driver, 0)
     until = time.monotonic() + 20
     while any(map(is_alive, pids)) and time.monotonic() < until:
         time.sleep(0.05)

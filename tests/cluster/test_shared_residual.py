@@ -10,14 +10,12 @@ from hypothesis import strategies as st
 from abcd_ns.cluster.shared_residual import FAINT, SharedResidual, shares, shown_beside
 from abcd_ns.cluster.visit_worker import VisitWorker
 from abcd_ns.engine.render import Shot, TorchRasterizer
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.layer_source import LayerRoom
 from abcd_ns.engine.train.training_loop import train
 from tests.cluster.conftest import setup_of
 from tests.cluster.in_process import InProcessWorkers
-from tests.reference.scenes import whole_scene
+from tests.reference.scenes import STILL, equal, whole_scene
 
-STILL = DensityConfig(strategy="off")
 WEIGHTS = st.lists(st.floats(0, 1), min_size=2, max_size=6)
 INFLUENCE = st.dictionaries(
     st.integers(0, 5), st.dictionaries(st.integers(0, 3), st.floats(1e-6, 1), max_size=4), max_size=6
@@ -100,4 +98,4 @@ def test_with_no_room_pictures_are_drawn_when_they_are_asked_for(make, photos):
         return whole_scene(run)
 
     kept, drawn = trained("kept", LayerRoom()), trained("drawn", LayerRoom(0))
-    assert all(torch.equal(value, dict(drawn.items())[name]) for name, value in kept.items())
+    assert equal(kept, drawn)

@@ -1,5 +1,5 @@
 """Peers train on the engine's small scene."""
 
-from tests.engine.conftest import photos, start, views
+from tests.engine.conftest import make, photos, start, views
 
-__all__ = ["photos", "start", "views"]
+__all__ = ["make", "photos", "start", "views"]

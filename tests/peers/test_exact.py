@@ -9,19 +9,17 @@ from abcd_ns.engine.gaussians.param_swap import rates_of_young
 from abcd_ns.engine.layers.compositing import composite
 from abcd_ns.engine.store.special_blocks import LIVE
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.peers.exact import ExactTrainer
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views, whole_scene
-
-STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
+from tests.reference.scenes import GROWING, STILL, Photos, random_gaussians, ring_of_views, stop, whole_scene
 
 
-def exact(folder, start, views, **options) -> ExactTrainer:
-    folder.mkdir(exist_ok=True)
-    return make_coordinator(folder, start, views, kind=ExactTrainer, **{"density": STILL, **options})
+@pytest.fixture
+def exact(make):
+    """Makes such runs, of `scene` unless told otherwise."""
+    given = {"kind": ExactTrainer, "density": STILL, "start": scene(torch.float32)}
+    return lambda *args, **options: make(*args, **{**given, **options})
 
 
 def scene(dtype) -> Gaussians:
@@ -38,10 +36,10 @@ def by_rotation(gaussians: Gaussians) -> Gaussians:
 
 @pytest.mark.parametrize("blocks", [1, 5])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-5)])
-def test_gradients_are_those_of_the_merged_picture(tmp_path, blocks, dtype, tolerance):
+def test_gradients_are_those_of_the_merged_picture(exact, blocks, dtype, tolerance):
     views, start = ring_of_views(3, dtype=dtype), scene(dtype)
     photos = Photos(random_gaussians(150, seed=7, size=0.12, dtype=dtype), views)
-    coordinator = exact(tmp_path, start, views, blocks=blocks, batch=2, sh_ramp=0.0)
+    coordinator = exact(start=start, views=views, blocks=blocks, batch=2, sh_ramp=0.0)
     batch = coordinator.next_batch()
     wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
     coordinator.loss(batch, coordinator.render(batch).pictures, wanted).backward()
@@ -60,12 +58,12 @@ def test_gradients_are_those_of_the_merged_picture(tmp_path, blocks, dtype, tole
         assert worst <= tolerance * float(leaf.grad.abs().max()), name
 
 
-def test_reduced_pictures_are_exact_too(tmp_path, monkeypatch):
+def test_reduced_pictures_are_exact_too(exact, monkeypatch):
     """A pixel of theirs is as much wider, and what lies beyond a cell's border may still show within."""
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LEAST_SIDE", 1)
     start = scene(torch.float64)
     start.scales[:] -= 3.0  # it is the blur that reaches over borders
-    coordinator = exact(tmp_path, start, ring_of_views(3, dtype=torch.float64), blocks=5, sh_ramp=0.0)
+    coordinator = exact(start=start, views=ring_of_views(3, dtype=torch.float64), blocks=5, sh_ramp=0.0)
     batch = coordinator.next_batch()
     assert coordinator.run.reduction == 4
     (picture,), (sample,) = coordinator.render(batch).pictures, batch.samples
@@ -74,12 +72,10 @@ def test_reduced_pictures_are_exact_too(tmp_path, monkeypatch):
     assert float((picture - merged).detach().abs().max()) <= 1e-10
 
 
-def test_what_density_control_judges_by_adds_up_over_cells(tmp_path, views, photos):
+def test_what_density_control_judges_by_adds_up_over_cells(exact, photos):
     found = []
     for blocks in (1, 5):
-        coordinator = exact(
-            tmp_path / str(blocks), scene(torch.float32), views, blocks=blocks, density=GROWING
-        )
+        coordinator = exact(str(blocks), blocks=blocks, density=GROWING)
         batch = coordinator.next_batch()
         wanted = [photos(sample.view.index, sample.crop) for sample in batch.samples]
         coordinator.loss(batch, coordinator.render(batch).pictures, wanted).backward()
@@ -90,9 +86,9 @@ def test_what_density_control_judges_by_adds_up_over_cells(tmp_path, views, phot
     assert float(one.abs().max()) > 0
 
 
-def test_several_steps_are_those_of_a_plain_loop_over_everything(tmp_path, views, photos):
+def test_several_steps_are_those_of_a_plain_loop_over_everything(exact, photos):
     start = scene(torch.float32)
-    blocks = exact(tmp_path / "blocks", start, views, blocks=5, steps=12, fast_start=True)
+    blocks = exact(start=start, blocks=5, steps=12, fast_start=True)
     params = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
     rates = {name: adam.param_groups[0]["lr"] for name, adam in blocks.optimizers.items()}
     adam = {n: torch.optim.Adam([p], lr=rates[n], eps=1e-15, fused=True) for n, p in params.items()}
@@ -119,12 +115,10 @@ def test_several_steps_are_those_of_a_plain_loop_over_everything(tmp_path, views
         assert float((getattr(found, name) - value).abs().mean()) < 1e-3 * moved, name
 
 
-def test_blocks_do_not_matter_with_densification_either(tmp_path, views, photos):
+def test_blocks_do_not_matter_with_densification_either(exact, photos):
     counts = []
     for blocks in (1, 4):
-        coordinator = exact(
-            tmp_path / str(blocks), scene(torch.float32), views, blocks=blocks, steps=14, density=GROWING
-        )
+        coordinator = exact(str(blocks), blocks=blocks, steps=14, density=GROWING)
         train(coordinator, photos)
         counts.append(coordinator.count())
         assert coordinator.finished
@@ -132,8 +126,8 @@ def test_blocks_do_not_matter_with_densification_either(tmp_path, views, photos)
     assert abs(counts[1] - counts[0]) <= 0.05 * counts[0]
 
 
-def test_the_device_holds_nothing_between_steps_and_the_store_all_at_the_end(tmp_path, views, photos):
-    coordinator = exact(tmp_path, scene(torch.float32), views, blocks=4, steps=4)
+def test_the_device_holds_nothing_between_steps_and_the_store_all_at_the_end(exact, photos):
+    coordinator = exact(blocks=4, steps=4)
     while not coordinator.finished:
         train_step(coordinator, photos)
         assert all(len(parameter) == 0 for parameter in coordinator.params.values())
@@ -143,14 +137,14 @@ def test_the_device_holds_nothing_between_steps_and_the_store_all_at_the_end(tmp
         assert bool((tree.assign(store.load(block)[0]["means"]) == block).all())
 
 
-def test_a_run_that_stops_goes_on(tmp_path, views, photos):
-    whole = exact(tmp_path / "whole", scene(torch.float32), views, steps=10)
+def test_a_run_that_stops_goes_on(exact, photos):
+    """On parts of pictures. The order in which gradients are added up changes with a resume."""
+    options = {"steps": 10, "crop_pixels": 600}
+    whole, stopped = exact("whole", **options), exact("stopped", **options)
     train(whole, photos)
-    stopped = exact(tmp_path / "stopped", scene(torch.float32), views, steps=10)
     train(stopped, photos, steps=6)
-    stopped.save()
-    stopped.scene.store.close()
-    again = exact(tmp_path / "stopped", scene(torch.float32), views, steps=10, resume=True)
+    stop(stopped)
+    again = exact("stopped", resume=True, **options)
     assert again.state.step == 6
     train(again, photos)
     found, expected = by_rotation(whole_scene(again)), by_rotation(whole_scene(whole))
@@ -158,17 +152,15 @@ def test_a_run_that_stops_goes_on(tmp_path, views, photos):
         assert torch.allclose(getattr(found, name), value, rtol=1e-4, atol=1e-4), name
 
 
-def test_views_of_a_step_may_differ_in_size(tmp_path):
+def test_views_of_a_step_may_differ_in_size(exact):
     """What density control counts is what it counts in one drawing of the whole batch."""
     views = [*ring_of_views(2), *ring_of_views(2, width=90)]
     views = [replace(view, index=index) for index, view in enumerate(views)]
-    photos, start = Photos(random_gaussians(150, seed=7, size=0.12), views), scene(torch.float32)
+    photos = Photos(random_gaussians(150, seed=7, size=0.12), views)
     counted = []
     for kind in (ExactTrainer, Coordinator):
-        folder = tmp_path / kind.__name__
-        folder.mkdir()
         options = {"blocks": 1, "batch": 4, "steps": 4, "density": GROWING, "background": "black"}
-        coordinator = make_coordinator(folder, start, views, kind=kind, **options)
+        coordinator = exact(kind.__name__, views=views, kind=kind, **options)
         train_step(coordinator, photos)
         coordinator.save()
         state = coordinator.scene.state(0 if kind is ExactTrainer else LIVE)

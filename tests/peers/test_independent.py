@@ -7,20 +7,26 @@ import torch
 
 from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.peers.independent import CLEAR, OWN, Surfaces, enlarged, independent_at_rest, independent_trainer
-from tests.reference.scenes import Photos, listen, make_coordinator, random_gaussians, whole_scene
+from tests.reference.scenes import (
+    GROWING,
+    STILL,
+    Photos,
+    assert_resumes,
+    equal,
+    listen,
+    random_gaussians,
+    whole_scene,
+)
 
-STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
 
-
-def independent(folder, start, views, **options) -> independent_trainer:
-    options = {"overlap": 0.2, "layers": False, "migrate": False, "blocks": 4, **options}
-    return make_coordinator(
-        folder, start, views, kind=independent_trainer, content=independent_at_rest, **options
-    )
+@pytest.fixture
+def independent(make):
+    """Makes such runs."""
+    given = {"overlap": 0.2, "layers": False, "migrate": False, "blocks": 4}
+    given |= {"kind": independent_trainer, "content": independent_at_rest}
+    return lambda *args, **options: make(*args, **{**given, **options})
 
 
 def test_a_cell_is_enlarged_by_a_share_of_its_extent():
@@ -36,8 +42,8 @@ def test_a_cell_is_enlarged_by_a_share_of_its_extent():
     assert found.upper[2] == infinity
 
 
-def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(tmp_path, views, photos, start):
-    coordinator = independent(tmp_path, start, views, steps=30, density=STILL, batch=1)
+def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(independent, photos):
+    coordinator = independent(steps=30, density=STILL, batch=1)
     begun, ended = listen(coordinator, VisitBegan), []
     coordinator.announce.subscribe(
         lambda e: ended.append(coordinator.state.step) if isinstance(e, VisitEnded) else None
@@ -51,16 +57,16 @@ def test_each_block_is_visited_once_and_the_budget_is_shared_by_views(tmp_path, 
         assert abs(steps - 30 * count / sum(seen)) <= 2
 
 
-def test_a_visit_that_begins_as_time_runs_out_is_at_its_end(tmp_path, views, photos, start):
-    coordinator = independent(tmp_path, start, views, blocks=3, steps=30)
+def test_a_visit_that_begins_as_time_runs_out_is_at_its_end(independent, photos):
+    coordinator = independent(blocks=3, steps=30)
     train(coordinator, photos, steps=1)
     coordinator.state.step = 30
     active = coordinator.visits.begin()
     assert active.share(coordinator.progress) == 1.0
 
 
-def test_a_block_begins_with_its_overlap_and_keeps_its_cell(tmp_path, views, photos, start):
-    coordinator = independent(tmp_path, start, views, steps=12, density=STILL)
+def test_a_block_begins_with_its_overlap_and_keeps_its_cell(independent, photos, start):
+    coordinator = independent(steps=12, density=STILL)
     begun, ended = listen(coordinator, VisitBegan), listen(coordinator, VisitEnded)
     tree = coordinator.scene.tree
     initial = [coordinator.scene.gaussians(b) for b in range(4)]
@@ -74,12 +80,11 @@ def test_a_block_begins_with_its_overlap_and_keeps_its_cell(tmp_path, views, pho
         assert bool((tree.assign(means) == event.block).all())
 
 
-def test_what_others_became_is_nothing_to_a_block(tmp_path, views, photos, start):
+def test_what_others_became_is_nothing_to_a_block(independent, photos):
     """The block visited last ends up the same, whether or not the others were trained to nonsense."""
     results = []
     for name in ("plain", "spoilt"):
-        (tmp_path / name).mkdir()
-        coordinator = independent(tmp_path / name, start, views, steps=16, density=STILL, background="black")
+        coordinator = independent(name, steps=16, density=STILL, background="black")
         begun = listen(coordinator, VisitBegan)
         while not coordinator.finished:
             train_step(coordinator, photos)
@@ -89,11 +94,11 @@ def test_what_others_became_is_nothing_to_a_block(tmp_path, views, photos, start
         results.append((begun[-1].block, coordinator.scene.gaussians(begun[-1].block)))
     (block, plain), (same, spoilt) = results
     assert block == same
-    assert all(torch.equal(value, getattr(spoilt, name)) for name, value in plain.items())
+    assert equal(plain, spoilt)
 
 
-def test_every_pixel_is_some_blocks_and_without_overlap_just_ones(tmp_path, views, start):
-    coordinator = independent(tmp_path, start, views)
+def test_every_pixel_is_some_blocks_and_without_overlap_just_ones(independent, views):
+    coordinator = independent()
     scene = coordinator.scene
     surfaces = Surfaces(scene, views, coordinator.run.rasterizer, torch.device("cpu"))
     for overlap in (0.0, 0.2):
@@ -108,11 +113,9 @@ def test_every_pixel_is_some_blocks_and_without_overlap_just_ones(tmp_path, view
 
 
 def test_own_pixels_pull_to_the_photo_clear_ones_to_the_background_and_hidden_ones_nowhere(
-    tmp_path, views, photos, start
+    independent, views, photos
 ):
-    coordinator = independent(
-        tmp_path, start, views, density=STILL, ssim_lambda=0.0, pixel_loss="l2", batch=len(views)
-    )
+    coordinator = independent(density=STILL, ssim_lambda=0.0, pixel_loss="l2", batch=len(views))
     batch = coordinator.next_batch()
     rendered = coordinator.render(batch)
     pictures = [picture.detach().requires_grad_() for picture in rendered.pictures]
@@ -130,46 +133,31 @@ def test_own_pixels_pull_to_the_photo_clear_ones_to_the_background_and_hidden_on
     assert bool((kinds > 0).all())
 
 
-def test_training_improves_every_photo_of_a_scene_with_surfaces(tmp_path, views):
+def test_training_improves_every_photo_of_a_scene_with_surfaces(independent, views):
     truth = random_gaussians(300, seed=7, size=0.15)
     truth.opacities[:] = 4.0
     photos = Photos(truth, views)
-    start = dataclasses.replace(truth, features_dc=torch.zeros_like(truth.features_dc))
+    grey = dataclasses.replace(truth, features_dc=torch.zeros_like(truth.features_dc))
     # Small steps: by themselves, blocks of so small a scene overshoot where photos say little.
-    coordinator = independent(tmp_path, start, views, steps=300, density=STILL, batch=1)
+    coordinator = independent(start=grey, steps=300, density=STILL, batch=1)
 
-    def errors() -> list[float]:
-        scene = whole_scene(coordinator)
-        with torch.no_grad():
-            rasters = [coordinator.run.rasterizer(scene, view, sh_degree=1) for view in views]
-        pairs = [(r.color.clamp(0, 1), photos.images[v.index]) for r, v in zip(rasters, views, strict=True)]
-        return [float((picture - photo).square().mean()) for picture, photo in pairs]
+    def errors() -> torch.Tensor:
+        drawn = Photos(whole_scene(coordinator), views).images
+        return torch.stack([(drawn[k] - photos.images[k]).square().mean() for k in drawn])
 
     before = errors()
     train(coordinator, photos)
-    assert all(new < 0.9 * old for old, new in zip(before, errors(), strict=True)), (before, errors())
+    assert bool((errors() < 0.9 * before).all()), (before, errors())
 
 
-@pytest.mark.parametrize("stop", [3, 14])
-def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop):
-    runs = {}
-    for name in ("whole", "stopped"):
-        (tmp_path / name).mkdir()
-        runs[name] = independent(tmp_path / name, start, views, steps=20, density=GROWING)
-    train(runs["whole"], photos)
-    train(runs["stopped"], photos, steps=stop)
-    runs["stopped"].save()
-    runs["stopped"].scene.store.close()
-    again = independent(tmp_path / "stopped", start, views, steps=20, density=GROWING, resume=True)
-    train(again, photos)
-    found, expected = whole_scene(again), whole_scene(runs["whole"])
-    assert all(torch.equal(value, getattr(found, name)) for name, value in expected.items())
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(independent, photos):
+    assert_resumes(independent, photos, 3, 14, steps=20, density=GROWING)
 
 
-def test_a_limit_on_gaussians_is_shared_out(tmp_path, views, photos, start):
+def test_a_limit_on_gaussians_is_shared_out(independent, photos, start):
     limit = len(start) + 20
     density = dataclasses.replace(GROWING, max_gaussians=limit, cull_alpha_thresh=0.0)
-    coordinator = independent(tmp_path, start, views, steps=80, density=density, batch=1)
+    coordinator = independent(steps=80, density=density, batch=1)
     began = listen(coordinator, VisitBegan)
     most: dict[int, int] = {}
     while not coordinator.finished:

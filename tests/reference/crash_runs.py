@@ -4,7 +4,6 @@ Processes are forked from a server that has everything imported, so each starts 
 all the same, and are killed by SIGKILL. What a run must end with does not depend on whether it was killed.
 """
 
-import errno
 import hashlib
 import json
 import multiprocessing
@@ -22,9 +21,8 @@ import torch
 from abcd_ns.engine.events import Event, VisitEnded
 from abcd_ns.engine.store import ParameterStore, StoreError, crash_points
 from abcd_ns.engine.train.coordinator import Coordinator
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train_step
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
+from tests.reference.scenes import GROWING, Photos, make_coordinator, random_gaussians, ring_of_views
 
 STEPS = 30
 SAVE_EVERY = 4
@@ -50,7 +48,6 @@ def run(
     folder: Path,
     kill: Kill | None = None,
     file_bytes: int | None = None,
-    failing_file: int | None = None,
     commit_seconds: float = 0.0,
 ) -> None:
     """Train from where `folder` stands to the end; the body of a process.
@@ -58,14 +55,11 @@ def run(
     Args:
         commit_seconds: as of TrainingConfig. With 0 the run says at the end of each visit that it is safe.
         file_bytes: no file may grow above this, as on a full disk.
-        failing_file: the n-th file that is written, counted from 1, has no room.
     """
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     if kill is not None:
         crash_points.reached = killer(kill)
-    if failing_file is not None:
-        crash_points.reached = _no_room_for(failing_file)
     _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
     if file_bytes is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, most))
@@ -90,18 +84,6 @@ def killer(kill: Kill) -> Callable[[str], None]:
     return reached
 
 
-def _no_room_for(nth: int) -> Callable[[str], None]:
-    left = nth
-
-    def reached(point: str) -> None:
-        nonlocal left
-        left -= point == crash_points.FILE_WRITTEN
-        if left == 0 and point == crash_points.FILE_WRITTEN:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    return reached
-
-
 def points_reached(folder: Path) -> dict[str, int]:
     """How often an undisturbed run in `folder` reaches each point. Runs in this process."""
     counts: dict[str, int] = {}
@@ -121,8 +103,12 @@ def _train(folder: Path, commit_seconds: float = 0.0) -> None:
     views = ring_of_views(3, width=24, height=18)
     photos = Photos(random_gaussians(60, seed=7, size=0.12), views)
     coordinator = _open(folder, views, commit_seconds)
-    if commit_seconds == 0:
-        coordinator.announce.subscribe(lambda event: _note(folder, coordinator, event))
+
+    def note(event: Event) -> None:
+        if isinstance(event, VisitEnded) and commit_seconds == 0:
+            _write(folder, coordinator.state.step)
+
+    coordinator.announce.subscribe(note)
     while not coordinator.finished:
         train_step(coordinator, photos)
         if coordinator.state.step % SAVE_EVERY == 0:
@@ -134,31 +120,18 @@ def _train(folder: Path, commit_seconds: float = 0.0) -> None:
 
 def _open(folder: Path, views: list, commit_seconds: float) -> Coordinator:
     """Go on from a clone of what is there, as the trainer does with --load-dir, or begin."""
-    start = random_gaussians(60, seed=1, size=0.12)
     resume = begun(folder)
     if resume:
         shutil.rmtree(folder / "clone", ignore_errors=True)
         with ParameterStore.open(folder / "store") as store:
             store.clone_to(folder / "clone")
-        clone = ParameterStore.open(folder / "clone")
-        clone.close()
+        ParameterStore.open(folder / "clone").close()
         shutil.rmtree(folder / "clone")
     else:
         shutil.rmtree(folder / "store", ignore_errors=True)
-    density = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
-    return make_coordinator(
-        folder,
-        start,
-        views,
-        blocks=3,
-        steps=STEPS,
-        resume=resume,
-        scaffold=20,
-        batch=2,
-        layer_bytes=LAYER_BYTES,
-        density=density,
-        commit_seconds=commit_seconds,
-    )
+    options = {"blocks": 3, "steps": STEPS, "scaffold": 20, "batch": 2, "density": GROWING}
+    options |= {"layer_bytes": LAYER_BYTES, "commit_seconds": commit_seconds, "resume": resume}
+    return make_coordinator(folder, random_gaussians(60, seed=1, size=0.12), views, **options)
 
 
 def begun(folder: Path) -> bool:
@@ -166,11 +139,6 @@ def begun(folder: Path) -> bool:
     if not (folder / "store" / "manifest.json").exists():
         return False
     return bool(ParameterStore.open(folder / "store", read_only=True).blocks)
-
-
-def _note(folder: Path, coordinator: Coordinator, event: Event) -> None:
-    if isinstance(event, VisitEnded):
-        _write(folder, coordinator.state.step)
 
 
 def _write(folder: Path, step: int) -> None:
@@ -188,20 +156,15 @@ class Runs:
     modules: tuple[str, ...] = ("tests.reference.crash_runs",)
     """What the server imports, besides what torch would import late, and slowly, in every process."""
 
-    def __init__(self, *modules: str) -> None:
-        """`modules`: what the server is to import, too; the caller's own, if it is a program."""
+    def __init__(self) -> None:
         # Before the server starts: libraries read it when they are imported.
         os.environ["OMP_NUM_THREADS"] = "1"
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["torch._dynamo", *self.modules, *modules])
+        self._context.set_forkserver_preload(["torch._dynamo", *self.modules])
 
     def start(self, *args: Any, **options: Any) -> multiprocessing.Process:
         """A process; see `body` for its arguments."""
-        return self.process(self.body, *args, **options)
-
-    def process(self, target: Callable[..., None], *args: Any, **options: Any) -> multiprocessing.Process:
-        """A process that does something else."""
-        process = self._context.Process(target=target, args=args, kwargs=options)
+        process = self._context.Process(target=self.body, args=args, kwargs=options)
         process.start()
         return process
 

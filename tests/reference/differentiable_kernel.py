@@ -1,9 +1,12 @@
-"""Kernels of a simulated device that have a gradient."""
+"""Kernels of a simulated device that have a gradient; gsplat's signatures for what stands in for them."""
 
+import functools
+import inspect
 from collections.abc import Callable
 from typing import Any
 
 import torch
+from gsplat.cuda import _wrapper
 from torch import Tensor
 
 from tests.reference.simulated_device import kernel
@@ -37,3 +40,27 @@ class Differentiable(torch.autograd.Function):
 
         found = iter(kernel(gradient, *inputs, *given))
         return None, *(next(found) if w else None for w in wanted)
+
+
+def stands_in(**fixed: Any) -> Callable[[Callable], Callable]:
+    """Give a function the signature of gsplat's of the same name.
+
+    Args:
+        fixed: arguments that the function does not take, and the only value of each that it stands in for.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        signature = inspect.signature(getattr(_wrapper, function.__name__))
+        taken = inspect.signature(function).parameters
+
+        @functools.wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            given = signature.bind(*args, **options)
+            given.apply_defaults()
+            others = {name: value for name, value in given.arguments.items() if name not in taken}
+            assert others == fixed
+            return function(**{name: given.arguments[name] for name in taken})
+
+        return call
+
+    return decorate

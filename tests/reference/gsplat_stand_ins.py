@@ -1,4 +1,4 @@
-"""gsplat 1.4.0's CUDA functions in torch, under the names and signatures of `gsplat.cuda._wrapper`.
+"""gsplat 1.4.0's CUDA functions in torch, under the names and with the signatures of `gsplat.cuda._wrapper`.
 
     with lent():
         GsplatRasterizer()...  # on CPU tensors, or on the simulated device, where each counts as one launch
@@ -19,7 +19,7 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
-from tests.reference.differentiable_kernel import Differentiable
+from tests.reference.differentiable_kernel import Differentiable, stands_in
 from tests.reference.gsplat_surfel_stand_ins import fully_fused_projection_2dgs, surfel_sigma  # noqa: F401 - lent
 from tests.reference.simulated_device import kernel
 from tests.reference.triton_stand_ins import lent_triton
@@ -40,30 +40,11 @@ NAMES = (
 """What is stood in for."""
 
 
+@stands_in(covars=None, packed=False, sparse_grad=False, radius_clip=0.0, camera_model="pinhole")
 def fully_fused_projection(
-    means: Tensor,
-    covars: Tensor | None,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    eps2d: float = 0.3,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    packed: bool = False,
-    sparse_grad: bool = False,
-    calc_compensations: bool = False,
-    camera_model: str = "pinhole",
+    means, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
     """radii [C, N], means2d [C, N, 2], depths [C, N], conics [C, N, 3], compensations [C, N] or None."""
-    assert covars is None
-    assert not packed
-    assert not sparse_grad
-    assert radius_clip == 0
-    assert camera_model == "pinhole"
     options = {"eps2d": eps2d, "near_plane": near_plane, "far_plane": far_plane}
 
     def project(rows: slice | Tensor, means: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
@@ -94,9 +75,8 @@ def fully_fused_projection(
     return found if calc_compensations else (*found, None)
 
 
-def spherical_harmonics(
-    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
-) -> Tensor:
+@stands_in()
+def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None) -> Tensor:
     """Colours [..., 3] without the offset of 0.5."""
 
     def _harmonics(dirs: Tensor, coeffs: Tensor, *masks: Tensor) -> tuple[Tensor]:
@@ -108,22 +88,12 @@ def spherical_harmonics(
     return Differentiable.apply(_harmonics, *tensors)[0]
 
 
+@stands_in(packed=True)
 @torch.no_grad()
 def isect_tiles(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
-    sort: bool = True,
-    packed: bool = False,
-    n_cameras: int | None = None,
-    camera_ids: Tensor | None = None,
-    gaussian_ids: Tensor | None = None,
+    means2d, radii, depths, tile_size, tile_width, tile_height, sort, n_cameras, camera_ids, gaussian_ids
 ) -> tuple[Tensor, Tensor, Tensor]:
     """tiles per splat [nnz], isect_ids [pairs] (camera | tile << 32 | bits of the depth), flatten_ids."""
-    assert packed
     assert n_cameras is not None
     assert camera_ids.shape == gaussian_ids.shape == radii.shape == depths.shape == means2d.shape[:1]
     assert camera_ids.dtype == torch.int64
@@ -157,6 +127,7 @@ def _bits(tile_width: int, tile_height: int) -> int:
     return (tile_width * tile_height).bit_length()
 
 
+@stands_in()
 @torch.no_grad()
 def isect_offset_encode(isect_ids: Tensor, n_cameras: int, tile_width: int, tile_height: int) -> Tensor:
     """Where each tile's pairs begin in a sorted list: int32 [C, tile_height, tile_width]."""
@@ -170,28 +141,23 @@ def isect_offset_encode(isect_ids: Tensor, n_cameras: int, tile_width: int, tile
     return kernel(_offsets, isect_ids)
 
 
+@stands_in(backgrounds=None, packed=True, absgrad=False)
 def rasterize_to_pixels(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    image_width: int,
-    image_height: int,
-    tile_size: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
-    backgrounds: Tensor | None = None,
-    masks: Tensor | None = None,
-    packed: bool = False,
-    absgrad: bool = False,
+    means2d,
+    conics,
+    colors,
+    opacities,
+    image_width,
+    image_height,
+    tile_size,
+    isect_offsets,
+    flatten_ids,
+    masks,
 ) -> tuple[Tensor, Tensor]:
     """Colours [C, h, w, channels] and alphas [C, h, w, 1], from any lists of pairs.
 
     The last list ends where the pairs do. Of a tile that is masked colours are 0, and alphas are not written.
     """
-    assert backgrounds is None
-    assert packed
-    assert not absgrad
     assert means2d.shape == (len(opacities), 2)
     assert conics.shape[:2] == (len(opacities), 3)
     assert len(colors) == len(opacities)
@@ -205,33 +171,28 @@ def rasterize_to_pixels(
     return _Rasterize.apply(size, *tensors, *(() if masks is None else (masks,)))
 
 
+@stands_in(backgrounds=None, packed=True, absgrad=False, distloss=False)
 def rasterize_to_pixels_2dgs(
-    means2d: Tensor,
-    ray_transforms: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    normals: Tensor,
-    densify: Tensor,
-    image_width: int,
-    image_height: int,
-    tile_size: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
-    backgrounds: Tensor | None = None,
-    masks: Tensor | None = None,
-    packed: bool = False,
-    absgrad: bool = False,
-    distloss: bool = False,
+    means2d,
+    ray_transforms,
+    colors,
+    opacities,
+    normals,
+    densify,
+    image_width,
+    image_height,
+    tile_size,
+    isect_offsets,
+    flatten_ids,
+    masks,
 ) -> tuple[Tensor | None, ...]:
     """As `rasterize_to_pixels`; of what else CUDA gives, nothing."""
     assert ray_transforms.shape == (len(opacities), 3, 3)
     assert normals.shape == (len(opacities), 3)
     assert densify.shape == means2d.shape
-    assert not absgrad
-    assert not distloss
     splats = means2d, ray_transforms, colors, opacities
     lists = image_width, image_height, tile_size, isect_offsets, flatten_ids
-    return (*rasterize_to_pixels(*splats, *lists, backgrounds, masks, packed), None, None, None)
+    return (*rasterize_to_pixels(*splats, *lists, masks=masks, packed=True), None, None, None)
 
 
 def _in_image(offsets: Tensor, size: tuple[int, int, int]) -> Tensor:

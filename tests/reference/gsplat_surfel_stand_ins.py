@@ -6,7 +6,7 @@ import torch
 from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs
 from torch import Tensor
 
-from tests.reference.differentiable_kernel import Differentiable
+from tests.reference.differentiable_kernel import Differentiable, stands_in
 
 
 def place_surfels(
@@ -34,24 +34,12 @@ def place_surfels(
     return [torch.where(drawn, radii, 0.0).int(), means2d, depths, rays, normals]
 
 
+@stands_in(eps2d=0.3, radius_clip=0.0, packed=False, sparse_grad=False)
 def fully_fused_projection_2dgs(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    eps2d: float = 0.3,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    packed: bool = False,
-    sparse_grad: bool = False,
+    means, quats, scales, viewmats, Ks, width, height, near_plane, far_plane
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """radii [C, N], means2d [C, N, 2], depths [C, N], ray_transforms [C, N, 3, 3], normals [C, N, 3]. As in
     CUDA, cameras get no gradient."""
-    assert (eps2d, radius_clip, packed, sparse_grad) == (0.3, 0, False, False)
     size = width, height, near_plane, far_plane
 
     def _place(*tensors: Tensor) -> list[Tensor]:

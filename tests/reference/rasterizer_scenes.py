@@ -71,8 +71,22 @@ def gradients(draw: Callable[[Gaussians], object], gaussians: Gaussians) -> tupl
     }
 
 
+def assert_drawn_alike(
+    draw: Callable, oracle: Callable, gaussians: Gaussians, picture: float, gradient: float
+) -> None:
+    """Both draw the same, with the same gradients.
+
+    Args:
+        picture, gradient: how far off they may be, as a share of the largest value.
+    """
+    (image, found), (expected, wanted) = (gradients(each, gaussians) for each in (draw, oracle))
+    assert relative_error(image, expected) < picture
+    for name in PARAM_NAMES:
+        assert relative_error(found[name], wanted[name]) < gradient, name
+
+
 def relative_error(value: Tensor, reference: Tensor) -> float:
     """The largest difference, as a share of the largest reference value."""
     if reference.numel() == 0:
         return 0.0
-    return float((value - reference).abs().max() / reference.abs().max().clamp_min(1e-300))
+    return float((value - reference).abs().max() / reference.abs().max().clamp_min(1e-30))

@@ -22,13 +22,19 @@ from abcd_ns.engine.store.scaffold import blocks_at_rest
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.coordinator import Coordinator
+from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.engine.train.training_loop import train
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import look_at
+
+STILL = DensityConfig(strategy="off")
+GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0)
+"""So that runs of a few dozen steps grow."""
 
 
 def cell_windows(tree: BlockTree, view: View, grid: TileGrid, nodes, device="cpu") -> tuple[ZWindow, ...]:
@@ -160,3 +166,31 @@ def listen(trainer: Trainer, kind: type | UnionType) -> list[Any]:
     heard: list[Any] = []
     trainer.announce.subscribe(lambda event: heard.append(event) if isinstance(event, kind) else None)
     return heard
+
+
+def stop(trainer: Trainer) -> None:
+    """Save a run and let go of its folder."""
+    trainer.save()
+    trainer.close()
+
+
+def assert_resumes(make: Callable, photos: Callable, *stops: int, **options) -> tuple[Trainer, Trainer]:
+    """A run that stops after so many steps and goes on is the run that did not, bit for bit (invariant 7).
+
+    Args:
+        make: makes runs by their names and options.
+
+    Returns:
+        The run that did not stop, and the last one that did.
+    """
+    whole = make("whole", **options)
+    train(whole, photos)
+    for steps in stops:
+        stopped = make(f"stopped {steps}", **options)
+        train(stopped, photos, steps=steps)
+        stop(stopped)
+        again = make(f"stopped {steps}", resume=True, **options)
+        assert again.state.step == steps
+        train(again, photos)
+        assert equal(whole_scene(again), whole_scene(whole))
+    return whole, again

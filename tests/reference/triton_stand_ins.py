@@ -63,14 +63,7 @@ def skips(count: Tensor, norms: Sequence[Tensor]) -> Tensor:
 
 
 def windowed(
-    near: Tensor,
-    far: Tensor,
-    keys: Tensor,
-    owners: Tensor,
-    always: int,
-    bits: int,
-    tiles: int,
-    last_key: int,
+    near: Tensor, far: Tensor, keys: Tensor, owners: Tensor, always: int, bits: int, tiles: int, last_key: int
 ) -> tuple[Tensor, Tensor]:
     """Keys and owners: those that are kept, and as many others as there were."""
     place, z = keys >> 32, (keys & 0xFFFFFFFF).int().view(torch.float32)

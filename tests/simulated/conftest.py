@@ -2,12 +2,14 @@
 
 import pytest
 
+from abcd_ns.engine.render import TorchRasterizer
+from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.step import batch
-from tests.engine.conftest import photos, start, views
+from tests.engine.conftest import make, photos, start, views
 from tests.reference.gsplat_stand_ins import lent
-from tests.reference.simulated_device import simulated_device
+from tests.reference.simulated_device import DEVICE, simulated_device
 
-__all__ = ["counts", "photos", "simulated_gsplat", "start", "views"]
+__all__ = ["counts", "make", "on_device", "photos", "simulated_gsplat", "start", "views"]
 
 
 @pytest.fixture
@@ -22,6 +24,17 @@ def simulated_gsplat(counts):
     """The same, with gsplat's functions."""
     with lent():
         yield counts
+
+
+@pytest.fixture
+def on_device(simulated_gsplat, make):  # noqa: ARG001 - which is what they need
+    """Makes runs on it, with gsplat (without its check) unless told otherwise."""
+
+    def made(name: str = "run", rasterizer: str = "gsplat", **options):
+        draws = TorchRasterizer(use_native=False) if rasterizer == "torch" else GsplatRasterizer()
+        return make(name, device=DEVICE, rasterizer=draws, **options)
+
+    return made
 
 
 @pytest.fixture(autouse=True, scope="package")

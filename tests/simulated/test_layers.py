@@ -9,11 +9,9 @@ from abcd_ns.engine.layers.layer_store import Kept, LayerStore
 from abcd_ns.engine.layers.painter import Painter
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train import layer_source, memory
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.training_loop import train
-from tests.reference.scenes import whole_scene
+from tests.reference.scenes import STILL, equal, whole_scene
 from tests.reference.simulated_device import DEVICE
-from tests.simulated.test_coordinators import on_device
 
 SIZE = 2 * 6 * 8 * 4 * 2
 """Bytes of a layer of `kept`."""
@@ -61,8 +59,7 @@ def test_what_is_inside_the_window_goes_along(counts):
     assert torch.equal(store.get(0).interleaved.planes.cpu(), interleaved.planes.cpu())
 
 
-@pytest.mark.usefixtures("simulated_gsplat")
-def test_a_run_does_not_depend_on_where_its_layers_are(tmp_path, start, views, photos):
+def test_a_run_does_not_depend_on_where_its_layers_are(on_device, photos):
     scenes = []
     for name, on, ram in (
         ("device", 1 << 30, 0),
@@ -70,30 +67,26 @@ def test_a_run_does_not_depend_on_where_its_layers_are(tmp_path, start, views, p
         ("each", 60_000, 60_000),
         ("none", 0, 0),
     ):
-        (folder := tmp_path / name).mkdir()
-        options = {"layer_bytes": on, "layer_ram_bytes": ram, "density": DensityConfig(strategy="off")}
-        coordinator = on_device(folder, start, views, blocks=3, steps=6, **options)
+        options = {"layer_bytes": on, "layer_ram_bytes": ram, "density": STILL}
+        coordinator = on_device(name, blocks=3, steps=6, **options)
         held = []
         coordinator.announce.subscribe(lambda _, c=coordinator, h=held: h.append(c.layer_bytes))
         train(coordinator, photos)
         assert (max(held) > 0) == (name != "none")
         assert max(held) <= coordinator.layer_limit == on + ram
         scenes.append(whole_scene(coordinator))
-    for other in scenes[1:]:
-        assert all(torch.equal(value, getattr(other, name)) for name, value in scenes[0].items())
+    assert all(equal(scenes[0], other) for other in scenes[1:])
 
 
-@pytest.mark.usefixtures("simulated_gsplat")
 @pytest.mark.parametrize(("floats", "groups"), [(1, 4), (1e6, 1)])
 def test_where_steps_take_much_memory_layers_are_drawn_for_more_views_at_once(
-    tmp_path, start, views, photos, monkeypatch, floats, groups
+    on_device, photos, monkeypatch, floats, groups
 ):
     """Each time that blocks around the one that is visited are read, some are copied to the device anew."""
     for module in (memory, layer_source):
         monkeypatch.setattr(module, "PARTS_BYTES", 1)
     monkeypatch.setattr(memory, "PIXEL_FLOATS", floats)
-    options = {"density": DensityConfig(strategy="off"), "warmup": 0.0, "pass_gaussians": 1, "steps": 1}
-    coordinator = on_device(tmp_path, start, views, blocks=4, **options)
+    coordinator = on_device(blocks=4, density=STILL, warmup=0.0, pass_gaussians=1, steps=1)
     loaded, load = Counter(), Painter.load
 
     def counted(self, unit, **options):

@@ -15,11 +15,10 @@ from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, projected_bytes
 from abcd_ns.engine.train.training_loop import train
-from tests.reference.scenes import Photos, make_coordinator, random_gaussians, ring_of_views
+from tests.reference.scenes import STILL, Photos, make_coordinator, random_gaussians, ring_of_views
 from tests.reference.simulated_device import DEVICE
 
 LAVISH = 4.0
-STILL = DensityConfig(strategy="off")
 GROWING = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=2)
 
 
@@ -92,12 +91,9 @@ def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat, b
         pixels = coordinator.state.active.geometry.crops[view].pixels
         peaks.append((pixels, simulated_gsplat.peak_bytes - held))
     (few, small), (many, large) = peaks
-    levels = levels_of(blocks)
     huge = 1 << 26  # so that no least amount counts
-    per_pixel = (
-        DeviceNeeds(2 * huge, 1, levels=levels).drawing_bytes
-        - DeviceNeeds(huge, 1, levels=levels).drawing_bytes
-    ) / huge
+    one, two = (DeviceNeeds(n * huge, 1, levels=levels_of(blocks)).drawing_bytes for n in (1, 2))
+    per_pixel = (two - one) / huge
     slope = (large - small) / (many - few)
     assert slope <= per_pixel <= LAVISH * slope
 
@@ -105,21 +101,12 @@ def test_what_a_pixel_takes_while_layers_are_drawn(tmp_path, simulated_gsplat, b
 @pytest.mark.parametrize("primitive", ["3dgs", "2dgs"])
 def test_what_a_gaussian_is_in_a_view(tmp_path, simulated_gsplat, primitive):
     """What each further view of a step adds: a surfel has more rows than an ellipsoid."""
-    peaks = [
-        [
-            peak_of_steps(
-                simulated_gsplat,
-                tmp_path / f"{batch}-{gaussians}",
-                gaussians=gaussians,
-                width=32,
-                batch=batch,
-                density=STILL,
-                primitive=primitive,
-            )[0]
-            for gaussians in (800, 2400)  # so many that pictures are a small part
-        ]
-        for batch in (1, 3)
-    ]
-    (one, one_more), (three, three_more) = peaks
-    slope = (three_more - three - one_more + one) / 2 / 1600
+
+    def peak(batch: int, gaussians: int) -> int:
+        folder = tmp_path / f"{batch}-{gaussians}"
+        options = {"gaussians": gaussians, "batch": batch, "primitive": primitive}
+        return peak_of_steps(simulated_gsplat, folder, width=32, density=STILL, **options)[0]
+
+    few, many = 800, 2400  # so many that pictures are a small part
+    slope = (peak(3, many) - peak(3, few) - peak(1, many) + peak(1, few)) / 2 / (many - few)
     assert slope <= projected_bytes(primitive) <= LAVISH * slope

@@ -104,9 +104,7 @@ def test_a_run_is_gone_on_with(data, tmp_path, trained):
 
 
 @pytest.mark.parametrize(
-    "method",
-    [methods.abcd_ablated, methods.abcd_monolithic, methods.abcd_partition, methods.abcd_exact],
-    ids=lambda method: method.config.method_name,
+    "method", [methods.abcd_partition, methods.abcd_exact], ids=lambda method: method.config.method_name
 )
 def test_the_other_methods_train(data, tmp_path, method):
     trainer = run(on_device(data, tmp_path, method, steps=4))

@@ -20,37 +20,17 @@ from abcd_ns.engine.transfer import StepNumbers
 from abcd_ns.engine.types import Crop
 from benchmarks.device import Watch
 from tests.reference.rasterizer_scenes import as_leaves
-from tests.reference.scenes import (
-    listen,
-    make_coordinator,
-    random_gaussians,
-    ring_of_views,
-    whole_scene,
-)
+from tests.reference.scenes import STILL, listen, random_gaussians, ring_of_views, whole_scene
 from tests.reference.simulated_device import DEVICE
 
 GATHERING = DensityConfig(refine_start=1.0, refine_stop=1.0)
-STILL = DensityConfig(strategy="off")
 
 
 @pytest.mark.parametrize(("blocks", "parts"), [(1, 0), (4, 0), (4, 300)])
-def test_a_step_waits_once_and_copies_its_photos_alone(
-    tmp_path, start, views, photos, simulated_gsplat, blocks, parts
-):
+def test_a_step_waits_once_and_copies_its_photos_alone(on_device, photos, simulated_gsplat, blocks, parts):
     """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
-    counts = simulated_gsplat
-    coordinator = make_coordinator(
-        tmp_path,
-        start,
-        views,
-        blocks=blocks,
-        steps=3 * blocks,
-        density=GATHERING,
-        crop_pixels=parts,
-        rasterizer=GsplatRasterizer(),
-        device=DEVICE,
-    )
-    watch = Watch(counts)
+    coordinator = on_device(blocks=blocks, steps=3 * blocks, density=GATHERING, crop_pixels=parts)
+    watch = Watch(simulated_gsplat)
     watch.take_step(coordinator, photos)  # the first one uploads cameras and backgrounds
     while not coordinator.finished:
         before = watch.steps.counts.copy()
@@ -118,18 +98,15 @@ def test_numbers_of_a_step_are_there_a_step_later(counts):
     assert list(at_once.read(all_but=int(at_once.are_late))) == [{"losses": [2.0]}]
 
 
-def test_listeners_hear_of_a_step_when_the_next_is_taken(tmp_path, start, views, photos, counts):  # noqa: ARG001
-    heard = {}
-    for device in ("cpu", DEVICE):
-        folder = tmp_path / str(device).replace(":", "")
-        folder.mkdir()
-        coordinator = make_coordinator(
-            folder, start, views, blocks=2, steps=6, density=STILL, device=device, ownership="means"
-        )
-        heard[str(device)] = listen(coordinator, StepTaken)
+@pytest.mark.usefixtures("counts")
+def test_listeners_hear_of_a_step_when_the_next_is_taken(make, photos):
+    heard = []
+    for device in (torch.device("cpu"), DEVICE):
+        coordinator = make(device.type, blocks=2, steps=6, density=STILL, device=device, ownership="means")
+        heard.append(listen(coordinator, StepTaken))
         train(coordinator, photos)
         assert coordinator.state.health
-    now, late = heard["cpu"], heard[str(DEVICE)]
+    now, late = heard
     assert [event.visit_step for event in now] == [event.visit_step for event in late]
     for k, event in enumerate(late):
         if event.visit_step == 1:
@@ -154,10 +131,9 @@ def values(coordinator) -> dict[str, torch.Tensor]:
     return {name: coordinator.params[name].detach().clone() for name in PARAM_NAMES}
 
 
-def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, start, views, photos, counts):  # noqa: ARG001
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=1, steps=12, density=GATHERING, device=DEVICE
-    )
+@pytest.mark.usefixtures("counts")
+def test_a_step_whose_gradients_are_no_numbers_is_skipped(make, photos):
+    coordinator = make(blocks=1, steps=12, density=GATHERING, device=DEVICE)
     told = listen(coordinator, Mended)
     spoil_once(coordinator, 3)
     spoil_once(coordinator, 6)
@@ -185,20 +161,9 @@ def test_a_step_whose_gradients_are_no_numbers_is_skipped(tmp_path, start, views
     assert all(bool(value.isfinite().all()) for _, value in whole_scene(coordinator).items())
 
 
-def test_a_step_waits_as_before_some_steps_after_one_that_was_skipped(
-    tmp_path, start, views, photos, simulated_gsplat
-):
+def test_a_step_waits_as_before_some_steps_after_one_that_was_skipped(on_device, photos, simulated_gsplat):
     """Rows are looked at one by one for a while, and steps that six optimizers count once are counted on."""
-    coordinator = make_coordinator(
-        tmp_path,
-        start,
-        views,
-        blocks=1,
-        steps=LATE_AFTER + 12,
-        density=GATHERING,
-        rasterizer=GsplatRasterizer(),
-        device=DEVICE,
-    )
+    coordinator = on_device(blocks=1, steps=LATE_AFTER + 12, density=GATHERING)
     spoil_once(coordinator, 3)
     waits = []
     for _ in range(LATE_AFTER + 10):
@@ -211,15 +176,13 @@ def test_a_step_waits_as_before_some_steps_after_one_that_was_skipped(
     assert {float(step) for step in steps} == {LATE_AFTER + 9.0}
 
 
-def test_the_torch_rasterizer_is_what_it_is_on_the_cpu(tmp_path, start, views, photos, counts):  # noqa: ARG001
+@pytest.mark.usefixtures("counts")
+def test_the_torch_rasterizer_is_what_it_is_on_the_cpu(make, photos):
     """Statistics of density control included."""
-    grown = {}
-    for device in ("cpu", DEVICE):
-        folder = tmp_path / str(device).replace(":", "")
-        folder.mkdir()
-        options = {"rasterizer": TorchRasterizer(use_native=False), "density": GATHERING, "device": device}
-        coordinator = make_coordinator(folder, start, views, blocks=1, steps=4, **options)
+    grown = []
+    for device in (torch.device("cpu"), DEVICE):
+        draws = TorchRasterizer(use_native=False)
+        coordinator = make(device.type, blocks=1, steps=4, rasterizer=draws, density=GATHERING, device=device)
         train(coordinator, photos, steps=3)
-        grown[str(device)] = {name: value.cpu() for name, value in coordinator.visit.live.growth.items()}
-    for name, value in grown["cpu"].items():
-        torch.testing.assert_close(grown[str(DEVICE)][name], value, rtol=1e-3, atol=1e-5)
+        grown.append({name: value.cpu() for name, value in coordinator.visit.live.growth.items()})
+    torch.testing.assert_close(*grown, rtol=1e-3, atol=1e-5)

@@ -47,12 +47,6 @@ def take_steps(params, optimizers, count: int) -> None:
             optimizer.step()
 
 
-@pytest.mark.parametrize("count", [0, 1, 9])
-def test_tensors_and_back(count):
-    state = some_state(count)
-    assert_same(BlockState.unpacked(state.packed()), state)
-
-
 def test_rows_that_part_and_join_again_lose_nothing():
     state = some_state(10)
     mask = torch.arange(10) % 3 == 0
@@ -90,10 +84,7 @@ def test_a_block_that_rested_trains_as_if_it_had_not():
     take_steps(*moved, 3)
     attach(rest, *moved)
     take_steps(*moved, 3)
-    assert_same(
-        detach(*moved, state.growth, state.clocks),
-        detach(*stayed, state.growth, state.clocks),
-    )
+    assert_same(detach(*moved, state.growth, state.clocks), detach(*stayed, state.growth, state.clocks))
 
 
 def test_the_block_before_frees_its_memory_whoever_still_refers_to_it():

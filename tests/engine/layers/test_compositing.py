@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.engine.layers.compositing import composite, empty_layer, fold, over, sandwich
+from abcd_ns.engine.layers.compositing import composite, empty_layer, fold, sandwich
 from abcd_ns.engine.types import Layer
 from tests.engine.space.test_tree import SEEDS
 
@@ -59,16 +59,6 @@ def test_any_cut_of_the_list_gives_the_same(seed, dtype, cuts):
     assert_close(fold(runs), fold(layers))
 
 
-@given(SEEDS, DTYPES)
-def test_over_is_associative_with_the_empty_layer_as_unit(seed, dtype):
-    a, b, c = random_layers(seed, 3, dtype)
-    assert_close(over(over(a, b), c), over(a, over(b, c)))
-    nothing = empty_layer(3, 4, dtype=dtype)
-    for same in (over(a, nothing), over(nothing, a)):
-        assert torch.equal(same.color, a.color)
-        assert torch.equal(same.transmittance, a.transmittance)
-
-
 @given(SEEDS, DTYPES, st.booleans())
 def test_a_sandwich_is_the_fold_on_the_background(seed, dtype, image):
     front, active, back = layers = random_layers(seed, 3, dtype)
@@ -78,22 +68,6 @@ def test_a_sandwich_is_the_fold_on_the_background(seed, dtype, image):
     torch.testing.assert_close(
         sandwich(front, active, back, background), expected, rtol=0.0, atol=TOLERANCE[dtype]
     )
-
-
-@given(SEEDS)
-def test_the_sandwich_has_the_gradient_of_the_formula(seed):
-    front, active, back = random_layers(seed, 3, torch.float64)
-    background = torch.tensor([0.2, 0.7, 0.1], dtype=torch.float64)
-    color = active.color.requires_grad_()
-    transmittance = active.transmittance.requires_grad_()
-    image = sandwich(front, Layer(color, transmittance), back, background)
-    upstream = torch.randn(image.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    image.backward(upstream)
-    by_color = front.transmittance[..., None] * upstream
-    behind = back.color + back.transmittance[..., None] * background
-    by_transmittance = front.transmittance * (upstream * behind).sum(dim=-1)
-    torch.testing.assert_close(color.grad, by_color, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(transmittance.grad, by_transmittance, rtol=1e-12, atol=1e-12)
 
 
 def test_the_sandwich_passes_a_numerical_gradient_check():

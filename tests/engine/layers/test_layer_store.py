@@ -9,7 +9,7 @@ from abcd_ns.engine.layers.painter import FrozenLayers
 from abcd_ns.engine.render.projection import Splats
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Layer
-from tests.reference.scenes import equal, make_coordinator, whole_scene
+from tests.reference.scenes import equal, whole_scene
 
 CPU = torch.device("cpu")
 
@@ -66,11 +66,10 @@ def test_pinned_memory_counts_in_powers_of_two_as_it_is_given():
         assert store.nbytes == fit * one.nbytes
 
 
-def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start):
+def test_where_layers_are_kept_changes_nothing(make, photos):
     results, drawn = [], []
     for room in (1 << 30, 60_000, 0):
-        (folder := tmp_path / str(room)).mkdir()
-        coordinator = make_coordinator(folder, start, views, blocks=2, steps=10, layer_bytes=room)
+        coordinator = make(str(room), blocks=2, steps=10, layer_bytes=room)
         while not coordinator.finished:
             train_step(coordinator, photos)
             if coordinator.visit.layers is not None:
@@ -84,9 +83,7 @@ def test_where_layers_are_kept_changes_nothing(tmp_path, views, photos, start):
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_layers_that_are_not_finite_are_an_error_that_says_so(
-    tmp_path, views, photos, start, monkeypatch, bad
-):
+def test_layers_that_are_not_finite_are_an_error_that_says_so(make, photos, monkeypatch, bad):
     def spoilt(parts):
         layers = packed(parts)
         layers[1, 2, 3, 0] = bad
@@ -94,4 +91,4 @@ def test_layers_that_are_not_finite_are_an_error_that_says_so(
 
     monkeypatch.setattr(visit, "packed", spoilt)
     with pytest.raises(RuntimeError, match=r"layers around block \d have NaN .* diverged"):
-        train(make_coordinator(tmp_path, start, views, blocks=2, steps=10), photos)
+        train(make(blocks=2, steps=10), photos)

@@ -132,17 +132,6 @@ def test_folding_by_means_is_the_block_major_picture_not_the_merged_one():
     assert difference(Layer(color, light), merged(gaussians, view)) > 1e-3
 
 
-@pytest.mark.parametrize("ownership", ["fragments", "means"])
-def test_units_hold_every_block_but_the_active_one_exactly_once(ownership):
-    gaussians = random_gaussians(300)
-    tree = build_kd(gaussians.means, 11)
-    for pass_gaussians in (0, 90, 10_000):
-        paint = painter(tree, gaussians, ring_of_views(1), ownership=ownership, pass_gaussians=pass_gaussians)
-        for active in range(11):
-            held = [b for unit in paint.units(exclude=active) for b in tree.leaves(unit) if b != active]
-            assert sorted(held) == [b for b in range(11) if b != active]
-
-
 @pytest.mark.parametrize(("pass_gaussians", "side"), [(0, 4), (10_000, 4), (60, 16)])
 @BOTH
 def test_front_inside_and_back_are_everything_but_the_active_block(primitive, pass_gaussians, side):

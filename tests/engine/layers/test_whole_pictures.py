@@ -30,14 +30,17 @@ def weights_for(view):
 
 
 @pytest.mark.parametrize("pass_gaussians", [0, 1000])
-def test_the_gradient_of_a_pose_is_that_of_the_merged_picture(pass_gaussians):
+def test_pictures_and_gradients_of_poses_are_those_of_the_merged_picture(pass_gaussians):
     """By differences of the picture that is drawn at once, for each way in which a camera may move."""
-    draw, seen = TorchRasterizer(), []
+    draw, seen, pictures = TorchRasterizer(), [], whole_pictures_of(pass_gaussians)
 
-    def gradient(view, picture):
+    def assert_merged(view, picture):
         merged = draw(SCENE, replace(view, viewmat=view.viewmat.detach()), sh_degree=1)
         for name in ("color", "transmittance", "depth"):
             assert torch.allclose(getattr(picture, name), getattr(merged, name), atol=1e-3), name
+
+    def gradient(view, picture):
+        assert_merged(view, picture)
         seen.append(view.index)
         return weights_for(view)
 
@@ -45,7 +48,9 @@ def test_the_gradient_of_a_pose_is_that_of_the_merged_picture(pass_gaussians):
         moved = replace(view, viewmat=turned(view.viewmat, step))
         return float((draw(SCENE, moved, sh_degree=1).color * weights_for(view)).sum())
 
-    found = whole_pictures_of(pass_gaussians).differentiate(VIEWS, gradient)
+    for view, picture in zip(VIEWS, pictures.draw(VIEWS), strict=True):
+        assert_merged(view, picture)
+    found = pictures.differentiate(VIEWS, gradient)
     assert seen == [0, 1, 2]
     for view, matrix in zip(VIEWS, found, strict=True):
         steps = 1e-6 * torch.eye(6, dtype=torch.float64)
@@ -68,15 +73,6 @@ def test_a_graph_goes_before_the_next_view_is_drawn():
     pictures._raster = raster
     pictures.differentiate(VIEWS, lambda view, _: weights_for(view))
     assert len(alive) == len(VIEWS)
-
-
-@pytest.mark.parametrize("pass_gaussians", [0, 1000])
-def test_pictures_are_those_of_all_at_once(pass_gaussians):
-    drawn = list(whole_pictures_of(pass_gaussians).draw(VIEWS))
-    for view, picture in zip(VIEWS, drawn, strict=True):
-        merged = TorchRasterizer()(SCENE, view, sh_degree=1)
-        for name in ("color", "transmittance", "depth"):
-            assert torch.allclose(getattr(picture, name), getattr(merged, name), atol=1e-3), name
 
 
 def test_views_are_drawn_together_as_far_as_their_layers_have_room():

@@ -65,17 +65,6 @@ def test_what_the_window_leaves_out_on_either_side_weighs_less_than_said(seed):
         assert bool((far <= most.nextafter(infinity))[shows].all())
 
 
-def test_many_faint_gaussians_together_count():
-    """Each by itself weighs less than the window may leave out; all together they are what is seen."""
-    gaussians, view = scene(0, n=400, size=0.3)
-    gaussians.opacities[:] = math.log(0.02 / 0.98)
-    window = DRAW.depth_window(gaussians, view, crop=view.full, visible=0.05)
-    through = DRAW(gaussians, view, sh_degree=0, z_window=window)
-    whole = DRAW(gaussians, view, sh_degree=0)
-    assert 1 - float(whole.transmittance.mean()) > 0.4
-    assert float((through.transmittance - whole.transmittance).mean()) < 0.1
-
-
 def test_where_nothing_shows_the_window_is_empty_and_in_the_midst():
     gaussians, view = scene(0, n=3, size=0.02)
     window = DRAW.depth_window(gaussians, view, crop=view.full, visible=0.01)

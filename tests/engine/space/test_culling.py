@@ -139,8 +139,7 @@ def test_blocks_out_of_sight_are_not_read_and_the_picture_is_the_same(ownership)
 
 @pytest.mark.parametrize("ownership", ["fragments", "means"])
 def test_few_parts_are_held_while_units_are_folded(ownership):
-    gaussians = random_gaussians(128, dtype=torch.float64)
-    views = ring_of_views(2, dtype=torch.float64)
+    gaussians, views = random_gaussians(128), ring_of_views(1)
     tree = build_kd(gaussians.means, 32)
     paint = Painter(MemoryScene(tree, gaussians), views, DRAW, ownership=ownership, pass_gaussians=0)
     for view in views:

@@ -136,8 +136,7 @@ def test_a_coarser_view_sees_the_same():
 
 
 @given(
-    st.dictionaries(st.integers(0, 99), st.floats(1e-6, 1), max_size=30),
-    st.floats(0, 1, exclude_max=True),
+    st.dictionaries(st.integers(0, 99), st.floats(1e-6, 1), max_size=30), st.floats(0, 1, exclude_max=True)
 )
 def test_the_fewest_views_that_hold_the_share(views, share):
     kept, total = worth_training(views, share), sum(views.values())

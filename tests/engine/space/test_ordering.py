@@ -91,24 +91,6 @@ def test_order_is_right_in_exact_arithmetic(seed, num_blocks):
         assert places == sorted(places)
 
 
-def test_a_grid_is_ordered_by_manhattan_distance_of_cells():
-    points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * 4
-    tree = build_grid(points, counts=(4, 4, 4))
-    planes = [torch.tensor(sorted(set(tree.threshold[tree.axis == axis].tolist()))) for axis in range(3)]
-    lower, upper = corners(tree)
-    middles = torch.where(lower.isinf(), upper - 0.1, lower + 0.1)
-    index = torch.stack([torch.bucketize(middles[:, a].contiguous(), planes[a]) for a in range(3)], dim=1)
-    center = torch.tensor([1.5, 2.5, 9.0])
-    own = index[int(tree.assign(center[None]))]
-    steps = index - own
-    rank = order_of(tree, center).argsort()
-    for i in range(tree.num_blocks):
-        for j in range(tree.num_blocks):
-            # On the way from the camera's cell to j, a ray may pass i: then i has to come first.
-            passed = ((steps[i] * steps[j] >= 0) & (steps[i].abs() <= steps[j].abs())).all()
-            assert i == j or not passed or rank[i] < rank[j]
-
-
 def test_a_camera_on_the_plane_belongs_to_the_right():
     tree = build_grid(torch.zeros(0, 3), counts=(2, 1, 1))
     threshold = float(tree.threshold[0])

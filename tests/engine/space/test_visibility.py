@@ -1,6 +1,7 @@
 """Visibility: what a Gaussian draws, found by looking at every pixel, against what is predicted."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,20 +9,17 @@ from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_cova
 from hypothesis import given
 from hypothesis import strategies as st
 
+from abcd_ns.engine.render import TorchRasterizer
 from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import DRAWN_SIGMAS, SPLATS
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions
+from abcd_ns.engine.space.near_plane import near_plane, with_distances
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.space.visibility import (
-    footprint,
-    reach_radius,
-    reaches,
-    widest_slant,
-    world_size,
-)
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.space.visibility import footprint, reach_radius, reaches, widest_slant, world_size
+from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
 from tests.engine.space.test_tree import SEEDS
+from tests.reference.scenes import random_gaussians, ring_of_views
 
 
 def small_view(seed: int = 0) -> View:
@@ -78,16 +76,11 @@ def test_footprint_ignores_what_is_culled_whatever_its_place():
     assert crop == Crop(3, 3, 4, 4)
 
 
-def random_gaussians(seed: int, n: int) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=generator) * 3,
-        scales=torch.randn(n, 3, generator=generator) - 1.5,
-        quats=torch.randn(n, 4, generator=generator),
-        features_dc=torch.zeros(n, 3),
-        features_rest=torch.zeros(n, 0, 3),
-        opacities=torch.zeros(n, 1),
-    )
+def scattered(seed: int, count: int) -> Gaussians:
+    """Everywhere, so that a camera has some beside and behind it."""
+    gaussians = random_gaussians(count, seed, size=0.22)
+    gaussians.means[:] *= 3
+    return gaussians
 
 
 def project(gaussians: Gaussians, view: View):
@@ -113,33 +106,31 @@ def drawn_in_box(view: View, crop: Crop, box: Box, means2d, radii, depths, conic
     return (radii > 0) & (drawn & inside).flatten(1).any(dim=1)
 
 
-@given(SEEDS, st.booleans())
-def test_no_gaussian_draws_in_a_box_it_is_said_not_to_reach(seed, cropped):
-    view, gaussians = small_view(seed), random_gaussians(seed, 40)
-    crop = Crop(8, 5, 20, 13) if cropped else view.full
+def drawn_and_reached(seed: int, count: int, crop: Crop | None, lower: float, upper: list[float]):
+    """Which Gaussians draw in a box around a point before the camera, and which are said to reach it."""
+    view, gaussians = small_view(seed), scattered(seed, count)
     means2d, radii, depths, conics = project(gaussians, view)
     middle = view.center.double() + view.viewmat[2, :3].double() * 3
-    box = Box(middle - 0.7, torch.tensor([math.inf, 0.5, 0.9]).double() + middle)
-    truth = drawn_in_box(view, crop, box, means2d, radii, depths, conics)
+    box = Box(middle + lower, torch.tensor(upper).double() + middle)
     blur = world_size(SPLATS.blur_pixels, depths.clamp(min=0), view)
-    anywhere = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant(view))
-    assert not bool((truth & ~anywhere).any())
+    reached = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant(view))
+    return drawn_in_box(view, crop or view.full, box, means2d, radii, depths, conics), reached
 
 
-def test_the_tests_of_reach_are_not_vacuous():
-    view, gaussians = small_view(1), random_gaussians(1, 400)
-    means2d, radii, depths, conics = project(gaussians, view)
-    middle = view.center.double() + view.viewmat[2, :3].double() * 3
-    box = Box(middle - 1.2, middle + 1.2)
-    truth = drawn_in_box(view, view.full, box, means2d, radii, depths, conics)
-    blur = world_size(SPLATS.blur_pixels, depths.clamp(min=0), view)
-    anywhere = reaches(gaussians.means, gaussians.scales, box, blur, widest_slant(view))
-    assert int(truth.sum()) >= 20
-    assert int(anywhere.sum()) < 400
+@given(SEEDS, st.sampled_from([None, Crop(8, 5, 20, 13)]))
+def test_no_gaussian_draws_in_a_box_it_is_said_not_to_reach(seed, crop):
+    drawn, reached = drawn_and_reached(seed, 40, crop, -0.7, [math.inf, 0.5, 0.9])
+    assert not bool((drawn & ~reached).any())
+
+
+def test_some_draw_in_a_box_and_some_do_not_reach_it():
+    drawn, reached = drawn_and_reached(1, 400, None, -1.2, [1.2, 1.2, 1.2])
+    assert int(drawn.sum()) >= 20
+    assert int(reached.sum()) < 400
 
 
 def test_reach_is_measured_to_the_nearest_point_of_the_box():
-    gaussians = random_gaussians(0, 3)
+    gaussians = random_gaussians(3)
     gaussians.means.copy_(torch.tensor([[0.5, 0.5, 0.5], [4.0, 5.0, 0.5], [-9.0, 0.5, 0.5]]))
     gaussians.scales.copy_(torch.log(torch.tensor([[0.1, 0.1, 0.1], [0.1, 1.0, 0.2], [1.0, 1.0, 1.0]])))
     box = Box(torch.zeros(3).double(), torch.ones(3).double())
@@ -152,3 +143,74 @@ def test_reach_is_measured_to_the_nearest_point_of_the_box():
     assert reaches(*shapes, box, slant=3.0).tolist() == [True, True, True]
     of_each = torch.tensor([0.0, 0.0, 6.0])
     assert reaches(*shapes, box, slack=of_each, slant=1.0).tolist() == [True, False, True]
+
+
+def ahead(view, distance, count=1):
+    """Points on the view's axis."""
+    return (view.center + distance * view.viewmat[2, :3]).expand(count, 3)
+
+
+def test_half_the_nearest_distance_in_any_view():
+    views = ring_of_views(3)
+    points = torch.cat((ahead(views[0], 2.0), ahead(views[1], 0.8), ahead(views[2], 2.5)))
+    assert near_plane(points, views) == pytest.approx(0.4, rel=1e-2)
+
+
+def test_what_no_photo_shows_does_not_count():
+    (view,) = ring_of_views(1)
+    beside = ahead(view, 0.1) + 10 * view.viewmat[0, :3]
+    behind = ahead(view, -0.1)
+    assert near_plane(torch.cat((ahead(view, 2.0), beside, behind)), [view]) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_wrong_match_in_thousands_does_not_count():
+    (view,) = ring_of_views(1)
+    points = torch.cat((ahead(view, 2.0, 5000), ahead(view, 0.05)))
+    assert near_plane(points, [view]) == pytest.approx(1.0, rel=1e-2)
+
+
+def test_gsplats_own_where_nothing_is_known():
+    views = ring_of_views(2)
+    assert near_plane(torch.zeros(0, 3), views) == NEAR_PLANE
+    assert near_plane(ahead(views[0], -5.0), views[:1]) == NEAR_PLANE
+    assert near_plane(ahead(views[0], 0.02), views[:1]) == NEAR_PLANE
+
+
+def test_a_camera_far_away_changes_nothing_for_the_others():
+    """Its frame is scaled down; what the others see from how far is as before."""
+    views, points = ring_of_views(4), torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+    far = replace(views[0], viewmat=views[0].viewmat.clone(), index=4)
+    far.viewmat[2, 3] += 3000.0
+    for scale in (1.0, 1e-3):
+        seen = [replace(v, viewmat=v.viewmat.clone()) for v in (*views, far)]
+        for view in seen:
+            view.viewmat[:3, 3] *= scale
+        alone, beside = with_distances(points * scale, seen[:4]), with_distances(points * scale, seen)
+        assert [view.distance for view in alone] == [view.distance for view in beside[:4]]
+        assert alone[0].distance == pytest.approx(3.38 * scale, rel=1e-2)
+        assert near_plane(points * scale, seen) == pytest.approx(near_plane(points, views) * scale, rel=1e-3)
+
+
+def test_a_view_that_sees_no_point_is_as_far_as_the_others():
+    near, other = ring_of_views(2)
+    away = replace(near, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ near.viewmat, index=1)
+    points = ahead(near, 2.0, 5)
+    assert [view.distance for view in with_distances(points, [near, away])] == pytest.approx([2.0, 2.0])
+    assert [view.distance for view in with_distances(torch.zeros(0, 3), [near, other])] == [1.0, 1.0]
+
+
+def test_no_more_points_and_views_than_needed_are_looked_at():
+    views = ring_of_views(5) * 200
+    points = ahead(views[0], 2.0, 50_000)
+    assert near_plane(points, views) == pytest.approx(near_plane(points[:1], views[:5]), rel=1e-3)
+
+
+def test_a_gaussian_before_the_camera_spoils_no_picture():
+    (view,) = ring_of_views(1)
+    scene = random_gaussians(30, seed=3, size=0.2)
+    blinder = replace(scene[:1], means=ahead(view, 0.1).clone(), opacities=torch.full((1, 1), 5.0))
+    both = type(scene).cat([scene, blinder])
+    draw = TorchRasterizer(use_native=False)
+    clear = draw(scene, view, sh_degree=0).color
+    assert float((draw(both, view, sh_degree=0).color - clear).abs().max()) > 0.1
+    assert torch.equal(draw(both, replace(view, near=0.2), sh_degree=0).color, clear)

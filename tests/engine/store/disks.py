@@ -1,6 +1,8 @@
 """A disk that can be watched and held up."""
 
 import threading
+import time
+from collections.abc import Callable
 
 from abcd_ns.engine.store import ParameterStore, StoreError
 from abcd_ns.engine.store.scene import StoredScene
@@ -32,3 +34,11 @@ class Disk:
 def on_disk(scene: StoredScene) -> dict:
     """The run's state, as whoever opens the store finds it."""
     return ParameterStore.open(scene.store.folder, read_only=True).state
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Of what another thread does."""
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

@@ -1,6 +1,7 @@
 """The store gives back what was committed, pinned and cloned: it is a dictionary with generations."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from abcd_ns.engine.store import ParameterStore, StoreError, atomic, shard
+from abcd_ns.engine.store import ParameterStore, StoreError, atomic, crash_points, shard
 from tests.reference.store_helpers import FailAt, assert_block, block, names_in
 
 DTYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool)
@@ -29,7 +30,7 @@ def test_what_was_committed_is_there_after_reopening(store):
 
 
 @given(st.data())
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_any_tensor_survives(tmp_path_factory, data):
     tensors = {}
     for name in data.draw(st.lists(st.text("abcdef._é", min_size=1, max_size=8), max_size=4, unique=True)):
@@ -170,7 +171,10 @@ def test_a_failed_clone_is_no_store(store, tmp_path, monkeypatch):
 
 
 class StoreMachine(RuleBasedStateMachine):
-    """The store against a dictionary, through commits, failures, pins and reopening."""
+    """The store against a dictionary, through commits, failures, kills, pins and reopening.
+
+    A kill leaves what the kernel has of the files at that moment: what a copy of the folder holds.
+    """
 
     blocks_ = st.dictionaries(st.integers(0, 4), st.tuples(st.integers(0, 3), st.integers(0, 99)), max_size=3)
     names = st.sampled_from(["a", "b"])
@@ -181,7 +185,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.store = ParameterStore.create(self.folder, {})
         self.model: dict = {}
         self.pins: dict = {}
-        self.generation = 0
+        self.generation = self.kills = 0
 
     def update(self, blocks):
         return {number: block(rows, float(value)) for number, (rows, value) in blocks.items()}
@@ -201,6 +205,32 @@ class StoreMachine(RuleBasedStateMachine):
                 self.store.commit(self.update(blocks))
         finally:
             atomic.os.fsync = fsync
+
+    @rule(blocks=blocks_, nth=st.integers(1, 16))
+    def be_killed(self, blocks, nth):
+        """At the n-th point that a commit comes to."""
+        self.kills += 1
+        copy, old, left = self.folder.with_name(f"s{self.kills}"), self.generation, nth
+
+        def reached(point: str) -> None:
+            del point
+            nonlocal left
+            left -= 1
+            if left == 0:
+                shutil.copytree(self.folder, copy)
+
+        before, crash_points.reached = crash_points.reached, reached
+        try:
+            self.store.commit(self.update(blocks), state={"n": self.generation + 1})
+        finally:
+            crash_points.reached = before
+        self.store.close()
+        self.folder = copy if copy.exists() else self.folder
+        self.store = ParameterStore.open(self.folder)
+        self.generation = self.store.generation
+        assert self.generation in (old, old + 1)
+        if self.generation > old:
+            self.model |= {number: (*what, self.generation) for number, what in blocks.items()}
 
     @rule(name=names)
     def pin(self, name):
@@ -248,7 +278,7 @@ class StoreMachine(RuleBasedStateMachine):
 def test_the_store_is_a_dictionary(tmp_path_factory):
     StoreMachine.base = tmp_path_factory
     case = StoreMachine.TestCase
-    case.settings = settings(max_examples=15, stateful_step_count=15, deadline=None, derandomize=True)
+    case.settings = settings(max_examples=20, stateful_step_count=20)
     case().runTest()
 
 

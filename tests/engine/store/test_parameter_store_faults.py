@@ -1,35 +1,53 @@
-"""A store is whole or not at all, believes no altered byte, and has one writer and any number of readers."""
+"""A store is whole or not at all, whatever disks and other programs do to it; it believes no altered byte,
+and has one writer and any number of readers."""
 
+import errno
+import json
+import multiprocessing
 import os
+import resource
+import shutil
 import signal
-import subprocess
-import sys
+import struct
 import threading
+import time
+from pathlib import Path
 
 import pytest
 
 from abcd_ns.engine.store import FolderLockedError, ParameterStore, StoreError, atomic, shard
-from abcd_ns.engine.store.manifest import FORMAT_VERSION
+from abcd_ns.engine.store.manifest import Manifest, manifest_path, read_manifest
 from tests.reference.store_helpers import FailAt, assert_block, block, names_in
 
 FAULTS = [(atomic.os, "replace", 3), (atomic.os, "fsync", 5), (shard, "save_file", 2)]
+"""What a commit of two blocks calls, and how often."""
+
+
+def assert_intact(store: ParameterStore) -> None:
+    """The first generation, whole, and nothing else in the folder."""
+    for view in (store, ParameterStore.open(store.folder, read_only=True)):
+        assert (view.generation, view.blocks, view.state) == (1, [0, 7], {"clock": 5})
+        assert_block(view, 0, 3, 1.0)
+    assert not list(store.folder.glob(".*"))
+    assert len(names_in(store.folder)) == 4
+
+
+# Disks that refuse
 
 
 @pytest.mark.parametrize(("module", "name", "calls"), FAULTS)
 def test_a_failed_commit_leaves_the_previous_generation(store, monkeypatch, module, name, calls):
-    before = names_in(store.folder)
     original = getattr(module, name)
     for n in range(1, calls + 1):
         fault = FailAt(original, n)
         monkeypatch.setattr(module, name, fault)
-        with pytest.raises(StoreError, match=r"generation 2 failed: .*injected.* holds generation 1"):
+        said = r"generation 2 failed: .*injected.* holds generation 1, intact: free space or mend the disk"
+        with pytest.raises(StoreError, match=said) as raised:
             store.commit({0: block(5, 8.0), 4: block(1, 8.0)}, state={"clock": 6})
         monkeypatch.setattr(module, name, original)
         assert fault.calls >= n
-        assert names_in(store.folder) == before
-        for view in (store, ParameterStore.open(store.folder, read_only=True)):
-            assert (view.generation, view.blocks, view.state) == (1, [0, 7], {"clock": 5})
-            assert_block(view, 0, 3, 1.0)
+        assert len(str(raised.value).splitlines()) == 1
+        assert_intact(store)
     fault = FailAt(original, calls + 1)
     monkeypatch.setattr(module, name, fault)
     assert store.commit({0: block(5, 8.0), 4: block(1, 8.0)}) == 2
@@ -53,17 +71,32 @@ def test_a_disk_that_stays_broken_leaves_one_whole_generation(store, monkeypatch
             return
 
 
+def test_a_disk_that_is_full_at_any_byte_leaves_the_previous_generation(store):
+    """RLIMIT_FSIZE makes every write beyond a size fail, in Python, in safetensors, wherever it happens."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    sizes = {path.name: path.stat().st_size for path in store.folder.iterdir()}
+    try:
+        for limit in (0, 1, 100, 300, sizes["manifest.json"] - 1, max(sizes.values()) - 1):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+            with pytest.raises(StoreError, match=r"generation 2 failed: .* holds generation 1, intact"):
+                store.commit({0: block(5, 8.0), 4: block(40, 8.0)}, state={"clock": 6})
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            assert_intact(store)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert store.commit({0: block(5, 8.0)}) == 2
+    assert_block(store, 0, 5, 8.0)
+
+
 def test_an_interrupt_is_no_commit(store, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    before = names_in(store.folder)
     with monkeypatch.context() as patch:
         patch.setattr(atomic.os, "replace", interrupt)
         with pytest.raises(KeyboardInterrupt):
             store.commit({0: block(1)})
-    assert names_in(store.folder) == before
-    assert_block(store, 0, 3, 1.0)
+    assert_intact(store)
 
 
 def test_too_little_space_is_found_before_writing(store, monkeypatch):
@@ -74,21 +107,97 @@ def test_too_little_space_is_found_before_writing(store, monkeypatch):
         store.commit({0: block(50)})
 
 
-@pytest.mark.parametrize("kind", ["shard", "manifest"])
-def test_every_flip_and_truncation_is_found(store, kind):
-    file = next(store.folder.glob("block-000000-*")) if kind == "shard" else store.folder / "manifest.json"
+def test_a_pin_that_cannot_be_written_leaves_the_others(store, monkeypatch):
+    store.pin("best")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", FailAt(None, 1, persistent=True, code=errno.ENOSPC))
+        with pytest.raises(StoreError, match=r"manifest-other\.json could not be written"):
+            store.pin("other")
+        with pytest.raises(StoreError, match=r"'best' could not be restored.*holds generation 1"):
+            store.restore("best")
+    assert store.pins == ["best"]
+    assert store.restore("best") == 2
+
+
+@pytest.mark.parametrize("step", [(shard, "safe_open"), (shard, "_checksum")], ids=["tensors", "bytes"])
+def test_a_disk_that_fails_while_reading_says_which_file(store, monkeypatch, step):
+    file = next(store.folder.glob("block-000000-*"))
+    fresh = ParameterStore.open(store.folder, read_only=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(*step, FailAt(None, 1, persistent=True))
+        with pytest.raises(StoreError, match=rf"{file.name} cannot be read: .*injected"):
+            fresh.load(0)
+    assert_block(fresh, 0, 3, 1.0)
+    monkeypatch.setattr(Path, "read_bytes", FailAt(None, 1))
+    with pytest.raises(StoreError, match=r"manifest\.json cannot be read"):
+        ParameterStore.open(store.folder, read_only=True)
+
+
+def test_a_folder_that_is_read_only_can_be_read_and_not_written(store, monkeypatch):
     store.close()
-    sound = file.read_bytes()
-    flips = [(offset, 1 << (offset % 8)) for offset in range(0, len(sound), max(1, len(sound) // 150))]
-    for offset, mask in flips:
-        file.write_bytes(sound[:offset] + bytes([sound[offset] ^ mask]) + sound[offset + 1 :])
-        with pytest.raises(StoreError, match=file.name):
-            ParameterStore.open(store.folder, read_only=True).load(0)
-    for length in (0, 1, 7, len(sound) // 2, len(sound) - 1):
+    opened = os.open
+
+    def read_only(path, flags, *rest, **options):
+        if flags & (os.O_WRONLY | os.O_RDWR):
+            raise OSError(errno.EROFS, "Read-only file system")
+        return opened(path, flags, *rest, **options)
+
+    monkeypatch.setattr(atomic.os, "open", read_only)
+    with pytest.raises(StoreError, match="is not writable: Read-only file system; open it read-only"):
+        ParameterStore.open(store.folder)
+    with pytest.raises(StoreError, match=r"No store can be made in .*: Read-only file system"):
+        ParameterStore.create(store.folder.with_name("new"), {})
+    assert_block(ParameterStore.open(store.folder, read_only=True), 0, 3, 1.0)
+
+
+def test_a_folder_that_is_deleted_under_a_run_is_an_error_and_no_crash(store):
+    shutil.rmtree(store.folder)
+    with pytest.raises(StoreError, match="is gone: deleted"):
+        store.load(0)
+    with pytest.raises(StoreError, match=r"generation 2 failed: .*No such file.*manifest"):
+        store.commit({0: block(1)})
+    with pytest.raises(StoreError, match="does not exist"):
+        ParameterStore.open(store.folder)
+
+
+def test_opening_what_is_no_store_says_so(tmp_path, store):
+    with pytest.raises(StoreError, match="does not exist"):
+        ParameterStore.open(tmp_path / "nothing")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(StoreError, match="is no parameter store"):
+        ParameterStore.open(tmp_path / "empty")
+    assert names_in(tmp_path / "empty") == set()
+    with pytest.raises(StoreError, match="no such pin"):
+        ParameterStore.open(store.folder, "lost")
+    store.close()
+    with pytest.raises(StoreError, match="already holds a store"):
+        ParameterStore.create(store.folder, {})
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="No store can be made in"):
+        ParameterStore.create(tmp_path / "file" / "store", {})
+
+
+# Files that were altered, or made to harm
+
+
+@pytest.mark.parametrize("kind", ["block-000000-*", "manifest.json", "manifest-best.json"])
+def test_every_flip_and_truncation_is_found(store, kind):
+    store.pin("best")
+    store.close()
+    (file,) = store.folder.glob(kind)
+    sound, pin = file.read_bytes(), "best" if "best" in kind else None
+    named = pin or file.name
+    for offset in range(0, len(sound), max(1, len(sound) // 150)):
+        file.write_bytes(sound[:offset] + bytes([sound[offset] ^ 1 << offset % 8]) + sound[offset + 1 :])
+        with pytest.raises(StoreError, match=named):
+            ParameterStore.open(store.folder, pin, read_only=True).load(0)
+    header = 8 + struct.unpack("<Q", sound[:8])[0] if sound[8:9] == b"{" else sound.find(b"\n") + 1
+    for length in {0, 1, 7, header, len(sound) // 2, len(sound) - 1} - {len(sound)}:
         file.write_bytes(sound[:length])
-        with pytest.raises(StoreError, match=file.name):
-            ParameterStore.open(store.folder, read_only=True)
+        with pytest.raises(StoreError, match=named):
+            ParameterStore.open(store.folder, pin, read_only=True)
     file.write_bytes(sound)
+    (store.folder / "lock").write_bytes(b"")
     assert_block(ParameterStore.open(store.folder), 0, 3, 1.0)
 
 
@@ -108,35 +217,43 @@ def test_load_of_some_tensors_checks_each_file_once(store):
     file = next(store.folder.glob("block-000000-*"))
     fresh = ParameterStore.open(store.folder, read_only=True)
     sound = file.read_bytes()
-    file.write_bytes(sound[:-1] + bytes([sound[-1] ^ 1]))
+    damaged = sound[:-1] + bytes([sound[-1] ^ 1])
+    file.write_bytes(damaged)
     with pytest.raises(StoreError, match="checksum"):
         fresh.load(0, ["means"])
     file.write_bytes(sound)
     fresh.load(0, ["means"])
-    file.write_bytes(sound[:-1] + bytes([sound[-1] ^ 1]))
+    file.write_bytes(damaged)
     fresh.load(0, ["means"])
     with pytest.raises(StoreError, match="checksum"):
         fresh.load(0)
 
 
-def test_opening_what_is_no_store_says_so(tmp_path, store):
-    with pytest.raises(StoreError, match="does not exist"):
-        ParameterStore.open(tmp_path / "nothing")
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(StoreError, match="is no parameter store"):
-        ParameterStore.open(tmp_path / "empty")
-    assert names_in(tmp_path / "empty") == set()
-    with pytest.raises(StoreError, match="no such pin"):
-        ParameterStore.open(store.folder, "lost")
+@pytest.mark.parametrize("version", [4, 6, "5", None])
+def test_older_and_newer_formats_are_named(store, version):
     store.close()
-    with pytest.raises(StoreError, match="already holds a store"):
-        ParameterStore.create(store.folder, {})
-    manifest = store.folder / "manifest.json"
-    newer = FORMAT_VERSION + 1
-    head = b'"version":%d'
-    manifest.write_bytes(manifest.read_bytes().replace(head % FORMAT_VERSION, head % newer))
-    with pytest.raises(StoreError, match=rf"format version {newer}.*version {FORMAT_VERSION}"):
+    path = manifest_path(store.folder)
+    path.write_text(json.dumps({**json.loads(path.read_bytes()), "version": version}))
+    with pytest.raises(StoreError, match=rf"format version {version}; this program reads version 5"):
         ParameterStore.open(store.folder)
+
+
+@pytest.mark.parametrize("claim", ["elements", "header"])
+def test_a_shard_that_claims_more_than_it_has_is_refused(store, claim):
+    """Its checksum is right: whoever made it wanted it to be read."""
+    path = next(store.folder.glob("block-000000-*"))
+    tensor = {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}
+    header = json.dumps({"means": tensor}).encode()
+    length = 2**40 if claim == "header" else len(header)
+    store.close()
+    path.write_bytes(struct.pack("<Q", length) + header + bytes(64))
+    old = read_manifest(manifest_path(store.folder))
+    with open(path, "rb") as file:
+        forged = shard.Shard(path.name, 1, path.stat().st_size, shard._checksum(file), 3, {})
+    new = Manifest(old.generation, old.header, old.state, {**old.blocks, 0: forged})
+    manifest_path(store.folder).write_bytes(new.to_bytes())
+    with pytest.raises(StoreError, match=f"{path.name} cannot be read"):
+        ParameterStore.open(store.folder, read_only=True).load(0)
 
 
 # Writers and readers
@@ -153,39 +270,40 @@ def test_leftovers_of_a_killed_writer_are_removed(store):
     assert names_in(store.folder) == before
 
 
-HOLDER = """
-import os, pathlib, runpy, sys, time
-lock = runpy.run_path(sys.argv[1])["FolderLock"](pathlib.Path(sys.argv[2]))
-worker = os.fork()  # shares the open lock file, as a data loader's worker does
-if worker:
-    print(worker, flush=True)
-time.sleep(60)
-"""
+def hold_locked(folder: Path, writes: int) -> None:
+    """The body of a process that holds the lock, and has a worker, whose number it writes."""
+    try:
+        lock = atomic.FolderLock(folder)
+        worker = os.fork()  # shares the open lock file, as a data loader's worker does
+        if worker:
+            os.write(writes, str(worker).encode())
+        time.sleep(60)
+        del lock
+    finally:
+        os._exit(1)
 
 
 def test_a_second_writer_is_refused_until_the_first_is_killed(store):
     with pytest.raises(FolderLockedError, match=f"process {os.getpid()}"):
         ParameterStore.open(store.folder)
     store.close()
-    # atomic.py alone: importing the package would take seconds.
-    command = [sys.executable, "-c", HOLDER, atomic.__file__, str(store.folder)]
-    holder = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    worker = None
+    reads, writes = os.pipe()
+    holder = os.fork()
+    if holder == 0:
+        hold_locked(store.folder, writes)
+    os.close(writes)
+    worker = int(os.read(reads, 20))
+    os.close(reads)
     try:
-        worker = int(holder.stdout.readline())
-        with pytest.raises(FolderLockedError, match=f"{store.folder}.*process {holder.pid}"):
+        with pytest.raises(FolderLockedError, match=f"{store.folder}.*process {holder}"):
             ParameterStore.open(store.folder)
         assert_block(ParameterStore.open(store.folder, read_only=True), 0, 3, 1.0)
-        holder.kill()
-        holder.wait()
+        os.kill(holder, signal.SIGKILL)
+        os.waitpid(holder, 0)
         with ParameterStore.open(store.folder) as again:  # though the worker lives on
             again.commit({0: block(1, 1.0)})
     finally:
-        holder.kill()
-        holder.wait()
-        holder.stdout.close()
-        if worker is not None:
-            os.kill(worker, signal.SIGKILL)
+        os.kill(worker, signal.SIGKILL)
 
 
 def test_a_reader_of_a_replaced_generation_is_told(store):
@@ -197,7 +315,7 @@ def test_a_reader_of_a_replaced_generation_is_told(store):
 
 
 def test_threads_read_old_or_new_but_never_a_mixture(store):
-    store.commit({0: block(20, 1.0)}, state={"value": 1, "again": 1})
+    store.commit({0: block(20, 1.0)})
     problems, done = [], threading.Event()
 
     def read():
@@ -206,18 +324,49 @@ def test_threads_read_old_or_new_but_never_a_mixture(store):
             if not (tensors["features_rest"] == meta["value"]).all():
                 problems.append(meta)
 
-    def reopen():
-        while not done.is_set():
-            view = ParameterStore.open(store.folder, read_only=True)
-            if view.state["value"] != view.state["again"]:
-                problems.append(view.state)
-
-    threads = [threading.Thread(target=work) for work in (read, reopen)]
-    for thread in threads:
-        thread.start()
+    thread = threading.Thread(target=read)
+    thread.start()
     for value in range(2, 40):
-        store.commit({0: block(20, float(value))}, state={"value": value, "again": value})
+        store.commit({0: block(20, float(value))})
     done.set()
-    for thread in threads:
-        thread.join()
+    thread.join()
     assert not problems
+
+
+def test_another_process_reads_hundreds_of_commits_old_or_new_and_never_mixed(store, monkeypatch):
+    """Whether a file is synced matters to no reader, and syncing takes long."""
+    monkeypatch.setattr(atomic.os, "fsync", lambda _: None)
+    store.commit({0: block(20, 0.0), 7: block(9, 0.0)}, state={"value": 0.0})
+    context = multiprocessing.get_context("fork")
+    stop, seen = context.Event(), context.Queue()
+    reader = context.Process(target=read_until, args=(store.folder, stop, seen))
+    reader.start()
+    assert seen.get(timeout=60) == "ready"
+    for value in range(1, 301):
+        fresh = {0: block(20, float(value)), 7: block(9, float(value))}
+        store.commit(fresh, state={"value": float(value)})
+    stop.set()
+    generations, mixed = seen.get(timeout=60)
+    reader.join()
+    assert mixed == []
+    assert len(generations) > 1
+    assert generations == sorted(generations)
+
+
+def read_until(folder: Path, stop, seen) -> None:
+    """Open the store again and again; a generation that is replaced while it is read says so."""
+    generations, mixed = [], []
+    seen.put("ready")
+    while not stop.is_set():
+        view = ParameterStore.open(folder, read_only=True)
+        try:
+            found = [float(view.load(number)[1]["value"]) for number in (0, 7)]
+        except StoreError as error:
+            if "newer generation" not in str(error):
+                mixed.append(str(error))
+            continue
+        if found != [view.state["value"]] * 2:
+            mixed.append(f"{found} in a generation of {view.state['value']}")
+        if view.generation not in generations[-1:]:
+            generations.append(view.generation)
+    seen.put((generations, mixed))

@@ -7,17 +7,16 @@ import pytest
 import torch
 
 from abcd_ns.engine.events import VisitBegan, VisitEnded
-from abcd_ns.engine.gaussians.initialize import split_off
+from abcd_ns.engine.gaussians.block_state import Clocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.scaffold import BEGINS, REVEALED_OPACITY, blocks_at_rest
 from abcd_ns.engine.store.special_blocks import RESERVE, in_order
-from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
+from abcd_ns.engine.train.density.control import DensityControl
 from abcd_ns.engine.train.training_loop import train, train_step
-from abcd_ns.engine.types import Gaussians
-from tests.reference.scenes import listen, make_coordinator, whole_scene
+from tests.reference import scenes
+from tests.reference.scenes import STILL, assert_resumes, listen, whole_scene
 
-STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0, price=0.0)
+GROWING = replace(scenes.GROWING, price=0.0)
 LONG = {"blocks": 4, "steps": 60, "warmup": 0.5}
 """Enough for growth."""
 
@@ -28,31 +27,14 @@ def warm_up_is_not_prolonged(monkeypatch):
     monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 1)
 
 
-def rows(gaussians: Gaussians) -> set[tuple[float, ...]]:
-    return {tuple(row) for row in gaussians.quats.tolist()}
-
-
-def test_scaffold_and_reserve_are_all_there_is(start):
-    scaffold, waiting = split_off(start, 30, seed=3)
-    assert len(scaffold) == 30
-    assert rows(scaffold) | rows(waiting) == rows(start)
-    assert not rows(scaffold) & rows(waiting)
-    originals = {tuple(q): s for q, s in zip(start.quats.tolist(), start.scales, strict=True)}
-    for quat, scales in zip(scaffold.quats.tolist(), scaffold.scales, strict=True):
-        assert bool((scales >= originals[tuple(quat)]).all())
-    assert float(scaffold.scales.mean()) > float(start.scales.mean()) + 0.2
-
-
 def test_without_a_scaffold_nothing_waits(start):
     tree = build_kd(start.means, 4)
     assert sorted(blocks_at_rest(tree, start)) == [0, 1, 2, 3]
     assert in_order(blocks_at_rest(tree, start, room=30)) == [0, 1, 2, 3, RESERVE]
 
 
-def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(tmp_path, views, photos, start):
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=4, steps=40, scaffold=1000, warmup=0.25, density=STILL
-    )
+def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(make, photos, start):
+    coordinator = make(blocks=4, steps=40, scaffold=1000, warmup=0.25, density=STILL)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
     assert len(coordinator.params["means"]) == len(start)
@@ -64,25 +46,19 @@ def test_where_all_fit_all_are_the_scaffold_and_nobody_waits(tmp_path, views, ph
     assert coordinator.finished
 
 
-def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=4, steps=40, scaffold=30)
+def test_the_whole_scaffold_is_live_and_nothing_else_is_seen(make, views, photos):
+    coordinator = make(blocks=4, steps=40, scaffold=30)
     train(coordinator, photos, steps=3)
     assert coordinator.state.active.is_whole
-    assert (
-        len(coordinator.params["means"])
-        == coordinator.count()
-        == len(whole_scene(coordinator))
-        == math.ceil(BEGINS * 30)
-    )
+    begins = math.ceil(BEGINS * 30)
+    assert len(coordinator.params["means"]) == coordinator.count() == len(whole_scene(coordinator)) == begins
     batch = coordinator.next_batch()
     assert [sample.crop for sample in batch.samples] == [views[0].full]
     assert all(sample.layers is None for sample in batch.samples)
 
 
-def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, start):
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL
-    )
+def test_when_it_ends_everyone_is_in_their_block_once(make, photos):
+    coordinator = make(blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL)
     begun = listen(coordinator, VisitBegan)
     train(coordinator, photos, steps=10)
     assert coordinator.state.active is None
@@ -91,24 +67,20 @@ def test_when_it_ends_everyone_is_in_their_block_once(tmp_path, views, photos, s
     for block in range(4):
         state = scene.state(block)
         assert bool((scene.tree.assign(state.gaussians.means) == block).all())
-        waits = state.waits
         trained = (state.exp_avg.opacities[:, 0] != 0) | (state.exp_avg_sq.means.sum(dim=1) != 0)
-        assert bool(waits.any())
-        assert not bool((waits & trained).any())
-        assert state.clocks.adam_views == 10
-        assert state.clocks.visits == 0
-        assert state.clocks.steps == 10
+        assert bool(state.waits.any())
+        assert not bool((state.waits & trained).any())
+        assert state.clocks == Clocks(steps=10, adam_views=10)
     assert coordinator.count() == 120
-    train(coordinator, photos)
-    assert [event.block for event in begun][:2] != [None, None]
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        assert len(coordinator.params["means"]) <= 32  # a block, and a migrant or two
     assert begun[0].block is None
     assert {event.block for event in begun[1:]} == {0, 1, 2, 3}
 
 
-def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, views, photos, start):
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL, heal=False
-    )
+def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(make, photos):
+    coordinator = make(blocks=4, steps=40, scaffold=30, warmup=0.25, density=STILL, heal=False)
     scene, visited = coordinator.scene, set()
     train(coordinator, photos, steps=10)
     assert len(whole_scene(coordinator)) == math.ceil(BEGINS * 30)
@@ -132,41 +104,14 @@ def test_who_waits_is_seen_when_their_block_is_visited_and_not_before(tmp_path, 
     assert torch.equal(scene.everything("cpu").means, whole_scene(coordinator).means)
 
 
-@pytest.mark.parametrize("stop", [4, 10, 13])
-def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(tmp_path, views, photos, start, stop):
-    """Bit for bit: within the warm-up, at its end, and after it (invariant 7)."""
-    runs = {}
-    for name in ("whole", "stopped"):
-        (tmp_path / name).mkdir()
-        runs[name] = make_coordinator(
-            tmp_path / name, start, views, blocks=4, steps=24, scaffold=30, warmup=0.4
-        )
-    train(runs["whole"], photos)
-    train(runs["stopped"], photos, steps=stop)
-    runs["stopped"].save()
-    runs["stopped"].scene.store.close()
-    again = make_coordinator(tmp_path / "stopped", start, views, steps=24, warmup=0.4, resume=True)
-    train(again, photos)
-    found, expected = whole_scene(again), whole_scene(runs["whole"])
-    assert all(torch.equal(value, getattr(found, name)) for name, value in expected.items())
+def test_a_run_that_stops_and_goes_on_is_the_run_that_did_not(make, photos):
+    """Within the warm-up, at its end, and after it."""
+    assert_resumes(make, photos, 4, 10, 13, blocks=4, steps=24, scaffold=30, warmup=0.4)
 
 
-def test_no_more_is_live_than_in_the_largest_block(tmp_path, views, photos, start):
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=4, steps=40, scaffold=30, density=STILL, warmup=0.25
-    )
-    most = 0
-    while not coordinator.finished:
-        train_step(coordinator, photos)
-        most = max(most, len(coordinator.params["means"]))
-    assert most <= 32  # a migrant or two
-
-
-def test_density_controls_clock_is_the_runs(tmp_path, views, photos, start, monkeypatch):
+def test_density_controls_clock_is_the_runs(make, photos, monkeypatch):
     """It does not start anew when the warm-up is over, which grows as well."""
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=4, steps=40, scaffold=30, warmup=0.5, density=STILL
-    )
+    coordinator = make(blocks=4, steps=40, scaffold=30, warmup=0.5, density=STILL)
     found = []
 
     def watch(_control, _params, _optimizers, growth, _infos, _judged, clock):
@@ -179,10 +124,9 @@ def test_density_controls_clock_is_the_runs(tmp_path, views, photos, start, monk
 
 
 @pytest.mark.parametrize("most", [0, 125, 400])
-def test_the_scaffold_grows_while_there_is_room_for_it(tmp_path, views, photos, start, most):
+def test_the_scaffold_grows_while_there_is_room_for_it(make, photos, start, most):
     """As a scene of one block does; what it has grown by, and its clocks, are in the blocks."""
-    options = {**LONG, "scaffold": len(start), "scaffold_gaussians": most, "density": GROWING}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
+    coordinator = make(**LONG, scaffold=len(start), scaffold_gaussians=most, density=GROWING)
     train(coordinator, photos, steps=29)
     live = len(coordinator.params["means"])
     assert live == coordinator.count()
@@ -193,47 +137,34 @@ def test_the_scaffold_grows_while_there_is_room_for_it(tmp_path, views, photos, 
     assert coordinator.scene.clocks(0).refined > 0
 
 
-def test_a_limit_on_gaussians_counts_those_that_wait(tmp_path, views, photos, start):
+def test_a_limit_on_gaussians_counts_those_that_wait(make, photos, start):
     density = replace(GROWING, max_gaussians=len(start))
-    options = {**LONG, "scaffold": 60, "scaffold_gaussians": 100, "density": density}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
+    coordinator = make(**LONG, scaffold=60, scaffold_gaussians=100, density=density)
     train(coordinator, photos, steps=29)
     assert len(coordinator.params["means"]) <= 60
 
 
-@pytest.mark.parametrize(("passes", "expected"), [(1, 5), (2, 10), (24, 25)])
+@pytest.mark.parametrize(
+    ("scaffold", "warmup", "longer", "passes", "expected"),
+    [
+        (30, 0.5, 1, 1, 5),
+        (30, 0.5, 1, 2, 10),
+        (30, 0.5, 1, 24, 25),
+        (120, 0.2, 2, 1, 10),
+        (120, 0.2, 2, 3, 15),
+        (120, 0.2, 2, 24, 20),
+    ],
+)
 def test_the_warm_up_ends_when_each_view_was_used_often_enough(
-    tmp_path, views, photos, start, monkeypatch, passes, expected
+    make, photos, monkeypatch, scaffold, warmup, longer, passes, expected
 ):
-    """Where it has no room for all: then, and not only when its share of the run is over."""
+    """Where it has no room for all: then, and not only when its share of the run is over. Where it has, after
+    twice its share at most, and not before its share is over."""
     monkeypatch.setattr("abcd_ns.engine.train.schedule.SCAFFOLD_PASSES", passes)
-    coordinator = make_coordinator(
-        tmp_path,
-        start,
-        views,
-        blocks=4,
-        steps=10 * len(views),
-        scaffold=30,
-        warmup=0.5,
-        density=STILL,
-    )
+    monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", longer)
+    coordinator = make(blocks=4, steps=50, scaffold=scaffold, warmup=warmup, density=STILL)
     ended = listen(coordinator, VisitEnded)
     while not ended:
         train_step(coordinator, photos)
     assert coordinator.state.step == expected
     assert not coordinator.state.active
-
-
-@pytest.mark.parametrize(("passes", "expected"), [(1, 10), (3, 15), (24, 20)])
-def test_the_warm_up_goes_on_for_twice_its_share_until_each_view_was_used_often_enough(
-    tmp_path, views, photos, start, monkeypatch, passes, expected
-):
-    """Where it has room for all, views are few in relation to the run, or the run is short."""
-    monkeypatch.setattr("abcd_ns.engine.train.schedule.SCAFFOLD_PASSES", passes)
-    monkeypatch.setattr("abcd_ns.engine.train.schedule.LONGER", 2)
-    options = {"blocks": 4, "steps": 50, "scaffold": len(start), "warmup": 0.2, "density": STILL}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
-    ended = listen(coordinator, VisitEnded)
-    while not ended:
-        train_step(coordinator, photos)
-    assert coordinator.state.step == expected

@@ -8,20 +8,18 @@ import torch
 
 from abcd_ns.engine.events import Mended, VisitBegan
 from abcd_ns.engine.gaussians.param_swap import attach
-from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.health import health_rules
 from abcd_ns.engine.train.health.health import Health
 from abcd_ns.engine.train.health.health_rules import stand_ins, unsound
 from abcd_ns.engine.train.health_record import BlockHealth, standing, summary
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room, live_bytes
-from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians
-from tests.reference.scenes import equal, listen, make_coordinator, random_gaussians, whole_scene
+from tests.reference import scenes
+from tests.reference.scenes import STILL, equal, listen, random_gaussians, stop, whole_scene
 
-STILL = DensityConfig(strategy="off")
-GROWING = DensityConfig(refine_start=0.0, refine_every=5, split_pixels=0.0, price=0.0)
+GROWING = replace(scenes.GROWING, price=0.0)
 
 
 def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
@@ -37,15 +35,12 @@ def spoil_gradients(coordinator, name: str, row: int, value: float) -> None:
     optimizer._optimizer_step_pre_hooks.move_to_end(handle.id, last=False)
 
 
-def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, start, monkeypatch):
+def test_a_healthy_run_is_the_same_with_and_without(make, photos, monkeypatch):
     results = []
     for watched in (True, False):
         if not watched:
             monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
-        folder = tmp_path / str(watched)
-        folder.mkdir()
-        options = {"blocks": 2, "steps": 18, "density": GROWING, "scaffold": 120}
-        coordinator = make_coordinator(folder, start, views, heal=watched, **options)
+        coordinator = make(str(watched), heal=watched, blocks=2, steps=18, density=GROWING, scaffold=120)
         told = listen(coordinator, Mended)
         train(coordinator, photos)
         results.append(whole_scene(coordinator))
@@ -54,10 +49,8 @@ def test_a_healthy_run_is_the_same_with_and_without(tmp_path, views, photos, sta
 
 
 @pytest.mark.parametrize(("value", "blocks"), [(math.nan, 3), (math.nan, 1), (math.inf, 1), (1e30, 1)])
-def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(
-    tmp_path, views, photos, start, value, blocks
-):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=12, density=GROWING)
+def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(make, photos, value, blocks):
+    coordinator = make(blocks=blocks, steps=12, density=GROWING)
     told = listen(coordinator, Mended)
     spoil_gradients(coordinator, "scales", 2, value)
     train(coordinator, photos)
@@ -69,25 +62,22 @@ def test_gradients_that_are_no_numbers_are_set_to_zero_and_counted(
         assert all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values())
 
 
-def test_without_the_watch_they_would_spread(tmp_path, views, photos, start, monkeypatch):
-    monkeypatch.setattr(Health, "_clean_gradients", lambda *_: None)
-    monkeypatch.setattr(Health, "_mend", lambda *_: None)
-    coordinator = make_coordinator(tmp_path, start, views, blocks=1, steps=3, density=STILL)
-    spoil_gradients(coordinator, "scales", 2, math.nan)
-    train(coordinator, photos)
-    assert bool(unsound(whole_scene(coordinator)).any())
-
-
-def test_a_value_that_is_no_number_is_put_back_as_it_was_at_rest(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30, density=STILL)
+def test_a_value_that_is_no_number_is_put_back_and_a_moment_set_to_zero(make, photos):
+    coordinator = make(blocks=2, steps=30, density=STILL)
     train_step(coordinator, photos)
     block = coordinator.state.active.geometry.block
     before, told = coordinator.scene.gaussians_at_rest(block), listen(coordinator, Mended)
     with torch.no_grad():
         coordinator.params["means"][4, 1] = math.nan
         coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"][4] = 7.0
+    squares = coordinator.optimizers["quats"].state[coordinator.params["quats"]]["exp_avg_sq"]
+    kept = squares[1].clone()
+    squares[0] = math.inf
     coordinator.save()
-    assert [(event.what, event.count, event.block) for event in told] == [("values", 1, block)]
+    mended = sorted((event.what, event.count, event.block) for event in told)
+    assert mended == [("moments", 1, block), ("values", 1, block)]
+    assert bool((squares[0] == 0).all())
+    assert torch.equal(squares[1], kept)
     live = coordinator.scene.gaussians(block)
     assert all(torch.equal(value[4], getattr(before, name)[4]) for name, value in live.items())
     moments = coordinator.optimizers["means"].state[coordinator.params["means"]]["exp_avg"]
@@ -95,8 +85,8 @@ def test_a_value_that_is_no_number_is_put_back_as_it_was_at_rest(tmp_path, views
     assert bool((moments[5] != 0).any())
 
 
-def test_where_rows_have_changed_a_transparent_one_takes_its_place(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, density=GROWING)
+def test_where_rows_have_changed_a_transparent_one_takes_its_place(make, photos):
+    coordinator = make(blocks=2, steps=200, density=GROWING)
     attached = listen(coordinator, VisitBegan)
     while not attached or len(coordinator.params["means"]) == attached[-1].gaussians:
         train_step(coordinator, photos)
@@ -107,22 +97,9 @@ def test_where_rows_have_changed_a_transparent_one_takes_its_place(tmp_path, vie
     assert float(torch.sigmoid(coordinator.params["opacities"].detach()[0])) < 1 / 255
 
 
-def test_moments_that_are_no_numbers_are_set_to_zero(tmp_path, views, photos, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=30, density=STILL)
-    train_step(coordinator, photos)
-    told = listen(coordinator, Mended)
-    adam = coordinator.optimizers["quats"].state[coordinator.params["quats"]]
-    kept = adam["exp_avg_sq"][1].clone()
-    adam["exp_avg_sq"][0] = math.inf
-    coordinator.save()
-    assert [(event.what, event.count) for event in told] == [("moments", 1)]
-    assert bool((adam["exp_avg_sq"][0] == 0).all())
-    assert torch.equal(adam["exp_avg_sq"][1], kept)
-
-
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, photos, start, blocks):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=30)
+def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(make, views, photos, blocks):
+    coordinator = make(blocks=blocks, steps=30)
     train_step(coordinator, photos)
     means, scales = coordinator.params["means"].detach(), coordinator.params["scales"].detach()
     with torch.no_grad():
@@ -139,28 +116,18 @@ def test_giants_shrink_to_what_the_nearest_camera_sees_of_them(tmp_path, views, 
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_giants_are_held_back_in_visits_that_refine_nothing(tmp_path, views, photos, start, blocks):
+def test_giants_shrink_before_their_block_is_trained_and_never_after(make, views, photos, start, blocks):
+    """A wall of one colour may be one oversized Gaussian: pictures without it were never seen."""
     start.scales[0] = 5.0
-    options = {"steps": 20, "warmup": 0.0, "density": DensityConfig(strategy="off")}
-    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, **options)
+    coordinator = make(blocks=blocks, steps=20, warmup=0.0, density=STILL)
     told = listen(coordinator, Mended)
-    train(coordinator, photos)
+    train(coordinator, photos, steps=19)
     assert {event.what for event in told} == {"giants"}
     scene = whole_scene(coordinator)
     nearest = torch.cdist(scene.means, torch.stack([view.center for view in views])).amin(dim=1)
-    assert (
-        float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.GIANT_ANGLE
-    )  # of e^5
-
-
-@pytest.mark.parametrize("blocks", [1, 2])
-def test_nothing_shrinks_after_the_last_step(tmp_path, views, photos, start, blocks):
-    """A wall of one colour may be one oversized Gaussian: pictures without it were never seen."""
-    options = {"steps": 20, "warmup": 0.0, "density": DensityConfig(strategy="off")}
-    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, **options)
-    train(coordinator, photos, steps=19)
+    assert float((scene.scales.amax(dim=1).exp() / nearest).max()) <= 1.25 * health_rules.GIANT_ANGLE
     with torch.no_grad():
-        coordinator.params["scales"][0] = 5.0
+        coordinator.params["scales"][1] = 5.0
     train(coordinator, photos)
     assert float(whole_scene(coordinator).scales.max()) == pytest.approx(5.0, abs=0.1)
 
@@ -177,12 +144,6 @@ def test_every_parameter_is_looked_at(name):
     gaussians = random_gaussians(5)
     getattr(gaussians, name)[3].view(-1)[-1] = math.nan
     assert unsound(gaussians).tolist() == [False, False, False, True, False]
-
-
-def test_the_record_survives_json():
-    state = RunState(health={WHOLE: BlockHealth(gradients=3), 4: BlockHealth(visits=2, hidden=True)})
-    again = RunState.from_json(state.to_json())
-    assert again.health == state.health
 
 
 def test_how_blocks_stand_is_said_in_words():
@@ -210,23 +171,19 @@ def test_how_blocks_stand_is_said_in_words():
     ]
 
 
-def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(
-    tmp_path, views, photos, start, monkeypatch
-):
+def test_a_block_that_cannot_fit_is_refused_before_memory_is_taken(make, photos, monkeypatch):
     with pytest.raises(OutOfRoomError, match=r"1,000,000,000,000 Gaussians .*max-gaussians"):
         check_room(10**12, 3, torch.device("cpu"))
     check_room(1000, 3, torch.device("cpu"))
     monkeypatch.setattr("abcd_ns.engine.train.memory.free_bytes", lambda _: live_bytes(30, 1))
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=10)
+    coordinator = make(blocks=2, steps=10)
     with pytest.raises(OutOfRoomError, match="A block of 60 Gaussians"):
         train_step(coordinator, photos)
 
 
 @pytest.mark.parametrize(("seen", "expected"), [(3, 3), (3000, 40)])
-def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
-    tmp_path, views, photos, start, seen, expected
-):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=2, steps=200, visit_steps=10)
+def test_blocks_are_refined_once_a_visit_however_many_views_there_are(make, photos, seen, expected):
+    coordinator = make(blocks=2, steps=200, visit_steps=10)
     train_step(coordinator, photos)
     coordinator.state.active.showing = tuple(range(seen))
     clock = coordinator.visit.live.density_clock(4, coordinator.batch, None)
@@ -239,11 +196,11 @@ def test_blocks_are_refined_once_a_visit_however_many_views_there_are(
 
 @pytest.mark.parametrize("blocks", [1, 3])
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_a_block_that_is_emptied_in_its_visit_ends_it(tmp_path, views, photos, start, blocks, strategy):
+def test_a_block_that_is_emptied_in_its_visit_ends_it(make, photos, blocks, strategy):
     """All its Gaussians may be pruned; the run goes on, and can be resumed."""
     density = DensityConfig(strategy, refine_start=0.0)
     options = {"blocks": blocks, "steps": 30, "density": density}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
+    coordinator = make(**options)
     train(coordinator, photos, steps=2)
     nobody = coordinator.visit.live.detached()[:0]
     attach(nobody, coordinator.params, coordinator.optimizers, batch=coordinator.batch)
@@ -253,17 +210,16 @@ def test_a_block_that_is_emptied_in_its_visit_ends_it(tmp_path, views, photos, s
     assert coordinator.loss(batch, coordinator.render(batch).pictures, wanted).requires_grad
     train(coordinator, photos, steps=2)
     assert coordinator.state.active is not None
-    coordinator.save()
-    coordinator.scene.store.close()
-    resumed = make_coordinator(tmp_path, start, views, resume=True, **options)
+    stop(coordinator)
+    resumed = make(resume=True, **options)
     left = resumed.state.active.steps - resumed.state.active.done
     train(resumed, photos, steps=left)
     assert resumed.state.active is None
     assert resumed.count() == coordinator.count()
 
 
-def test_a_visit_that_time_ran_out_on_says_nothing_of_whether_the_block_is_hidden(tmp_path, views, start):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=3, warmup=0.0)
+def test_a_visit_that_time_ran_out_on_says_nothing_of_whether_the_block_is_hidden(make):
+    coordinator = make(blocks=3, warmup=0.0)
     coordinator.next_batch()
     block = coordinator.state.active.geometry.block
     coordinator.end_visit()

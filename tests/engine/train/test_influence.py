@@ -7,23 +7,32 @@ from abcd_ns.engine.events import VisitBegan, VisitEnded
 from abcd_ns.engine.render import Shot
 from abcd_ns.engine.space.influence import influence, weights
 from abcd_ns.engine.train.density.control import DensityConfig
-from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.training_loop import train
-from abcd_ns.engine.types import Gaussians
-from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
+from tests.reference.scenes import STILL, make_coordinator, random_gaussians, ring_of_views, whole_scene
+
+PRICED = DensityConfig(price=1.0, refine_every=1000)
 
 
-def grown(tmp_path, start, views, **options):
-    density = DensityConfig(strategy="off")
-    return make_coordinator(
-        tmp_path,
-        start,
-        views,
-        blocks=4,
-        steps=60,
-        warmup=0.2,
-        **{"density": density, "scaffold": 40, **options},
-    )
+@pytest.fixture
+def begin(make):
+    """Makes runs with a warm-up of 12 steps."""
+
+    def begun(**options):
+        return make(**{"blocks": 4, "steps": 60, "warmup": 0.2, "density": STILL, "scaffold": 40, **options})
+
+    return begun
+
+
+@pytest.fixture
+def grown(begin, photos):
+    """Makes them, and trains the warm-up."""
+
+    def made(**options):
+        coordinator = begin(**options)
+        train(coordinator, photos, steps=12)
+        return coordinator
+
+    return made
 
 
 def asked_of(coordinator, monkeypatch, blind=()):
@@ -32,18 +41,16 @@ def asked_of(coordinator, monkeypatch, blind=()):
     nowhere = torch.tensor([torch.inf, torch.inf, -torch.inf, -torch.inf])
 
     def watched(gaussians, views):
-        asked.append(list(views))
-        found = extents(gaussians, views)
-        return torch.stack(
-            [nowhere if v.index in blind else row for v, row in zip(views, found, strict=True)]
-        )
+        asked.append([view.index for view in views])
+        found = zip(views, extents(gaussians, views), strict=True)
+        return torch.stack([nowhere if view.index in blind else row for view, row in found])
 
     monkeypatch.setattr(coordinator.run.rasterizer, "extents", watched)
     return asked
 
 
-def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(tmp_path, views, photos, start):
-    coordinator = grown(tmp_path, start, views, influence_share=0.6)
+def visits_of(coordinator) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
+    """(block, views, those that are looked at because they are doubtful), which grows as visits begin."""
     seen = []
 
     def note(event):
@@ -51,25 +58,36 @@ def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(tmp_p
             seen.append((event.block, coordinator.state.active.views, coordinator.state.active.looked_at))
 
     coordinator.announce.subscribe(note)
-    train(coordinator, photos, steps=12)
-    known = coordinator.state.influence
+    return seen
+
+
+def test_views_that_hardly_show_a_block_are_left_out_but_looked_at_in_turn(grown, photos):
+    coordinator = grown(influence_share=0.6)
+    seen, known = visits_of(coordinator), coordinator.state.influence
     assert sorted(known) == [0, 1, 2, 3]
     assert all(0 < sum(row[view] for row in known.values()) <= 1 + 1e-5 for view in range(5))
     train(coordinator, photos)
     assert any(len(used) < 5 for _, used, _ in seen)
     assert all(len(looked_at) <= 1 and set(looked_at) <= set(used) for _, used, looked_at in seen)
-    for block in range(4):
-        visits = [set(looked_at) for b, _, looked_at in seen if b == block]
-        assert set.union(*visits), "a doubtful view of every block is looked at sooner or later"
+    assert {block for block, _, looked_at in seen if looked_at} == {0, 1, 2, 3}
 
 
-def test_with_a_share_of_one_every_view_counts(tmp_path, views, photos, start):
-    coordinator = grown(tmp_path, start, views, influence_share=1.0)
+def test_with_a_share_of_one_every_view_counts(grown, photos):
+    coordinator = grown(influence_share=1.0)
     train(coordinator, photos)
     assert all(count == 5 for count in coordinator.state.views.values())
 
 
-def test_the_warm_up_draws_no_view_again_that_it_has_used(tmp_path, views, photos, start, monkeypatch):
+def assert_known_is_what_shows(coordinator, views, rel: float) -> None:
+    """Each view's influence, of all blocks together."""
+    whole, known = whole_scene(coordinator), coordinator.state.influence.values()
+    for view in views:
+        seen = float(weights(whole, coordinator.run.rasterizer, [Shot(view, view.full)]).sum())
+        told = sum(row.get(view.index, 0.0) for row in known)
+        assert told == pytest.approx(seen / view.full.pixels, rel=rel)
+
+
+def test_the_warm_up_draws_no_view_again_that_it_has_used(begin, views, photos, start, monkeypatch):
     drawn = []
 
     def watched(gaussians, owner, others, *rest, **options):
@@ -77,41 +95,26 @@ def test_the_warm_up_draws_no_view_again_that_it_has_used(tmp_path, views, photo
         return influence(gaussians, owner, others, *rest, **options)
 
     monkeypatch.setattr("abcd_ns.engine.train.coordinator.influence", watched)
-    density = DensityConfig(price=1.0, refine_every=1000)
-    coordinator = grown(tmp_path, start, views, density=density, scaffold=len(start))
+    coordinator = begin(density=PRICED, scaffold=len(start))
     train(coordinator, photos, steps=4)
     coordinator.save()
     coordinator.restore()
-    noted = coordinator.visit.influence.found()
-    assert len(noted[1]) == 1
+    assert len(coordinator.visit.influence.found()[1]) == 1
     while coordinator.state.visit == 1:
-        train(coordinator, photos, steps=coordinator.state.step + 1)
+        train(coordinator, photos, steps=1)
     assert not drawn
-    known = coordinator.state.influence
-    whole = Gaussians.cat([coordinator.scene.gaussians(block) for block in range(4)])
-    for view in views:
-        seen = float(weights(whole, coordinator.run.rasterizer, [Shot(view, view.full)]).sum())
-        assert sum(row[view.index] for row in known.values()) == pytest.approx(
-            seen / view.full.pixels, rel=0.1
-        )
+    assert_known_is_what_shows(coordinator, views, rel=0.1)
 
 
-def test_what_is_drawn_in_part_is_drawn_again_to_know_its_influence(tmp_path, views, photos, start):
-    density = DensityConfig(price=1.0, refine_every=1000)
-    coordinator = grown(tmp_path, start, views, density=density, crop_pixels=views[0].full.pixels // 4)
+def test_what_is_drawn_in_part_is_drawn_again_to_know_its_influence(begin, views, photos):
+    coordinator = begin(density=PRICED, crop_pixels=views[0].full.pixels // 4)
     while coordinator.state.visit < 2:
-        train(coordinator, photos, steps=coordinator.state.step + 1)
-    known = coordinator.state.influence
-    whole = Gaussians.cat([coordinator.scene.gaussians(block) for block in range(4)])
-    for view in views:
-        seen = float(weights(whole, coordinator.run.rasterizer, [Shot(view, view.full)]).sum())
-        told = sum(row.get(view.index, 0.0) for row in known.values())
-        assert told == pytest.approx(seen / view.full.pixels, rel=0.15)
+        train(coordinator, photos, steps=1)
+    assert_known_is_what_shows(coordinator, views, rel=0.15)
 
 
-def test_a_block_looks_at_a_doubtful_view_that_sees_it(tmp_path, views, photos, start, monkeypatch):
-    coordinator = grown(tmp_path, start, views)
-    train(coordinator, photos, steps=12)
+def test_a_block_looks_at_a_doubtful_view_that_sees_it(grown, monkeypatch):
+    coordinator = grown()
     asked_of(coordinator, monkeypatch, blind=(1, 2, 4))
     coordinator.state.influence = {block: {0: 0.1} for block in range(4)}
     active = coordinator.visits.begin()
@@ -119,34 +122,17 @@ def test_a_block_looks_at_a_doubtful_view_that_sees_it(tmp_path, views, photos, 
     assert active.looked_at == (3,)
 
 
-def test_influence_survives_a_save(tmp_path, views, photos, start):
-    coordinator = grown(tmp_path, start, views, influence_share=0.6)
-    train(coordinator, photos, steps=12)
-    coordinator.next_batch()
-    assert coordinator.state.influence
-    again = RunState.from_json(coordinator.state.to_json())
-    assert again.influence == coordinator.state.influence
-    assert again.active.looked_at == coordinator.state.active.looked_at
-
-
-def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(tmp_path, views, photos, start):
-    coordinator = grown(tmp_path, start, views)
-    train(coordinator, photos, steps=12)
+def test_a_block_that_no_view_is_known_to_show_is_trained_on_all_that_see_it(grown, photos):
+    coordinator = grown()
     coordinator.state.influence = {0: {}, 1: {99: 0.5}}
-    visited = {}
-
-    def note(event):
-        if isinstance(event, VisitBegan):
-            visited.setdefault(event.block, coordinator.state.active.views)
-
-    coordinator.announce.subscribe(note)
+    seen = visits_of(coordinator)
     train(coordinator, photos)
-    assert sorted(visited) == [0, 1, 2, 3]
-    assert all(sorted(used) == [0, 1, 2, 3, 4] for used in visited.values())
+    first = {block: sorted(views) for block, views, _ in reversed(seen)}
+    assert first == {block: [0, 1, 2, 3, 4] for block in range(4)}
 
 
-def test_when_the_warm_up_is_over_nothing_of_it_stays_live(tmp_path, views, photos, start):
-    coordinator, seen = grown(tmp_path, start, views), []
+def test_when_the_warm_up_is_over_nothing_of_it_stays_live(begin, photos):
+    coordinator, seen = begin(), []
 
     def note(event):
         if isinstance(event, VisitEnded) and event.block is None:
@@ -159,23 +145,18 @@ def test_when_the_warm_up_is_over_nothing_of_it_stays_live(tmp_path, views, phot
     assert seen == [[0, 0, 0]] * 6
 
 
-def test_a_visit_asks_no_other_views_than_its_own_where_they_see_the_block(
-    tmp_path, views, photos, start, monkeypatch
-):
-    coordinator = grown(tmp_path, start, views, visit_views=2)
-    train(coordinator, photos, steps=12)
+def test_a_visit_asks_no_other_views_than_its_own_where_they_see_the_block(grown, monkeypatch):
+    coordinator = grown(visit_views=2)
     asked = asked_of(coordinator, monkeypatch)
     for number in range(4):
         active = coordinator.visits.begin()
-        assert [[view.index for view in few] for few in asked[number:]] == [list(active.views)]
+        assert asked[number:] == [list(active.views)]
         assert sorted(active.geometry.crops) == sorted(active.views)
         assert len(active.views) <= 3 < len(active.trained_on)
 
 
-def test_views_that_show_a_block_no_more_are_found_out(tmp_path, views, photos, start, monkeypatch):
-    coordinator = grown(tmp_path, start, views, visit_views=2)
-    train(coordinator, photos, steps=12)
-    blind = (0, 1, 2)
+def test_views_that_show_a_block_no_more_are_found_out(grown, monkeypatch):
+    coordinator, blind = grown(visit_views=2), (0, 1, 2)
     asked_of(coordinator, monkeypatch, blind)
     coordinator.state.influence = {block: dict.fromkeys(blind, 0.1) for block in range(4)}
     for _ in range(4):
@@ -185,15 +166,14 @@ def test_views_that_show_a_block_no_more_are_found_out(tmp_path, views, photos, 
 
 
 def test_the_block_that_shares_least_with_those_that_are_out_is_next(tmp_path):
-    views = ring_of_views(4)
-    run = make_coordinator(tmp_path, random_gaussians(60, seed=3), views, blocks=4, steps=80)
+    start, views = random_gaussians(60, seed=3), ring_of_views(4)
+    run = make_coordinator(tmp_path, start, views, blocks=4, steps=80)
     first = run.visits.begin(at_once=2)
-    state = run.state
-    queued = [plan.block for plan in state.queue]
-    out, last = first.geometry.block, queued[-1]
+    queued = [plan.block for plan in run.state.queue]
     everywhere, elsewhere = {0: 0.5, 1: 0.5}, {2: 0.1, 3: 0.1}
-    state.influence = {block: elsewhere if block == last else everywhere for block in (out, *queued)}
-    state.in_flight.append(first)
-    assert run.visits.begin(at_once=2).geometry.block == last
-    state.in_flight.clear()
+    blocks = (first.geometry.block, *queued)
+    run.state.influence = {block: elsewhere if block == queued[-1] else everywhere for block in blocks}
+    run.state.in_flight.append(first)
+    assert run.visits.begin(at_once=2).geometry.block == queued[-1]
+    run.state.in_flight.clear()
     assert run.visits.begin().geometry.block == queued[0]  # one at a time goes by the sweep's order

@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 
 from abcd_ns.engine.events import VisitBegan
 from abcd_ns.engine.train.capture.poses import laid_over, turned
-from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.step import pose_rounds
 from abcd_ns.engine.train.training_loop import train
-from abcd_ns.engine.types import PARAM_NAMES
 from abcd_ns.errors import UserError
 from tests.reference.scenes import (
+    STILL,
     Photos,
+    assert_resumes,
+    equal,
     make_coordinator,
     random_gaussians,
     ring_of_views,
@@ -24,7 +25,6 @@ from tests.reference.scenes import (
     whole_scene,
 )
 
-STILL = DensityConfig(strategy="off")
 TRUTH = random_gaussians(150, seed=7, size=0.12)
 RING = ring_of_views(6)
 NOISE = 0.01
@@ -113,24 +113,15 @@ def test_where_poses_are_not_refined_a_run_knows_nothing_of_them(make, photos):
         scenes.append(whole_scene(made))
         assert made.state.poses == {}
         assert poses_of(made.run).equal(torch.stack([view.viewmat for view in RING]))
-    assert all(torch.equal(getattr(scenes[0], name), getattr(scenes[1], name)) for name in PARAM_NAMES)
+    assert equal(*scenes)
 
 
 @pytest.mark.parametrize(("blocks", "warmup"), [(1, 0.0), (4, 0.3)])
 def test_a_run_that_stops_goes_on_with_its_poses(make, photos, blocks, warmup):
     options = {"blocks": blocks, "steps": 30, "warmup": warmup, "scaffold": 60}
-    whole, stopped = make("whole", **options), make("stopped", **options)
-    train(whole, photos)
-    train(stopped, photos, steps=14)
-    stopped.save()
-    stopped.scene.store.close()
-    went_on = make("stopped", resume=True, **options)
-    assert torch.equal(poses_of(went_on.run), poses_of(stopped.run))
-    train(went_on, photos)
-    assert torch.equal(poses_of(went_on.run), poses_of(whole.run))
-    assert not torch.equal(poses_of(whole.run), poses_of(stopped.run))
-    for name in PARAM_NAMES:
-        assert torch.equal(getattr(whole_scene(went_on), name), getattr(whole_scene(whole), name)), name
+    whole, again = assert_resumes(make, photos, 14, **options)
+    assert torch.equal(poses_of(again.run), poses_of(whole.run))
+    assert not torch.equal(poses_of(whole.run), torch.stack([view.viewmat for view in shaken(RING)]))
 
 
 @pytest.mark.parametrize(("blocks", "warmup"), [(1, 0.0), (4, 0.4)])

@@ -17,14 +17,7 @@ from abcd_ns.engine.train.density.control import DensityConfig, DensityControl
 from abcd_ns.engine.train.density.shedding import PASSES, faded, fills, haze, risen, weigh
 from abcd_ns.engine.train.training_loop import train, train_step
 from abcd_ns.engine.types import Gaussians
-from tests.reference.scenes import (
-    Photos,
-    listen,
-    make_coordinator,
-    random_gaussians,
-    ring_of_views,
-    whole_scene,
-)
+from tests.reference.scenes import listen, random_gaussians, whole_scene
 
 STILL = DensityConfig(refine_start=1.0, refine_stop=0.0)
 """Nothing grows, and the price is the full one from the beginning."""
@@ -35,9 +28,9 @@ def statistics(weight: list[float], passes: list[float]) -> dict[str, torch.Tens
     return {"weight": torch.tensor(weight), "passes": torch.tensor(passes), "worth": torch.ones(len(weight))}
 
 
-def some_hidden(seed: int = 1) -> Gaussians:
+def some_hidden() -> Gaussians:
     """The last HIDDEN of them are above all views."""
-    gaussians = random_gaussians(120, seed=seed, size=0.12)
+    gaussians = random_gaussians(120, seed=1, size=0.12)
     gaussians.means[-HIDDEN:, 2] += 50.0
     return gaussians
 
@@ -114,28 +107,26 @@ def test_drawings_without_weights_say_nothing():
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_what_no_view_shows_goes_and_what_fills_much_stays(tmp_path, blocks):
-    views, start = ring_of_views(5), some_hidden()
-    photos = Photos(random_gaussians(150, seed=7, size=0.12), views)
-    options = {"blocks": blocks, "steps": 80, "density": replace(STILL, price=1.0), "batch": 1}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
+def test_what_no_view_shows_goes_and_what_fills_much_stays(make, views, photos, blocks):
+    density = replace(STILL, price=1.0)
+    coordinator = make(start=some_hidden(), blocks=blocks, steps=80, density=density, batch=1)
     told = listen(coordinator, Mended)
     train(coordinator, photos)
     left = whole_scene(coordinator)
-    assert sum(event.count for event in told if event.what == "shed") == len(start) - len(left)
-    assert HIDDEN / 2 < len(start) - len(left) < 2 * HIDDEN
-    assert sum(record.shed for record in coordinator.state.health.values()) == len(start) - len(left)
+    gone = 120 - len(left)
+    assert sum(event.count for event in told if event.what == "shed") == gone
+    assert sum(record.shed for record in coordinator.state.health.values()) == gone
+    assert HIDDEN / 2 < gone < 2 * HIDDEN
     assert float(left.means[:, 2].max()) < 40
     fills = weights(left, coordinator.run.rasterizer, [Shot(view, view.full) for view in views]).sum(dim=0)
     assert float((fills > 0.5).float().mean()) > 0.9
 
 
-def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_sheds(tmp_path, views, photos):
+def test_what_is_too_faint_for_any_picture_goes_whenever_the_block_sheds(make, photos):
     start = random_gaussians(60, seed=7, size=0.12)
     faint = torch.arange(60) % 3 == 0
     start = replace(start, opacities=torch.where(faint[:, None], -6.0, 1.0))  # a sigmoid of 1/404
-    options = {"blocks": 2, "steps": 12, "density": replace(STILL, price=1e-6)}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
+    coordinator = make(start=start, blocks=2, steps=12, density=replace(STILL, price=1e-6))
     train(coordinator, photos)
     left = whole_scene(coordinator)
     assert len(left) == 40
@@ -154,55 +145,35 @@ def test_a_cloud_before_cameras_is_shed_and_what_is_as_faint_but_small_stays(pro
     assert params["means"].tolist() == gaussians.means[left].tolist()
 
 
-def test_after_a_reset_of_opacities_nobody_is_haze():
-    growth = statistics([90.0, 50.0, 9.0, 1.0], [1.0] * 4)
-    assert not bool(haze(growth, torch.full((4,), 0.01)).any())
-    assert haze(statistics([], []), torch.zeros(0)).tolist() == []
-    assert haze(growth, torch.tensor([0.05, 0.5, 0.5, 0.5])).tolist() == [True, False, False, False]
-
-
-def test_without_a_price_everything_stays(tmp_path, views, photos):
-    options = {"blocks": 2, "steps": 30, "density": replace(STILL, price=0.0)}
-    coordinator = make_coordinator(tmp_path, some_hidden(), views, **options)
+def test_without_a_price_everything_stays(make, photos):
+    coordinator = make(start=some_hidden(), blocks=2, steps=30, density=replace(STILL, price=0.0))
     train(coordinator, photos)
     assert coordinator.count() == 120
 
 
-def test_statistics_weigh_what_lies_before_the_block(tmp_path, views, photos, start):
+def test_statistics_weigh_what_lies_before_the_block(make, views, photos):
     """Those of a step are the weights of the block's Gaussians in pictures of the whole scene."""
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=2, density=replace(STILL, price=1e-9), batch=1
-    )
-    rasterizer, run = coordinator.run.rasterizer, coordinator.run
-    batch = coordinator.next_batch()
-    block, live = run.active.geometry.block, coordinator.visit.live
-    before = whole_scene(coordinator)
+    coordinator = make(blocks=2, density=replace(STILL, price=1e-9), batch=1)
+    batch, before = coordinator.next_batch(), whole_scene(coordinator)
+    block = coordinator.run.active.geometry.block
     (sample,) = batch.samples
     rendered = coordinator.render(batch)
     coordinator.loss(batch, rendered.pictures, [photos(sample.view.index, sample.crop)]).backward()
     found = weigh(rendered.infos, len(views))["weight"]
     owner = torch.cat([torch.full((coordinator.scene.count(b),), b) for b in range(2)])
-    expected = weights(before, rasterizer, [replace(sample.shot, frozen=None, z_window=None)])[
-        0, owner == block
-    ]
-    assert len(live) == len(expected) == len(found)
+    shot = replace(sample.shot, frozen=None, z_window=None)
+    expected = weights(before, coordinator.run.rasterizer, [shot])[0, owner == block]
     # Layers are half floats, and by tiles where blocks interleave.
     torch.testing.assert_close(found, expected, rtol=0.05, atol=0.05)
 
 
-def test_one_block_sheds_after_every_so_many_passes(tmp_path, views, photos):
-    options = {
-        "blocks": 1,
-        "steps": 3 * PASSES * len(views),
-        "density": replace(STILL, price=1e-9),
-        "batch": 1,
-    }
-    coordinator = make_coordinator(tmp_path, some_hidden(), views, **options)
-    counts = []
+def test_one_block_sheds_after_every_so_many_passes(make, views, photos):
+    first, counts = PASSES * len(views), []
+    density = replace(STILL, price=1e-9)
+    coordinator = make(start=some_hidden(), blocks=1, steps=3 * first, density=density, batch=1)
     while not coordinator.finished:
         train_step(coordinator, photos)
         counts.append(coordinator.count())
-    first = PASSES * len(views)
     assert counts[first - 2] == 120
     assert counts[first - 1] <= 120 - HIDDEN
     assert math.isclose(counts[-1], counts[first - 1], abs_tol=5)

@@ -1,8 +1,10 @@
-"""What a sweep visits, what is known of it ahead, how blocks grow in the first, how rates fall at the end."""
+"""What a sweep visits and how: ahead, at first, at the end; and the paper's choices, each an option."""
 
 import pytest
+import torch
 
 from abcd_ns.engine.events import PhotosWanted, SweepEnded, VisitBegan
+from abcd_ns.engine.render.loss import photometric_loss
 from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.planner import LOOK_AGAIN
@@ -10,13 +12,11 @@ from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.schedule import VisitPlan, views_per_step
 from abcd_ns.engine.train.step.batch import COMING
 from abcd_ns.engine.train.training_loop import train, train_step
-from tests.reference.scenes import listen, make_coordinator
+from tests.reference.scenes import STILL, assert_resumes, listen, stop
 
 
-def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(tmp_path, views, photos, start):
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=4, steps=10_000, density=DensityConfig(strategy="off")
-    )
+def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(make, photos):
+    coordinator = make(blocks=4, steps=10_000, density=STILL)
     ended, began = listen(coordinator, SweepEnded), listen(coordinator, VisitBegan)
     while not ended:
         train(coordinator, photos, steps=1)
@@ -34,8 +34,8 @@ def test_who_is_hidden_is_no_part_of_a_sweep_until_looked_at_again(tmp_path, vie
 
 
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_photos_of_a_step_and_of_those_to_come_are_wanted(tmp_path, views, start, blocks):
-    coordinator = make_coordinator(tmp_path, start, views, blocks=blocks, steps=24)
+def test_photos_of_a_step_and_of_those_to_come_are_wanted(make, blocks):
+    coordinator = make(blocks=blocks, steps=24)
     wanted = listen(coordinator, PhotosWanted)
     told: dict[int, list[tuple[int, ...]]] = {}
     drawn: dict[int, list[int]] = {}
@@ -52,12 +52,10 @@ def test_photos_of_a_step_and_of_those_to_come_are_wanted(tmp_path, views, start
     assert any(len(views_told) > coordinator.batch for views_told in told[0])
 
 
-def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(
-    tmp_path, views, start, monkeypatch
-):
+def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(make, monkeypatch):
     monkeypatch.setattr("abcd_ns.engine.train.schedule.YOUNG", 20)  # these see a few dozen
-    options = {"blocks": 3, "steps": 150, "fast_start": True, "density": DensityConfig(strategy="off")}
-    coordinator, drawn, expected, stops = make_coordinator(tmp_path, start, views, **options), set(), 0, 0
+    options = {"blocks": 3, "steps": 150, "fast_start": True, "density": STILL}
+    coordinator, drawn, expected, stops = make(**options), set(), 0, 0
     while not coordinator.finished:
         batch = coordinator.next_batch()
         active = coordinator.run.active
@@ -67,21 +65,19 @@ def test_a_block_draws_more_views_a_step_as_it_grows_up_also_when_it_goes_on(
         drawn.add(expected)
         coordinator.after_step(coordinator.render(batch))
         if active.done == 1 and expected == 2:  # in the midst of a visit
-            coordinator.save()
-            coordinator.scene.store.close()
-            coordinator, stops = make_coordinator(tmp_path, start, views, resume=True, **options), stops + 1
+            stop(coordinator)
+            coordinator, stops = make(resume=True, **options), stops + 1
     assert drawn == {1, 2, 4}
     assert stops > 0
 
 
-def test_a_visit_that_goes_on_with_less_memory_draws_no_more_views_than_fit(tmp_path, views, start):
-    options = {"blocks": 3, "steps": 150, "density": DensityConfig(strategy="off")}
-    coordinator = make_coordinator(tmp_path, start, views, **options)
+def test_a_visit_that_goes_on_with_less_memory_draws_no_more_views_than_fit(make):
+    options = {"blocks": 3, "steps": 150, "density": STILL}
+    coordinator = make(**options)
     coordinator.after_step(coordinator.render(coordinator.next_batch()))
     assert coordinator.batch == 4
-    coordinator.save()
-    coordinator.scene.store.close()
-    went_on = make_coordinator(tmp_path, start, views, resume=True, batch_limit=2, **options)
+    stop(coordinator)
+    went_on = make(resume=True, batch_limit=2, **options)
     assert went_on.run.active.done == 1
     assert len(went_on.next_batch().samples) == went_on.batch == 2
 
@@ -93,13 +89,9 @@ def test_a_queue_of_before_visits_knew_their_batch_is_read():
     assert RunState.from_json(state).queue == [VisitPlan(3, 10)]
 
 
-def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(
-    tmp_path, views, photos, start, monkeypatch
-):
+def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(make, photos, monkeypatch):
     monkeypatch.setattr("abcd_ns.engine.train.schedule.SETTLING_VIEWS", 1)  # these see a few dozen
-    still = DensityConfig(strategy="off")
-    options = {"steps": 55, "density": still, "visit_steps": 5, "fast_start": True}
-    coordinator = make_coordinator(tmp_path, start, views, blocks=7, **options)
+    coordinator = make(blocks=7, steps=55, density=STILL, visit_steps=5, fast_start=True)
     began, rates = listen(coordinator, VisitBegan), dict[int, set[float]]()
     while not coordinator.finished:
         train(coordinator, photos, steps=1)
@@ -112,11 +104,9 @@ def test_rates_fall_at_the_end_but_not_in_the_first_visit_to_a_block(
     assert min(second[-1]) < 0.2 * whole
 
 
-def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(tmp_path, views, photos, start):
+def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(make, photos):
     density = DensityConfig(refine_start=0.0, refine_stop=0.01, refine_every=1, split_pixels=0.0, price=0)
-    coordinator = make_coordinator(
-        tmp_path, start, views, blocks=2, steps=60, scaffold=40, visit_steps=8, density=density
-    )
+    coordinator = make(blocks=2, steps=60, scaffold=40, visit_steps=8, density=density)
     counts: dict[bool, dict[int, set[int]]] = {True: {}, False: {}}
     while not coordinator.finished:
         train_step(coordinator, photos)
@@ -125,3 +115,73 @@ def test_a_run_whose_growth_is_over_grows_in_the_first_visit_to_each_block(tmp_p
             counts[live.clocks.visits == 0].setdefault(active.geometry.block, set()).add(len(live))
     assert [len(found) for found in counts[True].values()] == [2, 2]  # before it grew, and after
     assert [len(found) for found in counts[False].values()] == [1, 1]
+
+
+def test_fixed_steps_for_each_cell_are_one_visit_to_each(make, photos):
+    coordinator = make(blocks=4, steps=20, visit_steps=5, batch=1, density=STILL)
+    begun = listen(coordinator, VisitBegan)
+    train(coordinator, photos)
+    assert [event.steps for event in begun] == [5] * 4
+    assert {event.block for event in begun} == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_moments_are_forgotten_at_the_next_visit_only_when_asked(make, photos, keep):
+    coordinator = make(blocks=2, steps=30, visit_steps=3, batch=1, density=STILL, keep_moments=keep)
+    train(coordinator, photos, steps=6)
+    coordinator.next_batch()
+    block = coordinator.state.active.geometry.block
+    stored = coordinator.scene.state(block)
+    assert stored.clocks.adam_views == 3
+    adam = coordinator.optimizers["scales"].state[coordinator.params["scales"]]
+    assert int(adam["step"]) == (3 if keep else 0)
+    assert bool(adam["exp_avg"].any()) == keep
+    assert coordinator.visit.live.clocks.visits == 1
+
+
+def test_a_run_without_moments_can_be_resumed_within_a_visit(make, photos):
+    options = {"visit_steps": 4, "batch": 1, "keep_moments": False, "sh_restart": True, "migrate": False}
+    assert_resumes(make, photos, 10, blocks=2, steps=16, density=STILL, **options)
+
+
+def test_the_degree_begins_at_0_in_every_visit_and_layers_have_the_highest(make, photos):
+    options = {"visit_steps": 4, "batch": 1, "density": STILL, "sh_restart": True, "sh_ramp": 0.5}
+    coordinator = make(blocks=2, steps=16, **options)
+    degrees = []
+    while not coordinator.finished:
+        coordinator.next_batch()
+        degrees.append(coordinator.run.sh_degree)
+        assert coordinator.state.active.sh_degree == 1
+        train_step(coordinator, photos)
+    assert degrees == [0, 0, 1, 1] * 4
+
+
+@pytest.mark.parametrize("migrate", [True, False])
+def test_leavers_are_deleted_only_when_asked(make, photos, migrate):
+    coordinator = make(blocks=2, steps=8, visit_steps=4, batch=1, density=STILL, migrate=migrate)
+    train(coordinator, photos, steps=3)
+    block = coordinator.state.active.geometry.block
+    with torch.no_grad():
+        coordinator.params["means"][:5] = coordinator.scene.gaussians(1 - block).means[:5]
+    train(coordinator, photos, steps=1)
+    assert coordinator.count() == (120 if migrate else 115)
+    means = coordinator.scene.gaussians(block).means
+    assert bool((coordinator.scene.tree.assign(means) == block).all())
+
+
+@pytest.mark.parametrize("ssim_lambda", [0.0, 0.2])
+def test_l2_is_the_mean_squared_difference(ssim_lambda):
+    generator = torch.Generator().manual_seed(0)
+    rendered, photo = (torch.rand(20, 30, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    sizes = {"full_pixels": 600, "full_windows": 200, "ssim_lambda": ssim_lambda}
+    losses, gradients = {}, {}
+    for kind in ("l1", "l2"):
+        picture = rendered.clone().requires_grad_()
+        losses[kind] = photometric_loss(picture, photo, pixel_loss=kind, **sizes)
+        losses[kind].backward()
+        gradients[kind] = picture.grad
+    apart = rendered - photo
+    expected = (1 - ssim_lambda) * (apart.square().mean() - apart.abs().mean())
+    assert torch.allclose(losses["l2"] - losses["l1"], expected, rtol=1e-9)
+    by_pixel = (1 - ssim_lambda) / apart.numel() * (2 * apart - apart.sign())
+    assert torch.allclose(gradients["l2"] - gradients["l1"], by_pixel, rtol=1e-9, atol=1e-12)

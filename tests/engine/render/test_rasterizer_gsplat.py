@@ -1,29 +1,83 @@
-"""The gsplat backend's own logic (crops, frozen Gaussians, sums), with CPU stand-ins for the CUDA ops.
-
-The real kernels are compared under tests/gpu.
-"""
+"""gsplat's reference against the torch rasterizer, and the gsplat backend's own logic with CPU stand-ins."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 
 from abcd_ns.engine.render import CutShot, Rasterizer, Shot, TorchRasterizer, ZWindow, self_check
 from abcd_ns.engine.render.cuda import backend as gsplat_backend
 from abcd_ns.engine.render.cuda.backend import GsplatRasterizer
 from abcd_ns.engine.render.cuda.pairs import TILE
 from abcd_ns.engine.render.tile_grid import TileGrid
-from abcd_ns.engine.types import PARAM_NAMES, Crop, Gaussians, View
+from abcd_ns.engine.types import Crop, Gaussians, View
 from tests.reference.gsplat_stand_ins import lent
 from tests.reference.rasterizer_scenes import (
     as_leaves,
-    gradients,
+    assert_drawn_alike,
     probe,
+    project,
     random_gaussians,
     relative_error,
     small_view,
     stacked,
 )
+
+
+def gsplat_projection(gaussians: Gaussians, antialiased: bool) -> tuple[torch.Tensor, ...]:
+    covars, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), compute_preci=False)
+    camera = VIEW.viewmat[None], VIEW.K[None], VIEW.width, VIEW.height
+    *found, compensations = _fully_fused_projection(
+        gaussians.means, covars, *camera, calc_compensations=antialiased
+    )
+    opacities = gaussians.opacities[:, 0].sigmoid()
+    return (*(value[0] for value in found), opacities * compensations[0] if antialiased else opacities)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_projection_equals_gsplats(antialiased):
+    gaussians = random_gaussians(400)
+    gaussians.means[:, 2] -= 3.0
+    ours, theirs = as_leaves(gaussians), as_leaves(gaussians)
+    splats = project(ours, VIEW, antialiased=antialiased)
+    radii, *expected = gsplat_projection(theirs, antialiased)
+    seen = radii > 0
+    assert 100 < int(seen.sum()) < 390
+    assert torch.equal(splats.radii, radii)
+
+    found = (splats.means2d, splats.depths, splats.shapes, splats.opacities)
+    generator = torch.Generator().manual_seed(0)
+    for value, reference in zip(found, expected, strict=True):
+        torch.testing.assert_close(value[seen], reference[seen], rtol=1e-9, atol=1e-10)
+        weights = torch.randn(value[seen].shape, generator=generator, dtype=torch.float64)
+        for each in (value, reference):
+            each[seen].backward(weights, retain_graph=True)
+    for name in ("means", "scales", "quats", "opacities"):
+        value, reference = getattr(ours, name).grad[seen], getattr(theirs, name).grad[seen]
+        assert relative_error(value, reference) < 1e-8, name
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colours_equal_gsplats(degree):
+    ours, theirs = as_leaves(random_gaussians(60)), as_leaves(random_gaussians(60))
+    used = (degree + 1) ** 2
+    coefficients = torch.cat((theirs.features_dc[:, None], theirs.features_rest), dim=1)[:, :used]
+    expected = (_spherical_harmonics(degree, theirs.means - VIEW.center, coefficients) + 0.5).clamp_min(0)
+    colors = project(ours, VIEW, sh_degree=degree).colors
+    torch.testing.assert_close(colors, expected, rtol=1e-12, atol=1e-12)
+    assert (expected == 0).any()
+
+    weights = torch.randn(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    (colors * weights).sum().backward()
+    (expected * weights).sum().backward()
+    for name in ("features_dc", "features_rest", "means"):
+        value, reference = getattr(ours, name).grad, getattr(theirs, name).grad
+        if name == "means" and degree == 0:
+            continue  # a constant colour; gsplat's twin leaves no gradient at all
+        assert relative_error(value, reference) < 1e-10, name
+
 
 VIEW = small_view(70, 45)
 
@@ -47,11 +101,8 @@ def torch_twin(backend: GsplatRasterizer, side: int = 4) -> TorchRasterizer:
 def test_equals_the_torch_backend(backend, crop, with_frozen, antialiased, sh_degree):
     gaussians, frozen = random_gaussians(40), random_gaussians(15, seed=3) if with_frozen else None
     options = {"crop": crop, "frozen": frozen, "antialiased": antialiased, "sh_degree": sh_degree}
-    image, grads = gradients(lambda g: backend(g, VIEW, **options), gaussians)
-    expected, expected_grads = gradients(lambda g: torch_twin(backend)(g, VIEW, **options), gaussians)
-    torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
-    for name in PARAM_NAMES:
-        assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
+    draws = (partial(draw, view=VIEW, **options) for draw in (backend, torch_twin(backend)))
+    assert_drawn_alike(*draws, gaussians, 1e-9, 1e-8)
 
 
 @pytest.mark.parametrize("backend", ["3dgs"], indirect=True)  # gsplat gives surfels' cameras no gradient
@@ -80,19 +131,18 @@ def test_the_near_plane_is_the_views(backend):
 @pytest.mark.parametrize("with_frozen", [False, True])
 def test_info_covers_the_gaussians_and_the_full_image(backend, crop, with_frozen):
     frozen = random_gaussians(15, seed=3) if with_frozen else None
-    raster = backend(as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, judge=True)
-    expected = torch_twin(backend)(
-        as_leaves(random_gaussians(40)), VIEW, sh_degree=0, crop=crop, frozen=frozen, judge=True
-    )
-    size = raster.transmittance.shape
-    for drawing in (raster, expected):
-        drawing.info["means2d"].retain_grad()
-        drawing.info["sums"].ask([probe(*size)[..., :4]])
-        (stacked(drawing) * probe(*size)).sum().backward()
-    info = raster.info
-    assert torch.equal(info["radii"], expected.info["radii"])
-    assert relative_error(info["means2d"].grad, expected.info["means2d"].grad) < 1e-8
-    assert relative_error(info["sums"].values, expected.info["sums"].values) < 1e-8
+    infos, options = [], {"crop": crop, "frozen": frozen, "judge": True, "sh_degree": 0}
+    for draw in (backend, torch_twin(backend)):
+        raster = draw(as_leaves(random_gaussians(40)), VIEW, **options)
+        weights = probe(*raster.transmittance.shape)
+        raster.info["means2d"].retain_grad()
+        raster.info["sums"].ask([weights[..., :4]])
+        (stacked(raster) * weights).sum().backward()
+        infos.append(raster.info)
+    info, expected = infos
+    assert torch.equal(info["radii"], expected["radii"])
+    assert relative_error(info["means2d"].grad, expected["means2d"].grad) < 1e-8
+    assert relative_error(info["sums"].values, expected["sums"].values) < 1e-8
     assert (info["width"], info["height"]) == (VIEW.width, VIEW.height)
 
 
@@ -136,11 +186,8 @@ def window_for(crop: Crop, seed: int = 3) -> ZWindow:
 def test_a_z_window_is_that_of_the_torch_backend(backend, crop, with_frozen):
     gaussians, frozen = random_gaussians(40), random_gaussians(30, seed=3) if with_frozen else None
     options = {"crop": crop, "frozen": frozen, "sh_degree": 1, "z_window": window_for(crop)}
-    image, grads = gradients(lambda g: backend(g, VIEW, **options), gaussians)
-    expected, expected_grads = gradients(lambda g: torch_twin(backend, TILE)(g, VIEW, **options), gaussians)
-    torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-10)
-    for name in PARAM_NAMES:
-        assert relative_error(grads[name], expected_grads[name]) < 1e-8, name
+    draws = (partial(draw, view=VIEW, **options) for draw in (backend, torch_twin(backend, TILE)))
+    assert_drawn_alike(*draws, gaussians, 1e-9, 1e-8)
 
 
 def test_a_window_masks_what_is_frozen_where_anything_is(backend):
@@ -153,7 +200,7 @@ def test_a_window_masks_what_is_frozen_where_anything_is(backend):
     assert torch.equal(stacked(beside), stacked(backend(gaussians, VIEW, sh_degree=0)))
 
 
-def moved(view: View, by: float, **changes) -> View:
+def moved(view: View, by: float = 0.0, **changes) -> View:
     viewmat = view.viewmat.clone()
     viewmat[0, 3] += by
     return replace(view, viewmat=viewmat, **changes)
@@ -182,10 +229,8 @@ def several_shots(backend, windowed: bool, with_frozen: bool) -> list[Shot]:
 def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, windowed, with_frozen):
     found = []
     for draws in (backend, torch_twin(backend, TILE)):
-        leaves, shots = (
-            as_leaves(random_gaussians(40)),
-            several_shots(torch_twin(backend, TILE), windowed, with_frozen),
-        )
+        leaves = as_leaves(random_gaussians(40))
+        shots = several_shots(torch_twin(backend, TILE), windowed, with_frozen)
         rasters = draws.draw(leaves, shots, sh_degree=2, judge=True)
         infos = {id(raster.info): raster.info for raster in rasters}
         assert {info["n_cameras"] for info in infos.values()} == {len(shots)}
@@ -198,13 +243,11 @@ def test_shots_that_are_drawn_together_are_those_of_the_torch_backend(backend, w
         places = [(id(raster.info), k) for k, raster in enumerate(rasters)]
         order = [k for info in infos for which, k in places if which == info]
         assert sum(len(info["radii"]) for info in infos.values()) == len(shots)
+        place = torch.tensor(order).argsort()
         values = {"picture": torch.cat([stacked(raster).flatten() for raster in rasters])}
         values |= {name: value.grad for name, value in leaves.items()}
-        for name, given in (
-            ("means2d", [info["means2d"].grad for info in infos.values()]),
-            ("sums", [info["sums"].values for info in infos.values()]),
-        ):
-            values[name] = torch.cat(given)[torch.tensor(order).argsort()]
+        values["means2d"] = torch.cat([info["means2d"].grad for info in infos.values()])[place]
+        values["sums"] = torch.cat([info["sums"].values for info in infos.values()])[place]
         found.append(values)
     for name, value in found[0].items():
         assert relative_error(value.detach(), found[1][name].detach()) < 1e-8, name
@@ -252,25 +295,17 @@ def test_the_depth_window_is_that_of_the_torch_backend(backend, crop, visible):
     torch.testing.assert_close(found.far, expected.far)
 
 
-SEVERAL = [
-    (VIEW, VIEW.full),
-    (moved(VIEW, 0.2), Crop(19, 5, 30, 31)),
-    (moved(VIEW, -0.1), Crop(60, 40, 10, 5)),
-]
-
-
-def test_depth_windows_of_several_views_are_those_of_each(backend):
-    gaussians = random_gaussians(60)
-    together = list(backend.depth_windows(gaussians, SEVERAL, visible=0.1))
-    for window, (view, crop) in zip(together, SEVERAL, strict=True):
+def test_depth_windows_and_cuts_of_several_views_are_those_of_each(backend):
+    gaussians, shots = random_gaussians(60), []
+    seen = [
+        (VIEW, VIEW.full),
+        (moved(VIEW, 0.2), Crop(19, 5, 30, 31)),
+        (moved(VIEW, -0.1), Crop(60, 40, 10, 5)),
+    ]
+    for (view, crop), window in zip(seen, backend.depth_windows(gaussians, seen, visible=0.1), strict=True):
         alone = backend.depth_window(gaussians, view, crop=crop, visible=0.1)
         assert window.grid == alone.grid
         torch.testing.assert_close((window.near, window.far), (alone.near, alone.far))
-
-
-def test_cuts_of_several_views_are_those_of_each(backend):
-    gaussians, shots = random_gaussians(60), []
-    for view, crop in SEVERAL:
         window = window_for(crop)
         every = ZWindow.everything(window.grid, "cpu", torch.float64)
         shots.append(CutShot(view, crop, every.before(window), window, every.behind(window)))
@@ -285,14 +320,11 @@ def test_cuts_of_several_views_are_those_of_each(backend):
         torch.testing.assert_close(cut.inside.planes[:-4], alone.inside.planes[:-4])
 
 
-def test_the_depth_window_of_no_gaussians_is_empty(backend):
+def test_a_loss_of_nothing_has_a_gradient_and_its_window_is_empty(backend):
+    """A block whose last Gaussian was pruned is drawn until its visit ends."""
     nobody = Gaussians.empty(1, dtype=torch.float64)
     window = backend.depth_window(nobody, VIEW, crop=Crop(16, 0, 32, 20), visible=0.06)
     assert bool((window.near == window.far).all())
-
-
-def test_a_loss_of_nothing_has_a_gradient(backend):
-    """A block whose last Gaussian was pruned is drawn until its visit ends."""
     leaves = as_leaves(Gaussians.empty())
     shots = [Shot(small_view(dtype=torch.float32), Crop(3, 3, 5, 4))] * 2
     rasters = backend.draw(leaves, shots, sh_degree=3, judge=True)

@@ -1,4 +1,4 @@
-"""Random parts of crops: the same at every resume, within the limit, and right on average."""
+"""What steps show: parts of crops, right on average; pictures that grow with the run."""
 
 import itertools
 import random
@@ -9,15 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from abcd_ns.engine.kernels.photometric import SSIM_WINDOW
+from abcd_ns.engine.train import schedule
 from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.schedule import reduction_at
 from abcd_ns.engine.train.step.batch import Sample, part_to_draw
 from abcd_ns.engine.train.step.cutouts import ALIGN, random_part
-from abcd_ns.engine.train.training_loop import train
-from abcd_ns.engine.types import Crop
-from abcd_ns.peers.exact import ExactTrainer
+from abcd_ns.engine.train.training_loop import train_step
+from abcd_ns.engine.types import Crop, View
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
-from tests.reference.scenes import make_coordinator, ring_of_views, training_config, whole_scene
+from tests.reference.rasterizer_scenes import project
+from tests.reference.scenes import STILL, assert_resumes, random_gaussians, ring_of_views, training_config
 
 CROPS = st.builds(Crop, st.integers(0, 200), st.integers(0, 200), st.integers(1, 2000), st.integers(1, 2000))
 
@@ -69,17 +70,6 @@ def test_parts_use_most_of_what_they_may(crop, most, seed):
     assert sum(parts) / 200 > 0.25 * min(most, crop.pixels)
 
 
-@pytest.mark.parametrize(("crop", "most"), [(Crop(16, 32, 40, 33), 600), (Crop(5, 0, 60, 17), 500)])
-def test_every_pixel_counts_alike_on_average(crop, most):
-    """The expectation of crop.pixels / part.pixels over the parts that hold a pixel is 1, for every pixel."""
-    parts = all_parts(crop, most)
-    counted = torch.zeros(crop.height, crop.width, dtype=torch.float64)
-    for part in parts:
-        counted[part.within(crop).slices] += crop.pixels / part.pixels
-    assert len(set(parts)) > 1
-    assert torch.allclose(counted / len(parts), torch.ones_like(counted))
-
-
 @pytest.mark.parametrize("background", [0.0, 0.4])
 @pytest.mark.parametrize("pixel_loss", ["l1", "l2"])
 def test_the_loss_of_parts_is_on_average_that_of_the_whole(background, pixel_loss):
@@ -124,12 +114,10 @@ def test_a_part_depends_on_seed_step_and_place_alone():
 
 
 @pytest.mark.parametrize("room", [0, 1 << 20])
-def test_a_part_of_a_batch_shows_what_the_whole_shows_there(tmp_path, views, start, room):
+def test_a_part_of_a_batch_shows_what_the_whole_shows_there(make, room):
     pictures = []
     for most in (0, 700):
-        (folder := tmp_path / str(most)).mkdir()
-        still = {"density": DensityConfig(strategy="off"), "layer_bytes": room}
-        coordinator = make_coordinator(folder, start, views, blocks=4, steps=8, crop_pixels=most, **still)
+        coordinator = make(str(most), blocks=4, steps=8, crop_pixels=most, density=STILL, layer_bytes=room)
         batch = coordinator.next_batch()
         pictures.append((batch.samples, coordinator.render(batch).pictures))
     whole, parts = pictures
@@ -149,27 +137,85 @@ EACH_ALONE = {
 }
 
 
-@pytest.mark.parametrize("options", [{"blocks": 4}, EACH_ALONE, {"blocks": 2, "kind": ExactTrainer}])
-def test_a_run_on_parts_that_stops_and_goes_on_is_the_run_that_did_not(
-    tmp_path, views, photos, start, options
-):
-    def coordinator(name, resume=False):
-        (tmp_path / name).mkdir(exist_ok=True)
-        return make_coordinator(
-            tmp_path / name, start, views, steps=10, crop_pixels=600, resume=resume, **options
-        )
+@pytest.mark.parametrize("options", [{"blocks": 4}, EACH_ALONE])
+def test_a_run_on_parts_that_stops_and_goes_on_is_the_run_that_did_not(make, photos, options):
+    assert_resumes(make, photos, 4, steps=10, crop_pixels=600, **options)
 
-    straight = coordinator("straight")
-    train(straight, photos)
-    stopped = coordinator("stopped")
-    train(stopped, photos, steps=4)
-    stopped.save()
-    stopped.scene.store.close()
-    resumed = coordinator("stopped", resume=True)
-    train(resumed, photos)
-    for (name, found), (_, expected) in zip(
-        whole_scene(resumed).items(), whole_scene(straight).items(), strict=True
-    ):
-        assert found.shape == expected.shape
-        # By all blocks at once the order in which gradients are added up changes with a resume.
-        assert torch.equal(found.sort(dim=0).values, expected.sort(dim=0).values), name
+
+@pytest.fixture
+def small_pictures(monkeypatch):
+    """Pictures of 48 x 36 px are reduced, too."""
+    monkeypatch.setattr(schedule, "LEAST_SIDE", 9)
+
+
+def sample_of(view: View, crop: Crop) -> Sample:
+    return Sample(view, crop, None, None, torch.zeros(3))
+
+
+def test_pictures_grow_by_share_and_never_become_too_small():
+    shares = [0.0, 0.19, 0.2, 0.39, 0.4, 1.0]
+    assert [reduction_at(share, 0.4, 640) for share in shares] == [4, 4, 2, 2, 1, 1]
+    assert [reduction_at(share, 0.4, 213) for share in shares] == [2, 2, 2, 2, 1, 1]
+    assert {reduction_at(share, 0.4, 120) for share in shares} == {1}
+    assert {reduction_at(share, 0.0, 640) for share in shares} == {1}
+
+
+@pytest.mark.parametrize("by", [1, 2, 4])
+def test_a_reduced_camera_sees_the_same_in_larger_pixels(by):
+    (view,), gaussians = (
+        ring_of_views(1, width=50, dtype=torch.float64),
+        random_gaussians(20).to(torch.float64),
+    )
+    small = view.reduced(by)
+    assert (small.width, small.height, small.reduction) == (50 // by, 36 // by, by)
+    found, full = project(gaussians, small), project(gaussians, view)
+    torch.testing.assert_close(found.means2d * by, full.means2d)
+    torch.testing.assert_close(found.depths, full.depths)
+
+
+def test_a_reduced_photo_is_the_mean_of_its_squares():
+    (view,) = ring_of_views(1)
+    sample = sample_of(view.reduced(4), Crop(2, 1, 5, 6))
+    assert sample.source == Crop(8, 4, 20, 24)
+    photo = torch.rand(24, 20, 3)
+    expected = torch.stack(
+        [
+            torch.stack([photo[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].mean(dim=(0, 1)) for x in range(5)])
+            for y in range(6)
+        ]
+    )
+    torch.testing.assert_close(sample.reduced(photo), expected)
+
+
+def test_alpha_and_masks_are_reduced_with_what_they_stand_for():
+    (view,) = ring_of_views(1)
+    sample = sample_of(view.reduced(2), Crop(0, 0, 3, 2))
+    photo, behind = torch.rand(4, 6, 4), torch.rand(3)
+    photo[:2, :2, 3] = 0.0
+
+    def composited(pixels):
+        return pixels[..., 3:] * pixels[..., :3] + (1 - pixels[..., 3:]) * behind
+
+    torch.testing.assert_close(composited(sample.reduced(photo)), sample.reduced(composited(photo)))
+    mask = torch.ones(4, 6, 1, dtype=torch.bool)
+    mask[0, 0] = False
+    found = sample.reduced_mask(mask)
+    assert found.shape == (2, 3, 1)
+    assert found.sum() == 5
+    assert not found[0, 0]
+    assert sample.reduced_mask(None) is None
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_samples_grow_with_the_run(make, photos):
+    coordinator, seen = make(blocks=1, steps=60, coarse=0.6), []
+    while not coordinator.finished:
+        train_step(coordinator, photos)
+        seen.append(coordinator.run.reduction)
+    assert {1, 2, 4} == set(seen)
+    assert seen == sorted(seen, reverse=True)
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_a_run_goes_on_with_the_pictures_it_stopped_at(make, photos):
+    assert_resumes(make, photos, 17, blocks=1, steps=40, coarse=0.7)
