@@ -18,7 +18,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 
 from abcd_ns.data.dataset import AbcdDataset
-from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
+from abcd_ns.data.dataset import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
