@@ -49,9 +49,8 @@ _MAX_NAME = 1 << 16
 
 def find_models(data: Path) -> list[Path]:
     """The folders of `data` that hold a COLMAP model; that with most photos comes first."""
-    places = [
-        p for each in MODEL_FOLDERS for p in (sorted(data.glob(each)) if "*" in each else [data / each])
-    ]
+    globs = (sorted(data.glob(each)) if "*" in each else [data / each] for each in MODEL_FOLDERS)
+    places = [place for found in globs for place in found]
     found = [p for p in places if _part(p, "cameras") and (p != data or _part(p, "images"))]
     return sorted(found, key=_count_photos, reverse=True) if len(found) > 1 else found
 
@@ -72,10 +71,10 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
         InputError: a file is missing, cut or absurd; every bad camera and pose is listed.
     """
     problems, found = Problems(), []
-    cameras, listed, cloud = (_part(model, name) for name in _READERS)
-    for name, path in (("cameras", cameras), ("images", listed or model / "images.bin"), ("points3D", cloud)):
+    cameras, listed = (_part(model, name) or model / f"{name}.bin" for name in ("cameras", "images"))
+    for path in (cameras, listed, _part(model, "points3D")):
         with problems.collect():
-            found.append(_READERS[name][path.suffix](path) if path else (np.empty((0, 3)), None))
+            found.append(_READERS[path.name](path) if path else (np.empty((0, 3)), None))
     problems.raise_if_any()
     lenses, posed, (xyz, rgb) = found
     for number, lens in lenses.items():
@@ -94,9 +93,7 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
             pose = _camera_to_world(quat, translation, label)
             frames.append(Frame(called[name], pose, lenses[camera], hidden and _mask(hidden, called[name])))
     if hidden and frames and not any(frame.mask_path for frame in frames):
-        problems.append(
-            f"{hidden.folder} has no mask of any photo, such as {frames[0].name}.png; put them there."
-        )
+        problems.append(f"{hidden.folder} has no mask such as {frames[0].name}.png; put masks there.")
     problems.raise_if_any()
     frames.sort(key=lambda frame: frame.name)
     return Scene(
@@ -113,11 +110,9 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
 
 
 def _part(model: Path, name: str) -> Path | None:
-    """A file of a model, .bin before .txt; of points3D, files of no bytes are none, as COLMAP's manual has it."""
-    for path in (model / f"{name}{suffix}" for suffix in (".bin", ".txt", ".ply")):
-        if path.exists() and not (name == "points3D" and path.is_file() and path.stat().st_size == 0):
-            return path
-    return None
+    """A file of a model, .bin before .txt. One of no bytes holds no points, as COLMAP's manual has it."""
+    paths = (model / file for file in _READERS if file.startswith(name) and (model / file).exists())
+    return next((p for p in paths if name != "points3D" or p.stat().st_size or not p.is_file()), None)
 
 
 def _count_photos(model: Path) -> int:
@@ -343,7 +338,11 @@ def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 _READERS = {
-    "cameras": {".bin": _cameras_bin, ".txt": _cameras_txt},
-    "images": {".bin": _images_bin, ".txt": _images_txt},
-    "points3D": {".bin": _points_bin, ".txt": _points_txt, ".ply": read_points},
+    "cameras.bin": _cameras_bin,
+    "cameras.txt": _cameras_txt,
+    "images.bin": _images_bin,
+    "images.txt": _images_txt,
+    "points3D.bin": _points_bin,
+    "points3D.txt": _points_txt,
+    "points3D.ply": read_points,
 }

@@ -22,7 +22,6 @@ from tests.data.dataparser_scenes import (
     parser,
     project,
     project_pycolmap,
-    refusal,
     write_capture,
     write_model,
     write_photos,

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from abcd_ns.data.input_errors import SHOWN, InputError, Problems
+from abcd_ns.data.picture_files import read_header
 from tests.data.dataparser_scenes import (
     NAMES,
     REAL,
@@ -150,11 +151,11 @@ def _tiff_16(path: Path) -> None:
     path.write_bytes(deep.tobytes())
 
 
-def _bomb(path: Path) -> None:
+def _bomb(path: Path, width: int = 30_000, height: int = 20_000) -> None:
     _png_16(path)
     data = bytearray(path.read_bytes())
     data[24] = 8
-    struct.pack_into(">II", data, 16, 30_000, 20_000)
+    struct.pack_into(">II", data, 16, width, height)
     struct.pack_into(">I", data, 29, zlib.crc32(bytes(data[12:29])))
     path.write_bytes(data)
 
@@ -212,6 +213,12 @@ def test_bad_photo_is_named_with_its_fault(scene, spoil, message):
     assert str(path) in said
     assert message in said
     assert "\n" not in said
+
+
+def test_photos_of_aerial_cameras_are_not_too_large(tmp_path):
+    """150 megapixels, over what Pillow takes for an attack."""
+    _bomb(tmp_path / "photo.png", 14_204, 10_652)
+    assert read_header(tmp_path / "photo.png").size == (14_204, 10_652)
 
 
 def test_all_bad_photos_are_listed_at_once(scene):

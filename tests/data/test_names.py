@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from abcd_ns.data.normalize import normalizing_similarity
 from tests.data.dataparser_scenes import (
     NAMES,
     SIZES,
@@ -238,3 +240,27 @@ def test_photos_of_several_shares_are_refused(tmp_path):
     write_photos(tmp_path / "images", divide=2)
     Image.fromarray(np.zeros((41, 61, 3), np.uint8)).save(tmp_path / "images" / NAMES[0])
     assert "its camera is 61 x 41" in refusal(tmp_path)
+
+
+# Surveys
+
+
+@pytest.mark.parametrize("center", ["poses", "focus", "none"])
+@pytest.mark.parametrize("orientation", ["up", "vertical", "pca", "none"])
+def test_flights_whose_headings_cancel_have_a_frame(orientation, center):
+    poses = np.array([
+        np.c_[np.diag([turn, turn, 1.0]), [3.0 * k, 3.0 * line, 10]]
+        for line, turn in enumerate((1, -1, 1, -1)) for k in range(4)
+    ])  # fmt: skip
+    found = normalizing_similarity(poses, orientation, center, True, 1.0)
+    assert np.abs(found.rotation @ found.rotation.T - np.eye(3)).max() < 1e-6
+    assert np.abs(found.poses(poses)[..., 3]).max() == pytest.approx(1)
+    if orientation in ("up", "vertical"):
+        assert (found.rotation @ [0, 0, 1])[2] == pytest.approx(1)
+
+
+def test_cameras_turned_about_their_axes_and_all_ways_have_a_frame():
+    turns = Rotation.from_rotvec(np.pi / 2 * np.array([[0, 0, k] for k in range(4)]))
+    poses = np.concatenate([turns.as_matrix(), -turns.as_matrix() * [-1, 1, 1]])
+    poses = np.concatenate([poses, np.random.default_rng(0).normal(size=(8, 3, 1))], axis=2)
+    assert np.isfinite(normalizing_similarity(poses, "up", "focus", True, 1.0).matrix).all()

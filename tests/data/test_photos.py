@@ -206,7 +206,7 @@ def test_resampled_photos_show_nothing_of_what_lies_below_transparent_pixels(tmp
         for name, each in (("cut.png", image), ("black.png", on_black))
     )
     error = cut[..., :3] * cut[..., 3:] / 255 - black
-    assert np.abs(error).max() < (1 if lens is None else 3)  # OpenCV rounds weights of 8-bit pixels to 1/32
+    assert np.abs(error).max() < (2 if lens is None else 3)  # OpenCV rounds weights of 8-bit pixels to 1/32
     assert 0.2 < (cut[..., 3] > 0).mean() <= 1
 
 
@@ -312,10 +312,10 @@ def test_rings_of_lossy_masks_are_hidden(tmp_path, save, white):
     assert (~seen & ~HIDDEN).sum() <= 0.02 * (~HIDDEN).sum()
 
 
-def test_soft_edges_are_cut_in_the_middle(tmp_path):
+def test_of_soft_edges_what_is_nearly_white_is_seen(tmp_path):
     step = np.clip(np.arange(WIDTH) * 20.0 - 200, 0, 255)
     Image.fromarray(np.tile(step, (HEIGHT, 1)).astype(np.uint8)).save(tmp_path / "mask.png")
-    assert np.array_equal(read_mask(tmp_path, "mask.png")[0], step > 127.5)
+    assert np.array_equal(read_mask(tmp_path, "mask.png")[0], step > 192)
 
 
 def read_mask(folder: Path, name: str) -> np.ndarray:
