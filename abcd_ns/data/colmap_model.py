@@ -5,6 +5,7 @@ which loads a cut cameras.bin silently and hangs on an empty points3D.bin.
 """
 
 import mmap
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,12 +14,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.picture_files import check_regular
-from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
+from abcd_ns.data.picture_files import FileFinder, check_regular
+from abcd_ns.data.ply import read_points
+from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, rigid
 from abcd_ns.data.split_lists import read_list_files
 
-MODEL_FOLDERS = ("sparse/0", "colmap/sparse/0", "sparse")
-"""Where a model may lie under the data folder; the first that holds one wins."""
+MODEL_FOLDERS = ("sparse/*", "colmap/sparse/*", "sparse", "colmap/sparse", "colmap", ".")
+"""Where models may lie under the data folder."""
 IMAGES = Path("images")
 """Where its photos lie, if nothing else is said."""
 
@@ -45,10 +47,12 @@ _MAX_NAME = 1 << 16
 """Bytes within which a name must end."""
 
 
-def find_model(data: Path) -> Path | None:
-    """The folder of `data` that holds a COLMAP model, or None."""
-    candidates = (data / folder for folder in MODEL_FOLDERS)
-    return next((c for c in candidates if (c / "cameras.bin").exists() or (c / "cameras.txt").exists()), None)
+def find_models(data: Path) -> list[Path]:
+    """The folders of `data` that hold a COLMAP model; that with most photos comes first."""
+    globs = (sorted(data.glob(each)) if "*" in each else [data / each] for each in MODEL_FOLDERS)
+    places = [place for found in globs for place in found]
+    found = [p for p in places if _part(p, "cameras") and (p != data or _part(p, "images"))]
+    return sorted(found, key=_count_photos, reverse=True) if len(found) > 1 else found
 
 
 def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | None = None) -> Scene:
@@ -56,37 +60,40 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
 
     Args:
         data: the data root.
-        model: the folder with cameras, images and points3D, as .bin or else .txt.
-        images: the folder of photos, from `data`.
+        model: the folder with cameras and images, as .bin or else .txt, and points3D as either or .ply.
+        images: the folder of photos, from `data`. Where there is no IMAGES, photos may lie in `data` itself.
         masks: the folder of masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg.
 
     Returns:
         The scene in a z-up world: `applied_transform` is the change of axes from COLMAP's.
 
     Raises:
-        InputError: a file is missing, cut, empty or absurd; every bad camera and pose is listed.
+        InputError: a file is missing, cut or absurd; every bad camera and pose is listed.
     """
-    binary, problems, found = (model / "cameras.bin").exists(), Problems(), []
-    suffix, readers = (".bin", _BINARY) if binary else (".txt", _TEXT)
-    for name, read in zip(("cameras", "images", "points3D"), readers, strict=True):
+    problems, found = Problems(), []
+    cameras, listed = (_part(model, name) or model / f"{name}.bin" for name in ("cameras", "images"))
+    for path in (cameras, listed, _part(model, "points3D")):
         with problems.collect():
-            found.append(read(model / f"{name}{suffix}"))
+            found.append(_READERS[path.name](path) if path else (np.empty((0, 3)), None))
     problems.raise_if_any()
     lenses, posed, (xyz, rgb) = found
     for number, lens in lenses.items():
-        with problems.collect():
-            check_lens(lens, f"{model}/cameras{suffix}: camera {number}")
-    frames, photos = [], data / images
+        with problems.collect(name=f" {number} "):
+            check_lens(lens, f"{cameras}: camera {number}")
+    photos = _photo_folder(data, images, [name for name, *_ in posed])
+    files, frames, called = FileFinder(photos, listed), [], {}
+    hidden = None if masks is None else FileFinder(data / masks, data / masks)
     for name, quat, translation, camera in posed:
-        label = f"{model}/images{suffix}: {name}"
-        if camera not in lenses:
-            lacks = f"which cameras{suffix} does not have"
-            problems.append(f"{label} uses camera {camera}, {lacks}; make the model again.")
-            continue
-        with problems.collect():
-            inside(photos, name, model / f"images{suffix}")
-            mask = None if masks is None else _mask(data / masks, name)
-            frames.append(Frame(name, _camera_to_world(quat, translation, label), lenses[camera], mask))
+        label = f"{listed}: {name}"
+        with problems.collect(name=name):
+            if camera not in lenses:
+                lacks = f"which {cameras.name} does not have"
+                raise InputError(f"{label} uses camera {camera}, {lacks}; make the model again.")
+            called[name] = files.find(name).relative_to(os.path.abspath(photos)).as_posix()
+            pose = _camera_to_world(quat, translation, label)
+            frames.append(Frame(called[name], pose, lenses[camera], hidden and _mask(hidden, called[name])))
+    if hidden and frames and not any(frame.mask_path for frame in frames):
+        problems.append(f"{hidden.folder} has no mask such as {frames[0].name}.png; put masks there.")
     problems.raise_if_any()
     frames.sort(key=lambda frame: frame.name)
     return Scene(
@@ -97,14 +104,40 @@ def read_colmap(data: Path, model: Path, images: Path = IMAGES, masks: Path | No
         points_xyz=xyz @ Z_UP[:, :3].T,
         points_rgb=rgb,
         applied_transform=Z_UP,
-        split_lists=read_list_files(data, [frame.name for frame in frames]),
+        split_lists=read_list_files(data, called),
+        notes=files.notes,
     )
 
 
-def _mask(folder: Path, name: str) -> Path:
-    """The mask of a photo: the first name that is there, or else the first."""
-    names = (Path(name).with_suffix(".png"), f"{name}.png", name)
-    return next((folder / each for each in names if (folder / each).exists()), folder / names[0])
+def _part(model: Path, name: str) -> Path | None:
+    """A file of a model, .bin before .txt. One of no bytes holds no points, as COLMAP's manual has it."""
+    paths = (model / file for file in _READERS if file.startswith(name) and (model / file).exists())
+    return next((p for p in paths if name != "points3D" or p.stat().st_size or not p.is_file()), None)
+
+
+def _count_photos(model: Path) -> int:
+    """How many a model says that it has; a line and one of 2D points for each, in text."""
+    path = _part(model, "images")
+    if path is None:
+        return 0
+    return _Cursor(path).take("Q")[0] if path.suffix == ".bin" else (sum(1 for _ in _lines(path)) + 1) // 2
+
+
+def _photo_folder(data: Path, images: Path, names: list[str]) -> Path:
+    """`images`, as its case may be; or `data` itself, where the first photo lies there."""
+    photos = data / images
+    if not photos.is_dir() and images == IMAGES:
+        alike = (path for path in data.iterdir() if path.is_dir() and path.name.lower() == IMAGES.name)
+        flat = [data] if names and FileFinder(data, data).find(names[0], moved=False).is_file() else []
+        return next(alike, next(iter(flat), photos))
+    return photos
+
+
+def _mask(files: FileFinder, name: str) -> Path | None:
+    """The mask of a photo."""
+    names = (str(Path(name).with_suffix(".png")), f"{name}.png")
+    found = (files.find(each, moved=False) for each in names)
+    return next((path for path in found if path.exists()), None)
 
 
 def _camera_to_world(quat: np.ndarray, translation: np.ndarray, label: str) -> np.ndarray:
@@ -237,7 +270,7 @@ def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number from 1, text) of all lines but comments; blank ones too: an image may have no 2D points."""
     check_regular(path, "file")
-    with path.open(encoding="utf-8", errors="surrogateescape") as file:
+    with path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
         for number, line in enumerate(file, start=1):
             if not line.startswith("#"):
                 yield number, line.strip()
@@ -304,5 +337,12 @@ def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(xyz, dtype=np.float64).reshape(-1, 3), np.array(rgb, dtype=np.uint8).reshape(-1, 3)
 
 
-_BINARY = (_cameras_bin, _images_bin, _points_bin)
-_TEXT = (_cameras_txt, _images_txt, _points_txt)
+_READERS = {
+    "cameras.bin": _cameras_bin,
+    "cameras.txt": _cameras_txt,
+    "images.bin": _images_bin,
+    "images.txt": _images_txt,
+    "points3D.bin": _points_bin,
+    "points3D.txt": _points_txt,
+    "points3D.ply": read_points,
+}

@@ -1,14 +1,30 @@
-"""nerfstudio's dataset over Photos."""
+"""nerfstudio's dataset over Photos, of what our own reader or another of nerfstudio's found.
 
+Others name files and cameras; what they leave to nerfstudio's datamanager, undistorting and putting photos onto
+a background, is done here as for our own reader: in memory, and checked beforehand.
+"""
+
+import dataclasses
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from torch import Tensor
 
-from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
-from abcd_ns.data.input_errors import InputError
-from abcd_ns.data.photos import Photos
+from abcd_ns.data.input_errors import OPTION, InputError, Problems
+from abcd_ns.data.photos import Photos, PhotoSource, reduces_to
+from abcd_ns.data.picture_files import FileFinder, check_complete, read_header
+from abcd_ns.data.scene import Lens, check_lens
+from abcd_ns.data.undistort import undistortion
+
+PHOTOS = "photos"
+"""The entry of the metadata that holds one PhotoSource for each camera."""
+_BROWN, _FISHEYE = CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value
 
 
 class AbcdDataset(InputDataset):
@@ -32,7 +48,7 @@ class AbcdDataset(InputDataset):
         needs_photos: bool = True,
     ):
         if scale_factor != 1.0:
-            raise InputError("camera_res_scale_factor has no effect: set --downscale-factor instead.")
+            raise InputError(f"camera_res_scale_factor has no effect: set {OPTION}downscale-factor instead.")
         outputs = with_photos(dataparser_outputs, needs_photos)
         super().__init__(outputs, scale_factor)
         self.photos = Photos(outputs.metadata[PHOTOS], budget_bytes)
@@ -49,3 +65,86 @@ class AbcdDataset(InputDataset):
         if mask is not None:
             data["mask"] = mask
         return data
+
+
+def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> DataparserOutputs:
+    """The same with PHOTOS, and with the cameras of photos that are undistorted; our own reader's unchanged.
+
+    Args:
+        needs_photos: False for viewing and exporting, which look at no file.
+
+    Raises:
+        InputError: lists all files that are missing, damaged or unlike their cameras, and other cameras.
+    """
+    if PHOTOS in outputs.metadata:
+        return outputs
+    if outputs.metadata.get("mask_color") is not None:
+        raise InputError("--mask-color has no effect here: masked pixels are not trained on. Leave it out.")
+    color = outputs.alpha_color
+    alpha_color = None if color is None else tuple(float(value) for value in color)
+    sources, lenses, problems, finders = [], [], Problems(), {}
+    if not outputs.cameras.camera_to_worlds.isfinite().all():
+        fix = "where the reader has an --orientation-method, set it to none"
+        raise InputError(
+            f"{outputs.image_filenames[0]} and others have poses that are NaN or infinite; {fix}."
+        )
+    for row, path in enumerate(outputs.image_filenames):
+        with problems.collect(name=str(path)):
+            lens = _lens(outputs.cameras, row, str(path))
+            stored = lens.size
+            if needs_photos:
+                path = finders.setdefault(path.parent, FileFinder(path.parent, path)).find(path.name)
+                header = read_header(path)
+                check_complete(path, header)
+                stored = header.size
+                if not reduces_to(stored, lens.size):
+                    shapes = f"is {stored[0]} x {stored[1]} but its camera is {lens.width} x {lens.height}"
+                    raise InputError(f"{path} {shapes}; put the photos there that the model was made from.")
+            flat = undistortion(lens) if lens.distorted else None
+            mask = outputs.mask_filenames[row] if outputs.mask_filenames else None
+            if mask is not None and needs_photos:
+                read_header(mask, check_kind=False)
+            sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
+            lenses.append(flat.pinhole if flat else lens)
+    problems.raise_if_any()
+    cameras = pinhole_cameras(lenses, outputs.cameras.camera_to_worlds)
+    return dataclasses.replace(
+        outputs,
+        image_filenames=[source.path for source in sources],
+        cameras=cameras,
+        metadata={**outputs.metadata, PHOTOS: sources},
+    )
+
+
+def pinhole_cameras(lenses: Sequence[Lens], poses: Float[Tensor, "n 3 4"]) -> Cameras:
+    """nerfstudio's cameras [n], perspective, without distortion, float32."""
+
+    def column(name: str, dtype: torch.dtype) -> Tensor:
+        return torch.tensor([[getattr(lens, name)] for lens in lenses], dtype=dtype)
+
+    return Cameras(
+        camera_to_worlds=poses.float(),
+        **{name: column(name, torch.float32) for name in ("fx", "fy", "cx", "cy")},
+        **{name: column(name, torch.int64) for name in ("width", "height")},
+        camera_type=CameraType.PERSPECTIVE,
+        metadata={},  # without any, `ns-export cameras` ends in an assertion
+    )
+
+
+def _lens(cameras: Cameras, row: int, label: str) -> Lens:
+    kind = int(cameras.camera_type[row])
+    if kind not in (_BROWN, _FISHEYE):
+        name = CameraType(kind).name.lower()
+        raise InputError(f"{label} is {name}; photos must be perspective or fisheye ones.")
+    given = torch.zeros(6) if cameras.distortion_params is None else cameras.distortion_params.double()
+    k1, k2, k3, k4, p1, p2 = given.expand(len(cameras.camera_to_worlds), 6)[
+        row
+    ].tolist()  # one for all, perhaps
+    if kind == _BROWN and k4 != 0:
+        raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
+    fx, fy, cx, cy = (float(getattr(cameras, name)[row]) for name in ("fx", "fy", "cx", "cy"))
+    coefficients = (k1, k2, k3, k4) if kind == _FISHEYE else (k1, k2, p1, p2, k3)
+    size = int(cameras.width[row]), int(cameras.height[row])
+    lens = Lens(*size, fx, fy, cx, cy, coefficients, kind == _FISHEYE)
+    check_lens(lens, label)
+    return lens

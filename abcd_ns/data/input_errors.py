@@ -8,8 +8,12 @@ from rich.markup import escape
 
 from abcd_ns.errors import UserError
 
+OPTION = "--pipeline.datamanager.dataparser."
+"""How the options of this reader begin."""
 SHOWN = 20
 """Lines of one error that are shown; the others are counted."""
+FEW = 3
+"""Files with the same fault that are named; of more, the first is named and the others are counted."""
 
 
 def one_line(text: str) -> str:
@@ -53,13 +57,24 @@ class InputError(UserError):
 class Problems(list[str]):
     """Collects errors so that all bad files are named at once, instead of one per run."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._alike: dict[str, list[str]] = {}
+
     @contextmanager
-    def collect(self, label: str = "") -> Iterator[None]:
-        """Note the InputError that the body raises, if any, each line after the label, and continue."""
+    def collect(self, label: str = "", name: str = "") -> Iterator[None]:
+        """Note the InputError that the body raises, if any, each line after the label, and continue.
+
+        Args:
+            name: what the body is about; lines that are equal but for it become one if they are many.
+        """
         try:
             yield
         except InputError as error:
-            self.extend(label + line for line in error.lines)
+            for line in error.lines:
+                self.append(label + line)
+                if name:
+                    self._alike.setdefault(self[-1].replace(one_line(name), ""), []).append(self[-1])
 
     def raise_if_any(self) -> None:
         """Raise one InputError with all that was noted.
@@ -67,5 +82,10 @@ class Problems(list[str]):
         Raises:
             InputError: something was noted.
         """
-        if self:
-            raise InputError(*self)
+        lines = list(self)
+        for first, *others in self._alike.values():
+            if len(others) >= FEW:
+                lines[lines.index(first)] += f" {len(others)} others have the same fault."
+                lines = [line for line in lines if line not in set(others)]
+        if lines:
+            raise InputError(*lines)

@@ -5,11 +5,13 @@ from typing import Literal
 
 import numpy as np
 import torch
-from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses, rotation_matrix_between
 
-from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.input_errors import OPTION, InputError
 
 Orientation = Literal["pca", "up", "vertical", "none"]
+_LEAST_UP = 0.1
+"""Length of the mean of unit vectors below which they are taken to cancel."""
 Center = Literal["poses", "focus", "none"]
 
 
@@ -64,10 +66,22 @@ def normalizing_similarity(
     near = torch.eye(4).repeat(len(poses), 1, 1)
     near[:, :3, :3] = torch.from_numpy(poses[..., :3])
     near[:, :3, 3] = torch.from_numpy(poses[..., 3] - middle)
-    _, transform = auto_orient_and_center_poses(near, method=orientation, center_method=center)
+    turn = torch.eye(3)
+    if orientation in ("up", "vertical") and near[:, :3, 1].mean(dim=0).norm() < _LEAST_UP:
+        # Up vectors cancel, as in flights that look down and turn about: what is behind the cameras is up.
+        orientation, behind = "none", near[:, :3, 2].mean(dim=0)
+        if behind.norm() >= _LEAST_UP:
+            turn = rotation_matrix_between(behind, torch.tensor([0.0, 0.0, 1.0]))
+        near[:, :3] = turn @ near[:, :3]
+    try:
+        _, transform = auto_orient_and_center_poses(near, method=orientation, center_method=center)
+    except torch.linalg.LinAlgError:  # of the point that parallel cameras look at
+        _, transform = auto_orient_and_center_poses(near, method=orientation, center_method="poses")
+    transform[:, :3] = transform[:, :3] @ turn
     transform = transform.numpy().astype(np.float64)
     if not np.isfinite(transform).all():
-        raise InputError("the cameras define no upward direction; set --orientation-method none.")
+        fix = f"set {OPTION}orientation-method none and center-method none"
+        raise InputError(f"the cameras define no orientation or centre; {fix}.")
     u, _, vt = np.linalg.svd(transform[:, :3])
     rotation = u @ vt
     # With center "none" nerfstudio keeps the origin, so `middle` must not be taken off.
@@ -75,5 +89,5 @@ def normalizing_similarity(
     centered = Similarity(rotation, translation, 1.0)
     reach = np.abs(centered.poses(poses)[..., 3]).max()
     if auto_scale and reach == 0:
-        raise InputError("all cameras are at the origin; set --auto-scale-poses False.")
+        raise InputError(f"all cameras are at the origin; set {OPTION}auto-scale-poses False.")
     return Similarity(rotation, translation, scale_factor / reach if auto_scale else scale_factor)

@@ -1,11 +1,19 @@
 """Decides which folder each photo is read from, and checks all of them before training."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
-from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.input_errors import OPTION, InputError, Problems
 from abcd_ns.data.photos import PhotoSource
-from abcd_ns.data.picture_files import SUFFIXES, check_complete, is_turned, read_header
+from abcd_ns.data.picture_files import (
+    SUFFIXES,
+    FileFinder,
+    check_complete,
+    is_turned,
+    read_header,
+    visible_files,
+)
 from abcd_ns.data.scene import Frame, Scene
 
 
@@ -36,12 +44,47 @@ def locate_photos(scene: Scene, factor: int) -> tuple[list[PhotoSource], list[st
         return _check_folder(full, 1, scene.frames, factor), notes + _unposed(full, scene)
     if not copies:
         count, example = len(scene.frames), next((frame.name for frame in scene.frames), "none")
-        raise InputError(f"{full} does not exist: put the {count} photos there ({example}, ...).")
+        raise InputError(
+            f"{full} does not exist: put the {count} photos there ({example}, ...){_hint(scene)}."
+        )
     of = max((n for n in copies if factor % n == 0), default=min(copies))
     if factor % of:
         found = of * max(factor // of, 1)
         notes.append(f"{full} does not exist: {copies[of]} is used, at 1/{found} and not 1/{factor}.")
     return _check_folder(copies[of], of, scene.frames, max(factor, of)), notes
+
+
+def _hint(scene: Scene) -> str:
+    """Where the photos of a COLMAP model seem to lie."""
+    end = f"/{scene.frames[0].name}" if scene.frames and scene.model.is_dir() else None
+    found = (path.as_posix() for path in visible_files(scene.root))
+    at = next((path.removesuffix(end) for path in found if end and path.endswith(end)), None)
+    return f", or set {OPTION}images-path {os.path.relpath(at, scene.root)}" if at else ""
+
+
+def as_stored(scene: Scene) -> Scene:
+    """The scene with cameras of the photos' size, where all photos are the same share of what cameras say.
+
+    The first photo is looked at; only if it has another size than its camera, so are all.
+    """
+    finder, problems, sizes = FileFinder(scene.photo_folder, scene.model), Problems(), []
+    for frame in scene.frames:
+        with problems.collect():
+            sizes.append(read_header(finder.find(frame.name)).size)
+        if problems or sizes[0] == frame.lens.size:
+            return scene
+    pairs = list(zip(sizes, (frame.lens.size for frame in scene.frames), strict=True))
+    (have, _), (want, _) = share = max(pairs, default=((1, 1), (1, 1)))
+    fits = all(abs(h * want - w * have) < want for pair in pairs for h, w in zip(*pair, strict=True))
+    if not fits:
+        return scene
+    frames = [replace(f, lens=f.lens.resized(*size)) for f, size in zip(scene.frames, sizes, strict=True)]
+    (width, height), (of_width, of_height) = share
+    note = (
+        f"The photos in {scene.photo_folder} are {have / want:.3g} times as large as their cameras, as "
+        f"{width} x {height} px and {of_width} x {of_height}: cameras are scaled to them."
+    )
+    return replace(scene, frames=frames, notes=[*scene.notes, note])
 
 
 def assume_photos(scene: Scene, factor: int) -> list[PhotoSource]:
@@ -67,14 +110,18 @@ def _reduced_folders(scene: Scene) -> dict[int, Path]:
 
 def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> list[PhotoSource]:
     """The files of `frames` in a folder of photos reduced by `of`, to be reduced by `factor` in all."""
-    problems, files = Problems(), []
+    problems, finder = Problems(), FileFinder(folder, folder)
+    files: list[PhotoSource] = []
+    meant: dict[Path, str] = {}
     for frame in frames:
-        with problems.collect():
-            path = folder / frame.name
+        with problems.collect(name=frame.name):
+            path = finder.find(frame.name)
             header = read_header(path)
             _check_size(path, header.size, frame, of)
             check_complete(path, header)
             files.append(PhotoSource(path, header.size, _reduce(str(path), header.size, factor // of)))
+            if (other := meant.setdefault(path, frame.name)) != frame.name:
+                raise InputError(f"{path} is all there is of {other} and of {frame.name}; copy both there.")
     problems.raise_if_any()
     return files
 
@@ -82,7 +129,9 @@ def _check_folder(folder: Path, of: int, frames: list[Frame], factor: int) -> li
 def _reduce(label: str, size: tuple[int, int], factor: int) -> tuple[int, int]:
     width, height = size[0] // factor, size[1] // factor
     if width == 0 or height == 0:
-        raise InputError(f"{label}: --downscale-factor leaves nothing of {size[0]} x {size[1]} px; lower it.")
+        raise InputError(
+            f"{label}: {OPTION}downscale-factor leaves nothing of {size[0]} x {size[1]} px; lower it."
+        )
     return width, height
 
 
@@ -107,7 +156,7 @@ def _unposed(folder: Path, scene: Scene) -> list[str]:
     """A note on photos that the model knows nothing of: training goes on without them."""
     posed = {os.path.abspath(folder / frame.name) for frame in scene.frames}
     known = posed | {os.path.abspath(frame.mask_path) for frame in scene.frames if frame.mask_path}
-    found = (p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and not p.is_dir())
+    found = (path for path in visible_files(folder) if path.suffix.lower() in SUFFIXES)
     extra = sorted(str(p.relative_to(folder)) for p in found if os.path.abspath(p) not in known)
     if not extra:
         return []

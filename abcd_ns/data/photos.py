@@ -5,6 +5,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Literal
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import psutil
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Num, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -26,6 +27,7 @@ READERS = 4
 FEWEST_AHEAD = 12
 """Photos that are read ahead of whoever asks for them, beyond the budget: a step's, and those of the next."""
 _MASK_USED = 255
+_LOSSY = ("JPEG", "MPO", "WEBP")
 _Key = tuple[Literal["image", "mask"], int]
 """What is read, and of which source."""
 
@@ -42,7 +44,7 @@ class PhotoSource:
     undistortion: Undistortion | None = None
     """From the reduced photo to the final one; None leaves the pixels as they are."""
     mask_path: Path | None = None
-    """A picture of the stored size or in the same proportion; pixels that are not 0 are used."""
+    """A picture of the stored size or in the same proportion; see `visible` for which pixels are used."""
     alpha_color: tuple[float, float, float] | None = None
     """What lies behind transparent pixels, 0 to 1; None keeps the alpha channel."""
 
@@ -145,8 +147,8 @@ class Photos:
         return value
 
 
-def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UInt8[np.ndarray, "y x c"]:
-    """The mean of the source's area that each pixel of the result covers, rounded to 8 bits.
+def area_reduce(image: Num[np.ndarray, "h w c"], size: tuple[int, int]) -> Num[np.ndarray, "y x c"]:
+    """The mean of the source's area that each pixel of the result covers, of the same type.
 
     Args:
         size: (width, height) of the result, at most the source's; the ratio need not be whole.
@@ -157,44 +159,87 @@ def area_reduce(image: UInt8[np.ndarray, "h w c"], size: tuple[int, int]) -> UIn
     return reduced.reshape(size[1], size[0], image.shape[2])
 
 
+def weighted_by_alpha(
+    image: UInt8[np.ndarray, "h w c"], change: Callable[[np.ndarray], np.ndarray]
+) -> UInt8[np.ndarray, "y x c"]:
+    """A resampled photo; with alpha, colours are resampled times alpha, so that what lies below transparent
+    pixels does not show.
+
+    Args:
+        change: resamples each channel, of uint8 or float32.
+    """
+    if image.shape[2] < 4 or (image[..., 3] == 255).all():
+        return change(image)
+    alpha = image[..., 3:].astype(np.float32) / 255
+    changed = change(np.concatenate([image[..., :3] * alpha, image[..., 3:]], axis=2, dtype=np.float32))
+    changed[..., :3] *= 255 / np.maximum(changed[..., 3:], 1e-3)
+    return np.rint(changed).clip(0, 255).astype(np.uint8)
+
+
+def visible(picture: Image.Image) -> Bool[np.ndarray, "h w"]:
+    """Which pixels of a mask are used: neither black nor transparent.
+
+    In grey masks with values of 128 or more, and in lossy files, all below three quarters of the largest is
+    black: edges are soft. In others any value but 0 may be a label, also that of a palette without colours.
+    """
+    alpha = np.array(picture.convert("RGBA"))[..., 3] if has_alpha(picture) else np.uint8(255)
+    if picture.mode.startswith(("I", "F")):
+        colors = np.array(picture)[..., None]
+    else:
+        colors = np.atleast_3d(picture.convert("L" if picture.mode in ("1", "L", "LA") else "RGB"))
+        if picture.mode == "P" and not colors.any():
+            colors = np.array(picture)[..., None]
+    value = colors.max(axis=2)
+    grey = (colors == colors[..., :1]).all()
+    soft = picture.format in _LOSSY or (grey and value.max() >= 128)
+    return (value > (value.max() * 0.75 if soft else 0)) & (alpha >= 128)
+
+
 def reduces_to(stored: tuple[int, int], size: tuple[int, int]) -> bool:
     """Whether a picture is large enough for a size, and of its proportion to half a pixel of the result."""
     (wide, high), (width, height) = stored, size
     return wide >= width and high >= height and abs(wide / high * height - width) <= max(1, width / height)
 
 
-def _decode(path: Path, keeps_alpha: Callable[[Image.Image], bool]) -> np.ndarray:
-    """uint8 [H, W, 3 or 4] as stored."""
+def _decode(path: Path, pixels: Callable[[Image.Image], np.ndarray]) -> np.ndarray:
+    """What `pixels` gives of a file's picture."""
     try:
         with open_picture(path) as picture:
-            return np.array(picture.convert("RGBA" if keeps_alpha(picture) else "RGB"))
+            return pixels(picture)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise undecodable(path, error) from None
 
 
+def _as_stored(picture: Image.Image) -> UInt8[np.ndarray, "h w c"]:
+    return np.array(picture.convert("RGBA" if has_alpha(picture) else "RGB"))
+
+
 def _read_photo(source: PhotoSource) -> Tensor:
-    image = _decode(source.path, has_alpha)
+    image = _decode(source.path, _as_stored)
     if (image.shape[1], image.shape[0]) != source.stored:
         wanted = f"{source.stored[0]} x {source.stored[1]}"
         raise InputError(f"{source.path} is no longer {wanted} px; put the photo back.")
     if source.alpha_color is not None and image.shape[2] == 4:
         alpha, behind = image[..., 3:].astype(np.float32) / 255, 255 * np.float32(source.alpha_color)
         image = np.rint(image[..., :3] * alpha + behind * (1 - alpha)).astype(np.uint8)
-    image = area_reduce(image, source.reduced)
-    if source.undistortion:
-        image = source.undistortion.apply(image)
+    flat = source.undistortion
+    if flat or source.reduced != source.stored:
+        reduced = partial(area_reduce, size=source.reduced)
+        image = weighted_by_alpha(
+            image, lambda pixels: flat.apply(reduced(pixels)) if flat else reduced(pixels)
+        )
     return torch.from_numpy(image)
 
 
 def _read_mask(source: PhotoSource) -> Tensor:
-    mask = _decode(source.mask_path, lambda _: False).max(axis=2, keepdims=True)
+    mask = _decode(source.mask_path, visible)[..., None]
     width, height = source.reduced
     if not reduces_to((mask.shape[1], mask.shape[0]), source.reduced):  # masks_N and full-size masks both do
         shape = f"{mask.shape[1]} x {mask.shape[0]}"
         raise InputError(
             f"{source.mask_path}: {shape} px, unlike its photo ({width} x {height}); replace it."
         )
-    used = area_reduce(np.where(mask > 0, np.uint8(_MASK_USED), np.uint8(0)), source.reduced)
+    used = area_reduce(mask * np.uint8(_MASK_USED), source.reduced)
     used = np.where(used == _MASK_USED, used, 0)
     if source.undistortion:
         used = source.undistortion.apply(used)

@@ -2,9 +2,12 @@
 
 import os
 import stat
+import unicodedata
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cached_property
+from pathlib import Path, PureWindowsPath
 
 from PIL import ExifTags, Image, UnidentifiedImageError
 
@@ -16,8 +19,11 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 UNREAD = frozenset({".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"})
 """Pictures that cameras and phones write, and nothing here reads."""
 
+_HIDDEN = (".", "@eaDir", "__MACOSX")
+"""How names begin that no program lists as a photo."""
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 """What is read, by content and not by name. Pillow knows more, some of which it gives to other programs."""
+Image.MAX_IMAGE_PIXELS = 500_000_000  # Pillow's own limit is 89 million: aerial cameras have up to 450
 _MODES = frozenset({"RGB", "RGBA", "L", "LA", "P", "1"})
 _ENDS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND\xaeB`\x82"}
 _PNG_BIT_DEPTH_BYTE = 24
@@ -45,20 +51,90 @@ def check_regular(path: Path, kind: str = "photo") -> None:
         status = path.stat()
     except OSError as error:
         what = "is a link to nothing" if path.is_symlink() else f"cannot be read ({error.strerror})"
-        other = _other_ending(path)
-        fix = f"copy the {kind} there" if other is None else f"{other.name} is there: rename it"
-        raise InputError(f"{path} {what}; {fix}.") from None
+        raise InputError(f"{path} {what}; copy the {kind} there.") from None
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path} is not a regular file; copy the {kind} there.")
     if status.st_size == 0:
         raise InputError(f"{path} is empty; copy the {kind} again.")
 
 
-def _other_ending(path: Path) -> Path | None:
-    """A photo of the same name with another ending, as .JPG for .jpg, if there is one."""
-    endings = (ending for suffix in sorted(SUFFIXES) for ending in (suffix, suffix.upper()))
-    found = (path.with_suffix(ending) for ending in endings if ending != path.suffix)
-    return next((other for other in found if os.path.lexists(other)), None) if path.stem else None
+class FileFinder:
+    """Finds files of a folder by what another file calls them, as written on another machine perhaps.
+
+    Args:
+        folder: no path leads out of it. The check is by name: a link inside may point anywhere.
+        said_by: the file that names them, for messages.
+    """
+
+    def __init__(self, folder: Path, said_by: Path):
+        self.folder, self.said_by = folder, said_by
+        self._renamed: dict[str, Path] = {}
+
+    def find(self, name: str, moved: bool = True) -> Path:
+        """The file of that name; or else the only one that differs in separators, case, Unicode form or a
+        picture's ending; or else the path as it is named.
+
+        Args:
+            moved: the folders that come first in the name may be missing, as those of another machine.
+
+        Raises:
+            InputError: the path leaves the folder, and no file inside is meant; or no file can be called so.
+        """
+        try:
+            os.fsencode(name)
+        except UnicodeEncodeError:
+            raise InputError(f"{self.said_by}: no file can have the name {name}; correct the path.") from None
+        path = Path(os.path.abspath(self.folder / name))
+        leaves = "\0" in name or not path.is_relative_to(os.path.abspath(self.folder))
+        if not leaves and os.path.lexists(path):
+            return path
+        parts = [part for part in PureWindowsPath(name).parts if part != ".."]
+        for start in range(len(parts) if moved else 1):
+            key = _loosely("/".join(parts[start:]))
+            meant = self._files.get(key) or self._files.get(_without_ending(key), [])
+            if len(meant) == 1:
+                self._renamed[name] = meant[0]
+                return meant[0]
+        if leaves:
+            leads = f"the path {name} leads out of {self.folder}"
+            raise InputError(f"{self.said_by}: {leads}; move the file inside.")
+        return path
+
+    @property
+    def notes(self) -> list[str]:
+        """How many files are read under other names than they were called by, if there are any."""
+        renamed = {
+            name: path.relative_to(os.path.abspath(self.folder)) for name, path in self._renamed.items()
+        }
+        example = next((f"{name} is {path}" for name, path in renamed.items()), None)
+        return [f"{self.said_by}: {len(renamed)} files have other names ({example}, ...)."] if example else []
+
+    @cached_property
+    def _files(self) -> dict[str, list[Path]]:
+        """All files by their path inside the folder, and pictures by it without the ending, too."""
+        found: dict[str, list[Path]] = {}
+        root = Path(os.path.abspath(self.folder))
+        for path in visible_files(root):
+            key = _loosely(path.relative_to(root).as_posix())
+            for each in {key, _without_ending(key)}:
+                found.setdefault(each, []).append(path)
+        return found
+
+
+def visible_files(folder: Path) -> Iterator[Path]:
+    """All files below a folder but for those that systems hide there, as macOS's ._a.jpg and Synology's @eaDir."""
+    for at, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(_HIDDEN)]
+        yield from (Path(at, name) for name in names if not name.startswith(_HIDDEN))
+
+
+def _loosely(path: str) -> str:
+    return unicodedata.normalize("NFC", path).casefold()
+
+
+def _without_ending(key: str) -> str:
+    stem, ending = os.path.splitext(key)
+    return stem if ending in SUFFIXES | UNREAD else key
 
 
 def open_picture(path: Path) -> Image.Image:
@@ -92,7 +168,7 @@ def read_header(path: Path, check_kind: bool = True) -> Header:
         check_kind: refuse what is not converted to 8-bit RGB without loss; of masks it does not matter.
 
     Raises:
-        InputError: missing, empty, a pipe, no picture of FORMATS, over 89 Mpx; or 16 bits deep or CMYK.
+        InputError: missing, empty, a pipe, no picture of FORMATS, over 500 Mpx; or 16 bits deep or CMYK.
     """
     check_regular(path)
     try:
@@ -104,7 +180,7 @@ def read_header(path: Path, check_kind: bool = True) -> Header:
                 return Header(picture.size, picture.format or "")
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
         fix = "reduce the photo and make the model again" if check_kind else "reduce the mask"
-        raise InputError(f"{path} has more than 89 Mpx; {fix}.") from None
+        raise InputError(f"{path} has more than 500 Mpx; {fix}.") from None
     except UnidentifiedImageError:
         raise InputError(f"{path} is not a picture of a known kind; save it as JPEG or PNG.") from None
     except (OSError, SyntaxError, ValueError) as error:

@@ -16,13 +16,27 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
 GREY = 127
 """Colour of points that come without one."""
+_COLORS = tuple(
+    (f"{prefix}{red}", f"{prefix}{green}", f"{prefix}{blue}")
+    for red, green, blue in (("red", "green", "blue"), ("r", "g", "b"))
+    for prefix in ("", "diffuse_", "vertex_", "scalar_")
+)
+"""What programs call colours, in lower case."""
+_HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
+"""What files of Gaussians have in their place: colour = 0.5 + Y00 x coefficient (Kerbl et al., 2023)."""
+_Y00 = 0.28209479177387814
+_WHITES = (255, 65_535, 4_294_967_295)
+"""What the brightest colour may be."""
+_OVERSHOOT = 2
+"""Times white: real numbers above it are still counted from that white, and clipped."""
 
 
-def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """The vertices of a .ply file, ascii or binary.
 
     Returns:
-        (xyz float64 [n, 3], rgb uint8 [n, 3]); float colours are taken as 0 to 1, missing ones as grey.
+        (xyz float64 [n, 3], rgb uint8 [n, 3], or None in a file without colours). White is what the type and
+        the largest value say: 1 in real numbers, 255, 65535 or 2^32 - 1.
 
     Raises:
         InputError: missing, not a .ply with x, y and z in its first element, or not as long as it claims.
@@ -38,14 +52,14 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         order, count, row, alone = _parse_header(content[:end].decode("ascii", "replace"))
         points = (_read_text if order == "=" else _read_binary)(content[start:], count, row, alone)
     except ValueError as error:
-        fix = "write the points again, or remove ply_file_path to start from random points"
+        fix = "write the points again, or remove the file and any ply_file_path to start at random"
         raise InputError(f"{path} {error}; {fix}.") from None
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64)
     return xyz, _colors(points)
 
 
 def _parse_header(header: str) -> tuple[str, int, np.dtype, bool]:
-    """(byte order, rows, type of a row, whether nothing follows the vertices)."""
+    """(byte order, rows, type of a row with names in lower case, whether nothing follows the vertices)."""
     order, elements = None, []
     try:
         for words in (line.split() for line in header.splitlines()):
@@ -54,7 +68,7 @@ def _parse_header(header: str) -> tuple[str, int, np.dtype, bool]:
             elif words[:1] == ["element"]:
                 elements.append((words[1], int(words[2]), []))
             elif words[:1] == ["property"] and len(elements) == 1:
-                elements[0][2].append((words[2], order + _TYPES[words[1]]))
+                elements[0][2].append((words[2].lower(), order + _TYPES[words[1]]))
         name, count, fields = elements[0]
         row = np.dtype(fields)
     except (KeyError, IndexError, TypeError, ValueError):  # also where no format was given before
@@ -82,12 +96,18 @@ def _read_binary(body: bytes, count: int, row: np.dtype, alone: bool) -> np.ndar
     return np.frombuffer(body, dtype=row, count=count)
 
 
-def _colors(points: np.ndarray) -> np.ndarray:
-    """uint8 [n, 3] of red, green and blue."""
-    names = ("red", "green", "blue")
-    if not set(names) <= set(points.dtype.names or ()):
-        return np.full((len(points), 3), GREY, dtype=np.uint8)
+def _colors(points: np.ndarray) -> np.ndarray | None:
+    """uint8 [n, 3] of red, green and blue; None without them."""
+    present = set(points.dtype.names or ())
+    names = next((names for names in (*_COLORS, _HARMONICS) if present.issuperset(names)), None)
+    if names is None:
+        return None
     rgb = np.stack([points[name] for name in names], axis=1)
+    whites, slack = _WHITES, 1
     if np.issubdtype(rgb.dtype, np.floating):
-        rgb = np.nan_to_num(rgb) * 255
-    return np.clip(np.round(rgb), 0, 255).astype(np.uint8)
+        rgb = np.where(np.isfinite(rgb), rgb, 0)
+        whites, slack = (1, *_WHITES), _OVERSHOOT
+    if names == _HARMONICS:
+        rgb, whites = 0.5 + _Y00 * rgb, (1,)
+    white = next((white for white in whites if rgb.max(initial=0) <= slack * white), whites[-1])
+    return np.clip(np.round(rgb * (255 / white)), 0, 255).astype(np.uint8)

@@ -1,6 +1,7 @@
 """Reads and checks everything that a scene consists of, once for all of its splits."""
 
 import math
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +11,13 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
-from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_model, read_colmap
-from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_models, read_colmap
+from abcd_ns.data.input_errors import OPTION, InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
-from abcd_ns.data.photo_folders import assume_photos, locate_photos
+from abcd_ns.data.photo_folders import as_stored, assume_photos, locate_photos
 from abcd_ns.data.photos import Photos, PhotoSource
-from abcd_ns.data.picture_files import read_header
+from abcd_ns.data.picture_files import read_header, visible_files
+from abcd_ns.data.ply import GREY
 from abcd_ns.data.scene import Lens, Scene, check_layout
 from abcd_ns.data.transforms_json import TRANSFORMS, read_split_transforms, read_transforms
 from abcd_ns.data.undistort import undistortion
@@ -23,9 +25,11 @@ from abcd_ns.progress_bar import ProgressBar
 
 MAX_AUTO_SIDE = 1600
 """Pixels along a photo's longer side, at most, where nothing is said: nerfstudio's MAX_AUTO_RESOLUTION."""
-DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
+DOWNSCALE = f"{OPTION}downscale-factor"
 """The option by which something is said."""
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
+_MODEL_FILES = ("cameras.bin", "cameras.txt", f"{TRANSFORMS}.json", f"{TRANSFORMS}_train.json")
+"""By which a model is found where nobody looks for it."""
 
 
 @dataclass
@@ -36,11 +40,13 @@ class SceneOptions(DataParserConfig):
     """A folder with sparse/0, colmap/sparse/0 or sparse (COLMAP, .bin or .txt) and images, or with
     transforms.json or transforms_train.json; or a transforms.json file itself. Where several are, COLMAP's
     model is taken."""
+    colmap_path: Path | None = None
+    """The folder of the COLMAP model, from `data`. None takes that with most photos."""
     images_path: Path = IMAGES
     """The folder of a COLMAP model's photos, from `data`."""
     masks_path: Path | None = None
-    """The folder of their masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg. Black is
-    not trained on. None for no masks."""
+    """The folder of their masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg. Black and
+    transparent pixels are not trained on. A photo without a mask counts as a whole. None for no masks."""
     downscale_factor: int | None = None
     """Divides the photos' width and height. None takes the smallest of 1, 2, 4, ... with which no photo is
     wider or higher than 1,600 px, as splatfacto's data parsers do; 1 keeps photos as they are. images_N is
@@ -81,34 +87,48 @@ class Prepared:
     """What was chosen where the user said nothing."""
 
 
-def read_scene(data: Path, images: Path = IMAGES, masks: Path | None = None) -> Scene:
+def read_scene(
+    data: Path, colmap: Path | None = None, images: Path = IMAGES, masks: Path | None = None
+) -> Scene:
     """The model in `data`, COLMAP's before transforms.json, and that before transforms_train.json.
 
     Args:
+        colmap: the folder of COLMAP's model, from `data`; None takes that with most photos.
         images, masks: folders of a COLMAP model's photos and masks, from `data`.
 
     Raises:
         InputError: nothing there; says what was looked for, and where known scenes come from.
     """
     whole = data if data.suffix == ".json" else data / f"{TRANSFORMS}.json"
-    model = find_model(data)
-    if model is not None:
-        scene = read_colmap(data, model, images, masks)
+    models = find_models(data) if colmap is None else [data / colmap]
+    if models and not (whole.exists() and models == [data]):  # whose cameras.txt may be anything
+        scene = read_colmap(data, models[0], images, masks)
+        if len(models) > 1:
+            others = ", ".join(str(os.path.relpath(model, data)) for model in models[1:])
+            more = f"the others have no more photos ({others}): {OPTION}colmap-path takes one of them"
+            scene.notes.append(f"{models[0]} is used, with {len(scene.frames)} photos; {more}.")
         if whole.exists():
-            scene.notes.append(f"{model} is used; give --data {whole} for the other.")
+            scene.notes.append(f"{models[0]} is used; give --data {whole} for the other.")
         return scene
     found = next((path for path in (whole, data / f"{TRANSFORMS}_train.json") if path.exists()), None)
     if found is not None and (images, masks) != (IMAGES, None):
-        raise InputError(f"{found} names photos and masks itself: leave out --images-path and --masks-path.")
+        fix = f"leave out {OPTION}images-path and masks-path"
+        raise InputError(f"{found} names photos and masks itself: {fix}.")
     if found is not None:
         return read_transforms(found) if found == whole else read_split_transforms(data)
-    if data.name in MIP_NERF_360:
+    elsewhere = next((path for path in visible_files(data) if path.name in _MODEL_FILES), None)
+    if elsewhere is not None:
+        folder = elsewhere.parent
+        hint = f"a model lies in {folder}: set {OPTION}colmap-path {folder.relative_to(data)}."
+        if elsewhere.suffix == ".json":
+            hint = f"give --data {elsewhere}."
+    elif data.name in MIP_NERF_360:
         hint = f"download {data.name} from https://jonbarron.info/mipnerf360 and unpack it there."
     else:
         hint = f"give a folder with a COLMAP model, or make one of {data}/images with `abcd poses {data}`."
     if not data.exists():
         raise InputError(f"--data {data} does not exist; {hint}")
-    looked = ", ".join(f"{folder}/cameras.bin|txt" for folder in MODEL_FOLDERS)
+    looked = ", ".join(f"{folder.replace('*', '0')}/cameras.bin|txt" for folder in MODEL_FOLDERS)
     raise InputError(f"--data {data} holds no model (looked for {looked} and transforms.json); {hint}")
 
 
@@ -123,12 +143,13 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     """
     wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
-        raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
+        raise InputError(f"{DOWNSCALE} is {wanted}; it must be a whole number from 1.")
     if not 0 < options.scale_factor < math.inf:
-        raise InputError(f"--scale-factor is {options.scale_factor}; it must be above 0 and finite.")
+        raise InputError(f"{OPTION}scale-factor is {options.scale_factor}; it must be above 0 and finite.")
     problems = Problems()
     try:
-        scene = read_scene(options.data, options.images_path, options.masks_path)
+        scene = read_scene(options.data, options.colmap_path, options.images_path, options.masks_path)
+        scene = as_stored(scene)
         factor = automatic_factor(scene) if wanted is None else int(wanted)
         with problems.collect():
             check_layout(scene)
@@ -147,6 +168,9 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     lists = scene.split_lists
     if lists and (both := len(lists.train & lists.held_out)):
         more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
+    masked = sum(source.mask_path is not None for source in sources)
+    if 0 < masked < len(sources):
+        more.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
     reduced = [_reduction(scene, sources, factor)] if wanted is None and factor > 1 and needs_photos else []
     notes = (*scene.notes, *notes, *more)
     return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, tuple(reduced))
@@ -240,6 +264,10 @@ def _points(scene: Scene, similarity: Similarity) -> tuple[dict[str, Tensor], np
             "with `point_triangulator` of the program colmap, or the whole model by `abcd poses`."
         )
         return {}, np.empty((0, 3)), notes
-    rgb = np.ascontiguousarray(scene.points_rgb[good])
+    rgb = scene.points_rgb
+    if rgb is None:
+        notes.append(f"{scene.model}: the points have no colours: Gaussians start grey.")
+        rgb = np.full(xyz.shape, GREY, np.uint8)
+    rgb = np.ascontiguousarray(rgb[good])
     metadata = {"points3D_xyz": torch.from_numpy(xyz[good]), "points3D_rgb": torch.from_numpy(rgb)}
     return metadata, scene.points_xyz[good], notes

@@ -1,7 +1,6 @@
 """A scene as its model file describes it, before any scaling: lenses, frames and points."""
 
 import math
-import os
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -80,8 +79,8 @@ class Scene:
     frames: list[Frame]
     points_xyz: np.ndarray
     """float64 [n, 3], world of the Scene."""
-    points_rgb: np.ndarray
-    """uint8 [n, 3]."""
+    points_rgb: np.ndarray | None
+    """uint8 [n, 3]; None where the model gives no colours."""
     applied_transform: np.ndarray = field(default_factory=lambda: np.eye(4)[:3])
     """float64 [3, 4]: world of the Scene = applied_scale x (applied_transform @ original coordinates)."""
     applied_scale: float = 1.0
@@ -89,24 +88,6 @@ class Scene:
     """Which frames are trained on and which are held out, if the data say so."""
     notes: list[str] = field(default_factory=list)
     """What the user should know but need not repair."""
-
-
-def inside(root: Path, relative: str, said_by: Path) -> Path:
-    """root / relative, for a path that a file names.
-
-    The check is by name: a link that the user laid inside the root may point anywhere.
-
-    Raises:
-        InputError: the path leaves `root`.
-    """
-    try:
-        os.fsencode(relative)
-    except UnicodeEncodeError:
-        raise InputError(f"{said_by}: no file can have the name {relative}; correct the path.") from None
-    path = Path(os.path.abspath(root / relative))
-    if not path.is_relative_to(os.path.abspath(root)) or "\0" in relative:
-        raise InputError(f"{said_by}: the path {relative} leads out of {root}; move the file inside.")
-    return path
 
 
 def check_lens(lens: Lens, label: str) -> None:

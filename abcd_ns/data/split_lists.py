@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from abcd_ns.data.input_errors import InputError, Problems
+from abcd_ns.data.input_errors import OPTION, InputError, Problems
 
 SPLITS = ("train", "val", "test")
 _NAMED = 3
@@ -61,14 +61,17 @@ def split_lists(
     for side, names in (("train on", train), ("hold out", held_out)):
         if not names:
             problems.append(
-                f"{next(iter(labels.values()))} leaves nothing to {side}; set --eval-mode interval."
+                f"{next(iter(labels.values()))} leaves nothing to {side}; set {OPTION}eval-mode interval."
             )
     problems.raise_if_any()
     return SplitLists(train, held_out)
 
 
-def read_list_files(data: Path, known: Sequence[str]) -> SplitLists | None:
+def read_list_files(data: Path, known: Mapping[str, str]) -> SplitLists | None:
     """The split of train_list.txt, val_list.txt and test_list.txt in `data`: a photo's name in each line.
+
+    Args:
+        known: the name of each frame, by what the model calls it.
 
     Raises:
         InputError: as `split_lists`, or a list cannot be read.
@@ -78,9 +81,9 @@ def read_list_files(data: Path, known: Sequence[str]) -> SplitLists | None:
         path = data / f"{split}_list.txt"
         if path.is_file():
             try:
-                lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+                lines = path.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()
             except OSError as error:
                 raise InputError(f"{path} cannot be read ({error.strerror}); remove or replace it.") from None
             found[split] = [line.strip() for line in lines if line.strip()]
             labels[split] = str(path)
-    return split_lists(found, {name: name for name in known}, labels)
+    return split_lists(found, {name: name for name in known.values()} | dict(known), labels)

@@ -11,17 +11,26 @@ from typing import Any
 import numpy as np
 
 from abcd_ns.data.input_errors import InputError, Problems
-from abcd_ns.data.picture_files import read_header
+from abcd_ns.data.picture_files import FileFinder, read_header
 from abcd_ns.data.ply import read_points
-from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, inside, rigid
+from abcd_ns.data.scene import Frame, Lens, Scene, check_lens, rigid
 from abcd_ns.data.split_lists import SPLITS, SplitLists, split_lists
 
 TRANSFORMS = "transforms"
 """What the file is called, before its ending or the name of a split."""
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_FISHEYES = ("OPENCV_FISHEYE",)
+_FISHEYES = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 LARGEST = sys.float_info.max
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4")
+_SPELLINGS = (
+    (("camera_model",), ("is_fisheye",)),
+    (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov")),
+    (("distortion_params",), _COEFFICIENTS),
+)
+"""Keys that say the same, those that win first. A frame's spelling hides the other ones of the file."""
+_UNREAD = ("k5", "k6", "p3", "p4", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "omega", "xi", "rolling_shutter",
+           "latlong", "equirectangular", *(f"ftheta_p{k}" for k in range(5)))  # fmt: skip
+"""Keys of a camera that other programs know. Where they are not zero the photos would be read wrongly."""
 
 
 def read_transforms(path: Path) -> Scene:
@@ -38,23 +47,15 @@ def read_transforms(path: Path) -> Scene:
             frames are listed.
     """
     meta = _load(path)
-    root, problems = path.parent, Problems()
-    model = str(meta.get("camera_model", "OPENCV"))
-    if model not in _PINHOLES + _FISHEYES:
-        known = ", ".join(_PINHOLES + _FISHEYES)
-        raise InputError(f"{path}: camera_model {model} is not one of {known}; undistort the photos first.")
-    fisheye = model in _FISHEYES or bool(meta.get("is_fisheye", False))
-    frames = []
+    root, problems, frames = path.parent, Problems(), []
+    files = FileFinder(root, path)
     for number, entry in enumerate(meta["frames"]):
-        with problems.collect():
-            frames.append(_frame(path, meta, entry, number, fisheye))
-    xyz, rgb = np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8)
+        with problems.collect(name=str(entry.get("file_path"))):
+            frames.append(_frame(path, files, meta, entry, number))
+    xyz, rgb = np.empty((0, 3)), None
     with problems.collect():
-        if "ply_file_path" in meta:
-            xyz, rgb = read_points(inside(root, str(meta["ply_file_path"]), path))
-    masks = sum(frame.mask_path is not None for frame in frames)
-    if 0 < masks < len(frames):
-        problems.append(f"{path}: {masks} of {len(frames)} frames have a mask_path; give one to all or none.")
+        if meta.get("ply_file_path"):
+            xyz, rgb = read_points(files.find(str(meta["ply_file_path"])))
     with problems.collect():
         given = _matrix(meta.get("applied_transform", np.eye(4)), path)
         transform = rigid(given, f"{path}: applied_transform")
@@ -63,10 +64,11 @@ def read_transforms(path: Path) -> Scene:
         if scale <= 0:
             problems.append(f"{path}: applied_scale is {scale:g}; it must be positive.")
     problems.raise_if_any()
+    called = {os.path.normpath(e["file_path"]): f.name for e, f in zip(meta["frames"], frames, strict=True)}
     folder, frames = _photo_folder(root, frames)
+    lists = _split_lists(path, meta, called, os.path.relpath(folder, root))
     frames.sort(key=lambda frame: frame.name)
-    lists = _split_lists(path, meta, folder.relative_to(root), [frame.name for frame in frames])
-    return Scene(path, root, folder, frames, xyz, rgb, transform, scale, lists)
+    return Scene(path, root, folder, frames, xyz, rgb, transform, scale, lists, files.notes)
 
 
 def read_split_transforms(folder: Path) -> Scene:
@@ -97,7 +99,7 @@ def _load(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path} is not a regular file; put nerfstudio's transforms.json there.")
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
+        meta = json.loads(path.read_bytes())  # in any of Unicode's encodings
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is not valid JSON ({error}); copy or make it again.") from None
     frames = meta.get("frames") if isinstance(meta, dict) else None
@@ -106,8 +108,12 @@ def _load(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _split_lists(path: Path, meta: dict[str, Any], folder: Path, names: list[str]) -> SplitLists | None:
-    """train_filenames, val_filenames and test_filenames: file_paths of frames, as nerfstudio has it."""
+def _split_lists(path: Path, meta: dict[str, Any], called: dict[str, str], folder: str) -> SplitLists | None:
+    """train_filenames, val_filenames and test_filenames: file_paths of frames, as nerfstudio has it.
+
+    Args:
+        called: the photo of each file_path, from the data root on; frames are named from `folder` on.
+    """
     found = {}
     for split in SPLITS:
         listed = meta.get(key := f"{split}_filenames", [])
@@ -115,10 +121,11 @@ def _split_lists(path: Path, meta: dict[str, Any], folder: Path, names: list[str
             raise InputError(f"{path}: {key} must be a list of file_paths.")
         if key in meta:
             found[split] = [os.path.normpath(name) for name in listed]
-    called = {str(folder / name): name for name in names}
     # As for the frames' own file_paths, the ending may be left out.
-    called |= {call.removesuffix(".png"): name for call, name in called.items()}
-    return split_lists(found, called, {split: f"{path}: {split}_filenames" for split in found})
+    called = {photo.removesuffix(".png"): photo for photo in called.values()} | called
+    known = {call: os.path.relpath(photo, folder) for call, photo in called.items()}
+    known |= {photo: os.path.relpath(photo, folder) for photo in called.values()}
+    return split_lists(found, known, {split: f"{path}: {split}_filenames" for split in found})
 
 
 def _number(values: dict[str, Any], key: str, label: str, default: float | None = None) -> float:
@@ -137,48 +144,72 @@ def _matrix(value: Any, label: object) -> np.ndarray:
         raise InputError(f"{label}: a matrix must be rows of numbers, all of one length.") from None
 
 
-def _frame(path: Path, meta: dict, entry: dict, number: int, fisheye: bool) -> Frame:
-    root, name = path.parent, entry.get("file_path")
+def _frame(path: Path, files: FileFinder, meta: dict, entry: dict, number: int) -> Frame:
+    name = entry.get("file_path")
     if not isinstance(name, str) or not name:
         raise InputError(f"{path}: frame {number} has no file_path; remove it or name its photo.")
     label = f"{path}: {name}"
-    photo = inside(root, name, path)
-    if not photo.suffix and not photo.exists():
-        photo = photo.with_suffix(".png")
+    if not Path(name).suffix and not (path.parent / name).exists():
+        name += ".png"
+    photo = files.find(name)
     pose = rigid(_matrix(entry.get("transform_matrix"), label), f"{label}: transform_matrix")
-    lens = _lens({**meta, **entry}, label, photo, fisheye)
+    lens = _lens(_camera_values(meta, entry), label, photo)
     check_lens(lens, label)
-    mask = inside(root, str(entry["mask_path"]), path) if "mask_path" in entry else None
+    mask = files.find(str(entry["mask_path"])) if entry.get("mask_path") else None
     # As nerfstudio has it, names are relative to the folder that transforms.json lies in.
-    return Frame(os.path.relpath(photo, root), pose, lens, mask)
+    return Frame(os.path.relpath(photo, path.parent), pose, lens, mask)
 
 
-def _lens(values: dict[str, Any], label: str, photo: Path, fisheye: bool) -> Lens:
-    """Intrinsics from a frame's values, which override the file's; the size may come from the photo."""
+def _camera_values(meta: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
+    """What a frame says of its camera, and what the file says where the frame does not."""
+    values = dict(meta)
+    for spellings in _SPELLINGS:
+        own = [keys for keys in spellings if not entry.keys().isdisjoint(keys)]
+        for keys in spellings if own else ():
+            if keys not in own:
+                values = {key: value for key, value in values.items() if key not in keys}
+    return values | entry
+
+
+def _lens(values: dict[str, Any], label: str, photo: Path) -> Lens:
+    """Intrinsics from a frame's values; the size may come from the photo.
+
+    Raises:
+        InputError: a value is no number, or says what is not read.
+    """
+    model = str(values.get("camera_model", "OPENCV")).upper()
+    if model not in _PINHOLES + _FISHEYES:
+        known = ", ".join(_PINHOLES + _FISHEYES)
+        raise InputError(f"{label}: camera_model {model} is not one of {known}; undistort the photos first.")
+    unread = next((key for key in _UNREAD if np.any(_matrix(values.get(key, 0), label))), None)
+    if unread:
+        fix = "undistort the photos, or remove it to train as if it were 0"
+        raise InputError(f"{label} has {unread} = {values[unread]}, which is not read; {fix}.")
+    fisheye = model in _FISHEYES or bool(values.get("is_fisheye", False))
     if "w" in values and "h" in values:
         width, height = (int(_number(values, key, label)) for key in ("w", "h"))
     else:
         width, height = read_header(photo).size
-    if "fl_x" not in values and "camera_angle_x" not in values:
+    focals = [_focal(values, "x", width, label), _focal(values, "y", height, label)]
+    given = [focal for focal in focals if focal is not None]
+    if not given:
         raise InputError(f"{label} has no focal length; give fl_x or camera_angle_x.")
-    if "fl_x" not in values:
-        angles = (("fl_x", "camera_angle_x", width), ("fl_y", "camera_angle_y", height))
-        focals = {name: _focal(values, key, size, label) for name, key, size in angles if key in values}
-        values = focals | values
-    fx = _number(values, "fl_x", label)
-    fy, cx, cy = (
-        _number(values, key, label, default)
-        for key, default in (("fl_y", fx), ("cx", width / 2), ("cy", height / 2))
-    )
-    return Lens(width, height, fx, fy, cx, cy, _distortion(values, label, fisheye), fisheye)
+    cx, cy = (_number(values, key, label, side / 2) for key, side in (("cx", width), ("cy", height)))
+    distortion = _distortion(values, label, fisheye)
+    return Lens(width, height, given[0], given[-1], cx, cy, distortion, fisheye)
 
 
-def _focal(values: dict[str, Any], key: str, size: int, label: str) -> float:
-    """Pixels: size / (2 tan(angle / 2)), for the full angle of view in radians."""
-    angle = _number(values, key, label)
-    if not 0 < angle < math.pi:
-        raise InputError(f"{label}: {key} is {angle:g} radians; it must lie between 0 and pi.")
-    return size / (2 * math.tan(angle / 2))
+def _focal(values: dict[str, Any], axis: str, size: int, label: str) -> float | None:
+    """Pixels, given or by the full angle of view: size / (2 tan(angle / 2)); None if neither is there."""
+    if f"fl_{axis}" in values:
+        return _number(values, f"fl_{axis}", label)
+    for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", math.pi / 180)):
+        if key in values:
+            angle = _number(values, key, label) * unit
+            if not 0 < angle < math.pi:
+                raise InputError(f"{label}: {key} is {angle:g} radians; it must lie between 0 and pi.")
+            return size / (2 * math.tan(angle / 2))
+    return None
 
 
 def _distortion(values: dict[str, Any], label: str, fisheye: bool) -> tuple[float, ...]:

@@ -28,7 +28,7 @@ class Undistortion:
     """Column and row of the result's first pixel before cropping."""
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """uint8 [lens.height, lens.width, c] to uint8 [pinhole.height, pinhole.width, c], bilinear."""
+        """[lens.height, lens.width, c] to [pinhole.height, pinhole.width, c] of the same type, bilinear."""
         K, coefficients = self.lens.matrix - _HALF_PIXEL, np.array(self.lens.distortion)
         x, y = self.corner
         uncropped = self.pinhole.matrix - _HALF_PIXEL

@@ -16,6 +16,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch.utils.data import DataLoader
 
 from abcd_ns.data.dataset import AbcdDataset
@@ -157,7 +158,11 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
 
     def create_eval_dataset(self) -> AbcdDataset:
         """The held-out photos; looked at one after the other, so none is kept."""
-        return self._dataset(self.dataparser.get_dataparser_outputs(split=self.test_split), 0)
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        if not outputs.image_filenames:  # as with `--eval-mode fraction --train-split-fraction 1`
+            CONSOLE.print("No view is held out: scores are of the training views.", style="yellow")
+            outputs = self.train_dataparser_outputs
+        return self._dataset(outputs, 0)
 
     def follow(self, coordinator: Trainer) -> None:
         """Serve what this coordinator asks for from now on."""

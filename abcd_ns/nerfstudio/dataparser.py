@@ -18,8 +18,8 @@ from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fractio
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from abcd_ns.data.foreign_outputs import PHOTOS, pinhole_cameras
-from abcd_ns.data.input_errors import InputError, one_line
+from abcd_ns.data.dataset import PHOTOS, pinhole_cameras
+from abcd_ns.data.input_errors import OPTION, InputError, one_line
 from abcd_ns.data.prepare import Prepared, SceneOptions, prepare
 
 
@@ -108,17 +108,18 @@ class AbcdDataParser(DataParser):
         return split_rows(len(scene.frames), split, self.config)
 
     def _generate_dataparser_outputs(self, split: str = "train", **_kwargs: Any) -> AbcdDataparserOutputs:
-        prepared, rows = self.prepared(), self.rows(split)
+        prepared, rows, as_stored = self.prepared(), self.rows(split), self.config.as_stored
         sources = [prepared.sources[row] for row in rows]
         masks = [source.mask_path for source in sources if source.mask_path]
+        if as_stored and 0 < len(masks) < len(sources):
+            raise InputError(f"{self.config.data}: only ABCD's methods take masks for some of the photos.")
         original = prepared.similarity.after(prepared.scene.applied_transform, prepared.scene.applied_scale)
         reach = self.config.scene_scale
-        as_stored = self.config.as_stored
         return AbcdDataparserOutputs(
             image_filenames=[source.path for source in sources],
             cameras=stored_cameras(prepared, rows) if as_stored else _cameras(prepared, rows),
             scene_box=SceneBox(aabb=torch.tensor([[-reach] * 3, [reach] * 3], dtype=torch.float32)),
-            mask_filenames=masks or None,
+            mask_filenames=masks if len(masks) == len(sources) > 0 else None,
             metadata={**({} if as_stored else {PHOTOS: sources}), **prepared.points},
             dataparser_transform=torch.from_numpy(original.matrix),
             dataparser_scale=original.scale,
@@ -143,12 +144,13 @@ def split_rows(count: int, split: str, config: AbcdDataParserConfig) -> list[int
         trained, held_out = get_train_eval_split_fraction(range(count), config.train_split_fraction)
         if not 0 < len(trained) < count:
             raise InputError(
-                f"--train-split-fraction {config.train_split_fraction} parts {count} views into "
+                f"{OPTION}train-split-fraction {config.train_split_fraction} parts {count} views into "
                 f"{len(trained)} to train on and {len(held_out)} to hold out; neither may be 0."
             )
         return (trained if split == "train" else held_out).tolist()
     if config.eval_interval < 2:
-        raise InputError(f"--eval-interval {config.eval_interval} must be 2 or more; or set --eval-mode all.")
+        least = "must be 2 or more; or set eval-mode all"
+        raise InputError(f"{OPTION}eval-interval {config.eval_interval} {least}.")
     return [row for row in range(count) if (row % config.eval_interval == 0) == (split != "train")]
 
 

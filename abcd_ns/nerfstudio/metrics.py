@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pytorch_msssim import ssim
 from torch import Tensor
 
@@ -19,21 +19,33 @@ FETCH = "ABCD_FETCH_LPIPS"
 
 
 def image_metrics(
-    rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"], corrected: bool = False
+    rendered: Float[Tensor, "h w 3"],
+    photo: Float[Tensor, "h w 3"],
+    corrected: bool = False,
+    mask: Bool[Tensor, "h w 1"] | None = None,
 ) -> dict[str, float]:
     """`psnr` (dB), `ssim` and, where LPIPS' weights are on this machine, `lpips`; `cc_psnr` if `corrected`.
 
-    SSIM is left out of pictures smaller than its window.
+    SSIM is left out of pictures smaller than its window. With a mask, PSNRs are of the pixels where it is true,
+    and the others of pictures that are black elsewhere.
     """
     a, b = (image.permute(2, 0, 1)[None] for image in (rendered, photo))
+    if mask is not None:
+        a, b = (image * mask[..., 0].to(image.device) for image in (a, b))
+        rendered, photo = counted(rendered, mask), counted(photo, mask)
     found = {"psnr": float(psnr(rendered, photo))}
-    if min(rendered.shape[:2]) >= SSIM_WINDOW:
+    if min(a.shape[2:]) >= SSIM_WINDOW:
         found["ssim"] = float(ssim(a, b, data_range=1.0, size_average=True))
     if corrected:
         found["cc_psnr"] = corrected_psnr(rendered, photo)
     if lpips_missing() is None:
         found["lpips"] = float(_lpips(str(rendered.device))(a.clamp(0, 1), b.clamp(0, 1)))
     return found
+
+
+def counted(picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w 1"] | None) -> Float[Tensor, "_h _w 3"]:
+    """The pixels at which a mask is true, [1, n, 3]; all without one."""
+    return picture if mask is None else picture[mask[..., 0].to(picture.device)][None]
 
 
 def corrected_psnr(rendered: Float[Tensor, "h w 3"], photo: Float[Tensor, "h w 3"]) -> float:

@@ -339,9 +339,6 @@ class AbcdModel(SplatfactoModel):
         """The coordinator's loss of a training batch; of a whole picture the photometric loss."""
         del metrics_dict
         pictures, photos = self._pairs(outputs, batch)
-        if "mask" in batch:
-            masks = as_list(batch["mask"])
-            pictures, photos = masked(pictures, masks), masked(photos, masks)
         if "batch" in outputs and self._coordinator is not None:
             return {"main_loss": self._coordinator.loss(outputs["batch"], pictures, photos)}
         height, width = pictures[0].shape[:2]
@@ -350,15 +347,16 @@ class AbcdModel(SplatfactoModel):
         return {"main_loss": loss}
 
     def _pairs(self, outputs: Values, batch: Values) -> tuple[list[Tensor], list[Tensor]]:
-        """Pictures and their photos, on the same background."""
+        """Pictures and their photos, on the same background, black where masks hide them."""
         backgrounds = zip(as_list(batch["image"]), as_list(outputs["background"]), strict=True)
         photos = [self.composite_with_background(self.get_gt_img(image), b) for image, b in backgrounds]
-        return as_list(outputs["rgb"]), photos
+        pictures, masks = as_list(outputs["rgb"]), as_list(batch.get("mask", [None] * len(photos)))
+        return masked(pictures, masks), masked(photos, masks)
 
     def get_image_metrics_and_images(self, outputs: Values, batch: Values) -> tuple[Values, Values]:
         """Metrics of a whole picture, and photo and picture side by side."""
         (picture,), (photo,) = self._pairs(outputs, batch)
-        found = image_metrics(picture, photo, self.config.color_corrected_metrics)
+        found = image_metrics(picture, photo, self.config.color_corrected_metrics, batch.get("mask"))
         return found, {"img": torch.cat([photo, picture], dim=1)}
 
     def get_gt_img(self, image: Tensor) -> Tensor:

@@ -14,7 +14,6 @@ from PIL import Image
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
-from abcd_ns.data.ply import read_points
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig, split_rows
 from tests.data.dataparser_scenes import (
     NAMES,
@@ -23,7 +22,6 @@ from tests.data.dataparser_scenes import (
     parser,
     project,
     project_pycolmap,
-    refusal,
     write_capture,
     write_model,
     write_photos,
@@ -264,36 +262,6 @@ def test_masks_of_all_frames_reach_the_dataset(scene):
     assert data["mask"].dtype == torch.bool
     assert not data["mask"][:, : width // 2].any()
     assert data["mask"][:, width // 2 :].all()
-    del meta["frames"][0]["mask_path"]
-    (scene / "transforms.json").write_text(json.dumps(meta))
-    assert "9 of 10 frames have a mask_path" in refusal(scene)
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_binary_ply(tmp_path, order):
-    xyz, rgb = np.arange(12.0).reshape(4, 3), np.arange(12, dtype=np.uint8).reshape(4, 3)
-    row = [(name, order + "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    table = np.array([(*p, *c) for p, c in zip(xyz, rgb, strict=True)], dtype=row)
-    kind = "little" if order == "<" else "big"
-    types = "".join(f"property {'uchar' if t == 'u1' else 'float'} {name}\n" for name, t in row)
-    form = f"comment some\nformat binary_{kind}_endian 1.0\n"
-    head = f"ply\n{form}element vertex 4\n{types}end_header\n".encode()
-    path = tmp_path / "points.ply"
-    path.write_bytes(head + table.tobytes())
-    assert np.array_equal(read_points(path)[0], xyz)
-    assert np.array_equal(read_points(path)[1], rgb)
-    for broken in (
-        head + table.tobytes()[:-1],
-        head + table.tobytes() + b"!",
-        b"",
-        head.replace(form.encode(), b"") + table.tobytes(),
-        head.replace(b"4\n", b"-4\n"),
-        head.replace(b"4\n", b"1152921504606846976\n") + table.tobytes(),
-        head.replace(b"4\n", b"9" * 5000 + b"\n") + table.tobytes(),
-    ):
-        path.write_bytes(broken)
-        with pytest.raises(InputError, match=r"points\.ply"):
-            read_points(path)
 
 
 # Real scenes

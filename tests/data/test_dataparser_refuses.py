@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from abcd_ns.data.input_errors import SHOWN, InputError, Problems
+from abcd_ns.data.picture_files import read_header
 from tests.data.dataparser_scenes import (
     NAMES,
     REAL,
@@ -56,7 +57,7 @@ def test_cut_model_is_refused(scene, file, share):
     path = scene / "sparse/0" / file
     whole = path.read_bytes()
     try:
-        for size in (int(share * len(whole)), len(whole) - 1):
+        for size in (max(int(share * len(whole)), 1), len(whole) - 1):
             path.write_bytes(whole[:size])
             assert file in refusal(scene)
         path.write_bytes(whole + b"\0")
@@ -71,7 +72,6 @@ def test_absurd_counts_are_refused(scene, file):
     path.write_bytes(b"\xff" * 8 + path.read_bytes()[8:])
     assert "claims" in refusal(scene)
     path.unlink()
-    assert file in refusal(scene)
     os.mkfifo(path)
     assert "not a regular file" in refusal(scene)
 
@@ -151,11 +151,11 @@ def _tiff_16(path: Path) -> None:
     path.write_bytes(deep.tobytes())
 
 
-def _bomb(path: Path) -> None:
+def _bomb(path: Path, width: int = 30_000, height: int = 20_000) -> None:
     _png_16(path)
     data = bytearray(path.read_bytes())
     data[24] = 8
-    struct.pack_into(">II", data, 16, 12_000, 9_000)
+    struct.pack_into(">II", data, 16, width, height)
     struct.pack_into(">I", data, 29, zlib.crc32(bytes(data[12:29])))
     path.write_bytes(data)
 
@@ -193,7 +193,6 @@ def _turned(path: Path) -> None:
         (lambda p: p.write_bytes(b"not a picture at all"), "not a picture"),
         # Pillow would run Ghostscript on it.
         (lambda p: p.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n"), "of a known kind"),
-        (lambda p: p.rename(p.with_suffix(".PNG")), "0000.PNG is there: rename it"),
         (_tiff_16, "has more than 8 bits a channel; convert it to 8 bits."),
         (_cut, "damaged"),
         (_cut_jpeg, "damaged"),
@@ -202,7 +201,7 @@ def _turned(path: Path) -> None:
         (_png_16, "8 bits"),
         (lambda p: Image.fromarray(np.zeros(SIZES[0][::-1], np.uint16)).save(p), "8 bits"),
         (lambda p: Image.new("CMYK", SIZES[0]).save(p, format="JPEG"), "CMYK"),
-        (_bomb, "89 Mpx"),
+        (_bomb, "500 Mpx"),
         (lambda p: Image.new("RGB", (SIZES[0][0] + 1, SIZES[0][1])).save(p), "its camera is 61 x 41"),
         (_turned, "EXIF"),
     ],
@@ -214,6 +213,12 @@ def test_bad_photo_is_named_with_its_fault(scene, spoil, message):
     assert str(path) in said
     assert message in said
     assert "\n" not in said
+
+
+def test_photos_of_aerial_cameras_are_not_too_large(tmp_path):
+    """150 megapixels, over what Pillow takes for an attack."""
+    _bomb(tmp_path / "photo.png", 14_204, 10_652)
+    assert read_header(tmp_path / "photo.png").size == (14_204, 10_652)
 
 
 def test_all_bad_photos_are_listed_at_once(scene):
@@ -282,7 +287,7 @@ def _spoil_pose(row: int, column: int, value: float) -> Callable[[dict], None]:
         (_spoil("file_path", "/etc/passwd"), "leads out"),
         (_spoil("mask_path", "../mask.png"), "leads out"),
         (_spoil("file_path", 7), "no file_path"),
-        (lambda meta: meta.update(ply_file_path="../points.ply"), "leads out"),
+        (lambda meta: meta.update(ply_file_path="../cloud.ply"), "leads out"),
         (lambda meta: meta.update(ply_file_path="gone.ply"), "does not exist"),
         (lambda meta: meta.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
         (lambda meta: meta.update(frames=[]), "no list of frames"),

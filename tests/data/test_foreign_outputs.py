@@ -17,8 +17,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 
-from abcd_ns.data.dataset import AbcdDataset
-from abcd_ns.data.foreign_outputs import PHOTOS, with_photos
+from abcd_ns.data.dataset import PHOTOS, AbcdDataset, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
@@ -129,6 +128,25 @@ def test_cameras_that_cannot_be_are_named(photo, camera, says):
         with_photos(outputs_of(photo, **camera))
     assert str(photo) in str(refused.value)
     assert says in str(refused.value)
+
+
+def test_a_distortion_may_be_one_for_all(photo):
+    given = outputs_of(photo, distortion_params=torch.tensor([0.1, 0, 0, 0, 0, 0]))
+    assert given.cameras.distortion_params.shape == (6,)
+    (source,) = with_photos(given).metadata[PHOTOS]
+    assert source.undistortion.lens.distortion[0] == pytest.approx(0.1)
+
+
+def test_a_path_of_windows_is_found(photo):
+    (source,) = with_photos(outputs_of(photo.parent / "C:\\me\\photo.png")).metadata[PHOTOS]
+    assert source.path == photo
+
+
+def test_poses_that_another_reader_could_not_turn_are_refused(photo):
+    outputs = outputs_of(photo)
+    outputs.cameras.camera_to_worlds[:] = torch.nan
+    with pytest.raises(InputError, match="--orientation-method"):
+        with_photos(outputs)
 
 
 def test_files_that_are_not_there_are_named_unless_nobody_looks_at_them(tmp_path):

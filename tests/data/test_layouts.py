@@ -64,12 +64,6 @@ def test_masks_of_a_colmap_model_are_found_by_name(scene, called):
     assert "mask" not in AbcdDataset(parser(scene).get_dataparser_outputs())[0]
 
 
-def test_masks_that_are_not_there_are_named(scene):
-    lines = refusal(scene, masks_path=Path("masks")).splitlines()
-    assert len(lines) == len(NAMES)
-    assert f"{scene / 'masks/left/0000.png'} cannot be read" in lines[0]
-
-
 def test_folders_of_a_colmap_model_mean_nothing_to_transforms_json(scene):
     write_transforms(scene)
     assert "names photos and masks itself" in refusal(scene, masks_path=Path("masks"))

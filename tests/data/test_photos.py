@@ -180,6 +180,47 @@ def test_photo_that_changed_since_the_check_is_named(sources):
                 photos.image(i)
 
 
+# Alpha
+
+
+def with_alpha(image: np.ndarray) -> np.ndarray:
+    """Two thirds transparent, with soft edges, and magenta below."""
+    alpha = np.clip(np.random.default_rng(9).integers(-300, 320, (*image.shape[:2], 1)), 0, 255).astype(
+        np.uint8
+    )
+    return np.concatenate([np.where(alpha == 0, [255, 0, 255], image).astype(np.uint8), alpha], axis=2)
+
+
+@pytest.mark.parametrize("lens", [None, "OPENCV", "OPENCV_FISHEYE"])
+@pytest.mark.parametrize("divide", [1, 2, 3])
+def test_resampled_photos_show_nothing_of_what_lies_below_transparent_pixels(tmp_path, lens, divide):
+    size, image = (240, 180), with_alpha(noise(0, size=(240, 180)))
+    reduced = (240 // divide, 180 // divide)
+    flat = None if lens is None else undistortion(lens_pair(lens, *reduced)[0])
+    on_black = np.rint(image[..., :3] * (image[..., 3:] / 255.0)).astype(np.uint8)
+    cut, black = (
+        Photos([PhotoSource(saved(tmp_path / name, each), size, reduced, flat)])
+        .image(0)
+        .numpy()
+        .astype(float)
+        for name, each in (("cut.png", image), ("black.png", on_black))
+    )
+    error = cut[..., :3] * cut[..., 3:] / 255 - black
+    assert np.abs(error).max() < (2 if lens is None else 3)  # OpenCV rounds weights of 8-bit pixels to 1/32
+    assert 0.2 < (cut[..., 3] > 0).mean() <= 1
+
+
+def test_an_opaque_photo_is_resampled_alike_with_alpha_and_without(tmp_path):
+    opaque = np.concatenate([noise(0), np.full((HEIGHT, WIDTH, 1), 255, np.uint8)], axis=2)
+    rgb, rgba = (
+        Photos(
+            [PhotoSource(saved(tmp_path / f"{k}.png", i), (WIDTH, HEIGHT), (WIDTH // 2, HEIGHT // 2))]
+        ).image(0)
+        for k, i in enumerate((noise(0), opaque))
+    )
+    assert np.array_equal(rgba[..., :3], rgb)
+
+
 # Masks
 
 
@@ -216,6 +257,72 @@ def test_mask_may_have_the_reduced_size(tmp_path):
 def test_useless_mask_is_named(tmp_path, mask, message):
     with pytest.raises(InputError, match=message):
         masked(tmp_path, mask, (WIDTH, HEIGHT)).mask(0)
+
+
+HIDDEN = np.hypot(*np.ogrid[-11:13, -20:20]) < 8
+"""What a mask hides, [HEIGHT, WIDTH]."""
+SEEN = np.where(HIDDEN, 0, 255).astype(np.uint8)
+
+
+def palette(colors: list[int]) -> Image.Image:
+    """0 where hidden."""
+    picture = Image.fromarray((~HIDDEN).astype(np.uint8), "P")
+    picture.putpalette(colors)
+    return picture
+
+
+def labelled() -> np.ndarray:
+    """Objects 1 to 3, and 0 for what is hidden."""
+    return np.where(HIDDEN, 0, 1 + np.arange(WIDTH) % 3).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        lambda: Image.fromarray(SEEN),
+        lambda: Image.fromarray(np.dstack([SEEN] * 3)),
+        lambda: Image.fromarray(SEEN).convert("1"),
+        lambda: Image.fromarray(SEEN // 255),
+        lambda: Image.fromarray(np.where(HIDDEN, 0, 100).astype(np.uint8)),
+        lambda: Image.fromarray(labelled()),
+        lambda: Image.fromarray(labelled().astype(np.uint16)),
+        lambda: Image.fromarray(SEEN.astype(np.uint16) * 257),
+        lambda: Image.fromarray(np.dstack([0 * SEEN, 0 * SEEN, SEEN // 4])),
+        lambda: palette([0, 0, 0, 128, 0, 0]),
+        lambda: palette([0, 0, 0, 0, 0, 0]),
+        # Transparent is hidden, whatever the colour is.
+        lambda: Image.fromarray(np.dstack([np.full_like(SEEN, 255)] * 3 + [SEEN])),
+        lambda: Image.fromarray(np.dstack([np.full_like(SEEN, 255), SEEN]), "LA"),
+        lambda: Image.fromarray(np.dstack([SEEN] * 3 + [np.full_like(SEEN, 255)])),
+        lambda: Image.fromarray(np.dstack([SEEN // 255] * 3 + [SEEN])),
+    ],
+)
+def test_what_is_hidden_stays_hidden_in_masks_of_any_kind(tmp_path, mask):
+    mask().save(tmp_path / "mask.png")
+    assert np.array_equal(read_mask(tmp_path, "mask.png"), ~HIDDEN)
+
+
+@pytest.mark.parametrize("save", [{"format": "JPEG", "quality": 95}, {"format": "JPEG", "quality": 50},
+                                  {"format": "WEBP", "quality": 50}])  # fmt: skip
+@pytest.mark.parametrize("white", [255, 100])
+def test_rings_of_lossy_masks_are_hidden(tmp_path, save, white):
+    Image.fromarray(np.where(HIDDEN, 0, white).astype(np.uint8)).save(tmp_path / "mask", **save)
+    seen = read_mask(tmp_path, "mask")
+    assert (seen & HIDDEN).sum() <= 0.02 * HIDDEN.sum()
+    assert (~seen & ~HIDDEN).sum() <= 0.02 * (~HIDDEN).sum()
+
+
+def test_of_soft_edges_what_is_nearly_white_is_seen(tmp_path):
+    step = np.clip(np.arange(WIDTH) * 20.0 - 200, 0, 255)
+    Image.fromarray(np.tile(step, (HEIGHT, 1)).astype(np.uint8)).save(tmp_path / "mask.png")
+    assert np.array_equal(read_mask(tmp_path, "mask.png")[0], step > 192)
+
+
+def read_mask(folder: Path, name: str) -> np.ndarray:
+    """bool [HEIGHT, WIDTH]."""
+    size = (WIDTH, HEIGHT)
+    photo = saved(folder / "photo.png", noise(0))
+    return Photos([PhotoSource(photo, size, size, mask_path=folder / name)]).mask(0).numpy()[..., 0]
 
 
 # Distortion

@@ -16,6 +16,18 @@ def test_a_corrected_psnr_leaves_the_light_of_the_photo_out():
     assert found["cc_psnr"] == pytest.approx(40, abs=0.5)  # the noise alone
 
 
+def test_hidden_pixels_are_not_scored():
+    photo, mask = (
+        torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)),
+        torch.ones(20, 30, 1).bool(),
+    )
+    mask[:, 20:] = False
+    picture = torch.where(mask, photo + 0.1, 0.0)
+    found = image_metrics(picture, photo, mask=mask)
+    assert found["psnr"] == pytest.approx(20, abs=1e-3)
+    assert found == image_metrics(torch.where(mask, picture, 1.0), photo, mask=mask)
+
+
 def test_black_pictures_are_scored_too():
     black = torch.zeros(20, 30, 3)
     assert image_metrics(black, black + 0.5, corrected=True)["cc_psnr"] > 0

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
@@ -16,7 +16,7 @@ from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.types import Gaussians, Layer
 from abcd_ns.lab.results.run import ViewScore
-from abcd_ns.nerfstudio.metrics import image_metrics
+from abcd_ns.nerfstudio.metrics import counted, image_metrics
 from abcd_ns.nerfstudio.model import AbcdModel
 
 Picture = Float[Tensor, "h w 3"]
@@ -31,6 +31,8 @@ class HeldOutView:
     camera: Cameras
     photo: Picture
     """On the model's background where the file has an alpha channel."""
+    mask: Bool[Tensor, "h w 1"] | None = None
+    """Where it counts; None for everywhere."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def held_out_views(pipeline: VanillaPipeline) -> Iterator[HeldOutView]:
     background = model.background_color.to(model.device)
     for row, (camera, batch) in enumerate(pipeline.datamanager.fixed_indices_eval_dataloader):
         photo = model.composite_with_background(model.get_gt_img(batch["image"]), background)
-        yield HeldOutView(row, dataset.image_filenames[row].name, camera, photo)
+        yield HeldOutView(row, dataset.image_filenames[row].name, camera, photo, batch.get("mask"))
 
 
 def everything(model: SplatfactoModel) -> Gaussians:
@@ -75,8 +77,8 @@ def draw_composited(model: SplatfactoModel, camera: Cameras) -> Picture:
 def mean_psnr(pipeline: VanillaPipeline) -> float:
     """Mean over the held-out views of the merged pictures' PSNR, dB."""
     with undisturbed(pipeline):
-        views = held_out_views(pipeline)
-        scores = [float(psnr(draw_merged(pipeline.model, view.camera), view.photo)) for view in views]
+        pairs = ((draw_merged(pipeline.model, v.camera), v.photo, v.mask) for v in held_out_views(pipeline))
+        scores = [float(psnr(counted(drawn, mask), counted(photo, mask))) for drawn, photo, mask in pairs]
     return sum(scores) / len(scores)
 
 
@@ -91,8 +93,8 @@ def draw_held_out(pipeline: VanillaPipeline, rows: Collection[int] | None = None
 
 def score(drawn: Drawn) -> ViewScore:
     """How close both pictures come to the photo."""
-    photo = drawn.view.photo
-    composited, merged = image_metrics(drawn.composited, photo), image_metrics(drawn.merged, photo)
+    photo, mask = drawn.view.photo, drawn.view.mask
+    composited, merged = (image_metrics(p, photo, mask=mask) for p in (drawn.composited, drawn.merged))
     return ViewScore(
         row=drawn.view.row,
         name=drawn.view.name,

@@ -1,0 +1,266 @@
+"""The file that is meant: names and places as other systems and programs write them."""
+
+import json
+import re
+import shutil
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from abcd_ns.data.normalize import normalizing_similarity
+from tests.data.dataparser_scenes import (
+    NAMES,
+    SIZES,
+    parser,
+    refusal,
+    write_capture,
+    write_model,
+    write_photos,
+    write_transforms,
+)
+
+WINDOWS = "C:\\Users\\me\\scan\\images\\"
+
+
+def paths_of(scene: Path, **options) -> set[str]:
+    """Of the photos that are read, from the scene on."""
+    paths = parser(scene, eval_mode="all", **options).get_dataparser_outputs().image_filenames
+    return {path.relative_to(scene).as_posix() for path in paths}
+
+
+IMAGES = {f"images/{name}" for name in NAMES}
+
+
+@pytest.mark.parametrize(
+    "called",
+    [
+        lambda name: f"images/{name}".replace("/", "\\"),
+        lambda name: WINDOWS + name.replace("/", "\\"),
+        lambda name: f"/content/data/images/{name}",
+        lambda name: f"../scan/images/{name}",
+        lambda name: f"IMAGES/{name.upper()}",
+        lambda name: f"images/{name}".replace(".png", ".jpg"),
+        lambda name: f"./images/{name}".removesuffix(".png"),
+    ],
+)
+def test_transforms_of_other_machines_find_their_photos(scene, called):
+    meta = write_transforms(scene)
+    wanted = [frame["file_path"] for frame in meta["frames"][:2]]
+    for frame in meta["frames"]:
+        frame["file_path"] = called(frame["file_path"].removeprefix("images/"))
+    meta["test_filenames"] = [frame["file_path"] for frame in meta["frames"][:2]]
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    assert paths_of(scene) == IMAGES
+    tested = parser(scene).get_dataparser_outputs("test").image_filenames
+    assert {path.relative_to(scene).as_posix() for path in tested} == set(wanted)
+
+
+@pytest.mark.parametrize(
+    "called",
+    [
+        lambda name: name.replace("/", "\\"),
+        lambda name: WINDOWS + name.replace("/", "\\"),
+        lambda name: f"images/{name}",
+        lambda name: name.upper(),
+        lambda name: name.replace(".png", ".jpeg"),
+    ],
+)
+def test_models_of_other_machines_find_their_photos(tmp_path, called, capsys):
+    write_model(tmp_path / "sparse/0", names=[called(name) for name in NAMES])
+    write_photos(tmp_path / "images")
+    (tmp_path / "test_list.txt").write_text(f"{called(NAMES[0])}\n", encoding="utf-8-sig")
+    assert paths_of(tmp_path) == IMAGES
+    assert re.search(r"10 files have other names \(.*\)", capsys.readouterr().out)
+    assert len(parser(tmp_path).get_dataparser_outputs("test").image_filenames) == 1
+
+
+@pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
+def test_the_form_of_unicode_does_not_matter(tmp_path, forms):
+    of_model, of_files = ([unicodedata.normalize(form, f"\u00e4{k}.png") for k in range(4)] for form in forms)
+    write_model(tmp_path / "sparse/0", names=of_model)
+    write_photos(tmp_path / "images", of_files)
+    assert paths_of(tmp_path) == {f"images/{name}" for name in of_files}
+
+
+def test_a_name_that_could_mean_two_photos_is_refused(tmp_path):
+    write_model(tmp_path / "sparse/0", names=["A.png", "b.png"])
+    write_photos(tmp_path / "images", ["a.png", "b.png", "a.jpg"])
+    assert paths_of(tmp_path) == {"images/a.png", "images/b.png"}
+    write_photos(tmp_path / "images", ["a.PNG"])
+    assert "A.png cannot be read" in refusal(tmp_path)
+
+
+def test_one_photo_is_not_read_for_two_cameras(tmp_path):
+    write_model(tmp_path / "sparse/0", names=["left/0.png", "right/0.png", "1.png"])
+    write_photos(tmp_path / "images", ["0.png", "1.png"])
+    assert "twice" in refusal(tmp_path)
+
+
+def test_many_photos_that_are_not_there_are_one_line(scene):
+    shutil.rmtree(scene / "images/left")
+    said = refusal(scene)
+    assert "left/0000.png cannot be read" in said
+    assert "4 others have the same fault" in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("hidden", ["._0000.png", "@eaDir/0000.png/THUMB_M.jpg", "__MACOSX/0000.png"])
+def test_what_systems_hide_among_photos_is_no_photo(scene, hidden, capsys):
+    path = scene / "images/left" / hidden
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"x")
+    assert paths_of(scene) == IMAGES
+    assert "no pose" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_json_as_windows_saves_it(scene, encoding):
+    meta = write_transforms(scene)
+    (scene / "transforms.json").write_bytes(json.dumps(meta).encode(encoding))
+    assert paths_of(scene) == IMAGES
+
+
+def test_text_models_as_windows_saves_them(tmp_path):
+    write_capture(tmp_path, text=True)
+    for name in ("cameras", "images", "points3D"):
+        path = tmp_path / f"sparse/0/{name}.txt"
+        path.write_bytes(path.read_text().replace("\n", "\r\n").encode("utf-8-sig"))
+    assert paths_of(tmp_path) == IMAGES
+
+
+# Several models, and models elsewhere
+
+
+def test_the_model_with_most_photos_is_taken_and_it_is_said(tmp_path, capsys):
+    write_photos(tmp_path / "images")
+    write_model(tmp_path / "sparse/0", names=NAMES[:3])
+    write_model(tmp_path / "sparse/1", text=True)
+    write_model(tmp_path / "sparse/2", names=NAMES[:4])
+    assert paths_of(tmp_path) == IMAGES
+    said = capsys.readouterr().out
+    assert "sparse/1 is used, with 10 photos" in said
+    assert "--pipeline.datamanager.dataparser.colmap-path" in said
+    assert len(paths_of(tmp_path, colmap_path=Path("sparse/0"))) == 3
+
+
+@pytest.mark.parametrize("place", [".", "colmap"])
+def test_a_model_and_photos_flat_in_a_folder(tmp_path, place):
+    write_capture(tmp_path / "made", text=True, names=["a b (1).png", "a b (2).png", "a b (3).png"])
+    (tmp_path / "flat" / place).mkdir(parents=True)
+    for part in (tmp_path / "made/sparse/0").glob("*.txt"):
+        shutil.copy(part, tmp_path / "flat" / place)
+    for photo in (tmp_path / "made/images").iterdir():
+        shutil.copy(photo, tmp_path / "flat")
+    assert paths_of(tmp_path / "flat") == {f"a b ({k}).png" for k in (1, 2, 3)}
+
+
+def test_the_folder_of_photos_in_another_case(tmp_path):
+    write_model(tmp_path / "sparse/0")
+    write_photos(tmp_path / "Images")
+    assert paths_of(tmp_path) == {name.replace("images", "Images") for name in IMAGES}
+
+
+def test_a_text_file_of_cameras_beside_transforms_is_no_model(scene):
+    write_transforms(scene)
+    (scene / "cameras.txt").write_text("front\n")
+    (scene / "images.txt").write_text("a.png\n")
+    assert paths_of(scene) == IMAGES
+
+
+def test_where_a_model_lies_is_told(scene):
+    shutil.move(scene / "sparse", scene / "dense")
+    said = refusal(scene)
+    assert "colmap-path dense/0" in said
+    assert "abcd poses" not in said
+    assert paths_of(scene, colmap_path=Path("dense/0")) == IMAGES
+    shutil.move(scene / "images", scene / "photos")
+    assert "or set --pipeline.datamanager.dataparser.images-path photos" in refusal(
+        scene, colmap_path=Path("dense/0")
+    )
+
+
+# Points
+
+
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("cloud", ["none", "empty", "header"])
+def test_a_model_without_points_starts_at_random(tmp_path, text, cloud, capsys):
+    write_capture(tmp_path, text=text, points=0)
+    path = tmp_path / f"sparse/0/points3D.{'txt' if text else 'bin'}"
+    if cloud == "none":
+        path.unlink()
+    elif cloud == "empty":
+        path.write_bytes(b"")
+    assert "points3D_xyz" not in parser(tmp_path).get_dataparser_outputs().metadata
+    assert "has no points" in capsys.readouterr().out
+
+
+def test_a_cloud_may_stand_for_a_models_points(scene):
+    wanted = parser(scene).get_dataparser_outputs().metadata
+    model = scene / "sparse/0"
+    shutil.copytree(model, scene / "kept")
+    write_transforms(scene)
+    shutil.copytree(scene / "kept", model)
+    (model / "points3D.bin").unlink()
+    (scene / "points.ply").rename(model / "points3D.ply")
+    (scene / "transforms.json").unlink()
+    found = parser(scene).get_dataparser_outputs().metadata
+    assert found["points3D_xyz"].shape == wanted["points3D_xyz"].shape
+    assert (found["points3D_rgb"] == wanted["points3D_rgb"]).all()
+
+
+@pytest.mark.parametrize("value", [None, ""])
+def test_no_cloud_may_be_named_as_none(scene, value):
+    meta = write_transforms(scene, ply_file_path=value)
+    (scene / "transforms.json").write_text(json.dumps(meta | {"ply_file_path": value}))
+    assert "points3D_xyz" not in parser(scene).get_dataparser_outputs().metadata
+
+
+# Sizes
+
+
+@pytest.mark.parametrize("divide", [2, 0.5, 1.7])
+def test_photos_that_are_all_one_share_of_their_cameras_are_taken(tmp_path, divide, capsys):
+    write_model(tmp_path / "sparse/0")
+    write_photos(tmp_path / "images", divide=divide)
+    cameras = parser(tmp_path, eval_mode="all").get_dataparser_outputs().cameras
+    for row, name in enumerate(sorted(NAMES)):
+        width, height = SIZES[NAMES.index(name) % 2]
+        assert (cameras.width[row], cameras.height[row]) == (int(width / divide), int(height / divide))
+        assert cameras.fx[row].item() == pytest.approx(width * 0.9 * int(width / divide) / width)
+    assert "times as large as their cameras" in capsys.readouterr().out
+
+
+def test_photos_of_several_shares_are_refused(tmp_path):
+    write_model(tmp_path / "sparse/0")
+    write_photos(tmp_path / "images", divide=2)
+    Image.fromarray(np.zeros((41, 61, 3), np.uint8)).save(tmp_path / "images" / NAMES[0])
+    assert "its camera is 61 x 41" in refusal(tmp_path)
+
+
+# Surveys
+
+
+@pytest.mark.parametrize("center", ["poses", "focus", "none"])
+@pytest.mark.parametrize("orientation", ["up", "vertical", "pca", "none"])
+def test_flights_whose_headings_cancel_have_a_frame(orientation, center):
+    poses = np.array([
+        np.c_[np.diag([turn, turn, 1.0]), [3.0 * k, 3.0 * line, 10]]
+        for line, turn in enumerate((1, -1, 1, -1)) for k in range(4)
+    ])  # fmt: skip
+    found = normalizing_similarity(poses, orientation, center, True, 1.0)
+    assert np.abs(found.rotation @ found.rotation.T - np.eye(3)).max() < 1e-6
+    assert np.abs(found.poses(poses)[..., 3]).max() == pytest.approx(1)
+    if orientation in ("up", "vertical"):
+        assert (found.rotation @ [0, 0, 1])[2] == pytest.approx(1)
+
+
+def test_cameras_turned_about_their_axes_and_all_ways_have_a_frame():
+    turns = Rotation.from_rotvec(np.pi / 2 * np.array([[0, 0, k] for k in range(4)]))
+    poses = np.concatenate([turns.as_matrix(), -turns.as_matrix() * [-1, 1, 1]])
+    poses = np.concatenate([poses, np.random.default_rng(0).normal(size=(8, 3, 1))], axis=2)
+    assert np.isfinite(normalizing_similarity(poses, "up", "focus", True, 1.0).matrix).all()

@@ -1,0 +1,83 @@
+"""Clouds as scanners and photogrammetry write them: colours of any type, range and name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.ply import read_points
+from tests.data.dataparser_scenes import parser, write_transforms
+
+XYZ = np.arange(12.0).reshape(4, 3)
+RGB = np.array([[0, 128, 255], [10, 20, 30], [255, 255, 255], [90, 0, 3]])
+NAMES = ("red", "green", "blue")
+
+
+def write_cloud(path: Path, kind: str, rgb: np.ndarray, names: tuple[str, ...] = NAMES) -> Path:
+    """Ascii, with colours of a type."""
+    types = [*(f"property float {axis}" for axis in "xyz"), *(f"property {kind} {name}" for name in names)]
+    rows = [" ".join(map(str, row)) for row in np.c_[XYZ.astype(object), rgb.astype(object)]]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(XYZ)}", *types, "end_header"]
+    path.write_text("\n".join([*head, *rows, ""]))
+    return path
+
+
+@pytest.mark.parametrize("names", [NAMES, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("R", "G", "B")])
+@pytest.mark.parametrize(
+    ("kind", "white"),
+    [("uchar", 255), ("ushort", 65_535), ("int16", 255), ("uint", 65_535), ("uint32", 2**32 - 1)]
+    + [(kind, white) for kind in ("float", "double") for white in (1, 255, 65_535)],
+)
+def test_colors_are_read_by_type_and_range(tmp_path, kind, white, names):
+    rgb = RGB / 255 * white if kind in ("float", "double") else RGB * white // 255
+    xyz, found = read_points(write_cloud(tmp_path / "points.ply", kind, rgb, names))
+    assert np.array_equal(xyz, XYZ)
+    assert np.array_equal(found, RGB)
+
+
+@pytest.mark.parametrize("white", [1, 255])
+def test_real_colors_above_white_are_clipped(tmp_path, white):
+    rgb = np.where(RGB == 255, 1.02 * white, RGB / 255 * white)
+    rgb[0, 0] = np.nan
+    assert np.array_equal(read_points(write_cloud(tmp_path / "points.ply", "float", rgb))[1], RGB)
+
+
+def test_gaussians_are_points_of_their_mean_color(tmp_path):
+    harmonics = (RGB / 255 - 0.5) / 0.28209479177387814
+    path = write_cloud(tmp_path / "points.ply", "float", harmonics, ("f_dc_0", "f_dc_1", "f_dc_2"))
+    assert np.array_equal(read_points(path)[1], RGB)
+
+
+def test_points_without_colors_are_grey_and_it_is_said(scene, capsys):
+    write_transforms(scene)
+    write_cloud(scene / "points.ply", "float", RGB, ("a", "b", "c"))
+    points = parser(scene).get_dataparser_outputs().metadata
+    assert (points["points3D_rgb"] == 127).all()
+    assert "the points have no colours" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_clouds(tmp_path, order):
+    row = [(name, order + "f4") for name in "xyz"] + [(name, "u1") for name in NAMES]
+    table = np.array([(*p, *c) for p, c in zip(XYZ, RGB, strict=True)], dtype=row)
+    kind = "little" if order == "<" else "big"
+    types = "".join(f"property {'uchar' if t == 'u1' else 'float'} {name}\n" for name, t in row)
+    form = f"comment some\nformat binary_{kind}_endian 1.0\n"
+    head = f"ply\n{form}element vertex 4\n{types}end_header\n".encode()
+    path = tmp_path / "points.ply"
+    path.write_bytes(head + table.tobytes())
+    assert np.array_equal(read_points(path)[0], XYZ)
+    assert np.array_equal(read_points(path)[1], RGB)
+    for broken in (
+        head + table.tobytes()[:-1],
+        head + table.tobytes() + b"!",
+        b"",
+        head.replace(form.encode(), b"") + table.tobytes(),
+        head.replace(b"4\n", b"-4\n"),
+        head.replace(b"4\n", b"1152921504606846976\n") + table.tobytes(),
+        head.replace(b"4\n", b"9" * 5000 + b"\n") + table.tobytes(),
+    ):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match=r"points\.ply"):
+            read_points(path)

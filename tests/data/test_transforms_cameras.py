@@ -1,0 +1,109 @@
+"""Cameras of transforms.json: each value is used, or refused by name, for a frame or for the file."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from tests.data.dataparser_scenes import parser, refusal, write_transforms
+
+RIGHT_ANGLE = math.pi / 2
+WHERE = pytest.mark.parametrize("where", ["frame", "file"])
+
+
+def with_camera(scene: Path, where: str, values: dict, without: tuple[str, ...] = ()) -> Path:
+    """The scene with these values of the camera in each frame or beside the frames."""
+    meta = write_transforms(scene)
+    meta["frames"] = [{k: v for k, v in f.items() if k not in without} for f in meta["frames"]]
+    for target in [meta] if where == "file" else meta["frames"]:
+        target.update(values)
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    return scene
+
+
+def lenses(scene: Path) -> list:
+    return [frame.lens for frame in parser(scene).prepared().scene.frames]
+
+
+@WHERE
+@pytest.mark.parametrize(
+    ("values", "fisheye"),
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, True),
+        ({"camera_model": "radial_fisheye"}, True),
+        ({"is_fisheye": True}, True),
+        ({"camera_model": "SIMPLE_RADIAL"}, False),
+    ],
+)
+def test_the_camera_model_is_taken_at_either_level(scene, where, values, fisheye):
+    assert {lens.fisheye for lens in lenses(with_camera(scene, where, values))} == {fisheye}
+
+
+@WHERE
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"camera_model": model}, model)
+        for model in ("EQUIRECTANGULAR", "VR180_L", "ORTHOPHOTO", "FISHEYE624", "FOV")
+    ]
+    + [
+        ({"skew": 0.1}, "skew = 0.1"),
+        ({"k5": 1e-3}, "k5"),
+        ({"ftheta_p0": 1.0}, "ftheta_p0"),
+        ({"latlong": True}, "latlong"),
+        ({"rolling_shutter": [0, 0, 0.01]}, "rolling_shutter"),
+    ],
+)
+def test_what_is_not_read_is_refused_by_name_in_one_line(scene, where, values, named):
+    said = refusal(with_camera(scene, where, values))
+    assert named in said
+    assert "9 others have the same fault" in said
+    assert "\n" not in said
+
+
+@WHERE
+@pytest.mark.parametrize(
+    "values", [{"distortion_params": [0.1, 0.01, 0, 0, 1e-3, 0]}, {"k1": 0.1, "k2": 0.01, "p1": 1e-3}]
+)
+def test_distortion_is_taken_at_either_level(scene, where, values):
+    assert {lens.distortion[:4] for lens in lenses(with_camera(scene, where, values))} == {
+        (0.1, 0.01, 1e-3, 0)
+    }
+
+
+@WHERE
+@pytest.mark.parametrize(
+    ("values", "fx", "fy"),
+    [
+        ({"fl_y": 50.0}, lambda _: 50.0, lambda _: 50.0),
+        ({"camera_angle_x": RIGHT_ANGLE}, lambda size: size[0] / 2, lambda size: size[0] / 2),
+        (
+            {"camera_angle_x": RIGHT_ANGLE, "camera_angle_y": RIGHT_ANGLE},
+            lambda size: size[0] / 2,
+            lambda size: size[1] / 2,
+        ),
+        ({"y_fov": 90}, lambda size: size[1] / 2, lambda size: size[1] / 2),
+        ({"fl_x": 60.0, "camera_angle_y": RIGHT_ANGLE}, lambda _: 60.0, lambda size: size[1] / 2),
+    ],
+)
+def test_focal_lengths_by_pixels_and_by_angles(scene, where, values, fx, fy):
+    for lens in lenses(with_camera(scene, where, values, without=("fl_x", "fl_y"))):
+        assert (lens.fx, lens.fy) == pytest.approx((fx(lens.size), fy(lens.size)))
+
+
+def test_a_frame_has_the_last_word_however_it_is_spelled(scene):
+    meta = write_transforms(
+        scene, camera_model="OPENCV_FISHEYE", distortion_params=[0.3, 0, 0, 0, 0, 0], fl_x=9e3
+    )
+    for frame in meta["frames"][:4]:
+        del frame["fl_x"], frame["fl_y"]
+        frame.update(is_fisheye=False, k1=0.1, camera_angle_x=RIGHT_ANGLE)
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    spelled = {f["file_path"] for f in meta["frames"][:4]}
+    for frame in parser(scene).prepared().scene.frames:
+        lens = frame.lens
+        if f"images/{frame.name}" in spelled:
+            assert (lens.fisheye, lens.distortion[0], lens.fx) == (False, 0.1, pytest.approx(lens.width / 2))
+        else:
+            assert (lens.fisheye, lens.distortion[0]) == (True, 0.3)
