@@ -46,7 +46,7 @@ def check_tool(words: Sequence[str]) -> None:
     """See that a command can do with a run of ours what it is asked for, before anything is loaded.
 
     Raises:
-        UserError: other methods alone can, there is no checkpoint, or a file that is named is of no use.
+        UserError: other methods alone can, or a file that is named is of no use.
     """
     config = opened(words)
     if config is None:
@@ -63,13 +63,22 @@ def check_tool(words: Sequence[str]) -> None:
         try:
             json.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise UserError(
-                f"{path} is no camera path ({error}): make one in the viewer's Render tab."
-            ) from None
-    if not any(config.parent.glob("nerfstudio_models/step-*.ckpt")):
-        raise UserError(
-            f"{config.parent} has no checkpoint in nerfstudio_models: resume the run, or copy all of it."
-        )
+            refused = f"{path} is no camera path ({error}): make one in the viewer's Render tab."
+            raise UserError(refused) from None
+
+
+def check_held_out(words: Sequence[str]) -> None:
+    """See that a command asks for no held-out photos, where a run has none.
+
+    Raises:
+        UserError: it does.
+    """
+    tool, what = Path(words[0]).stem, "".join(words[1:2])
+    flag = {"dataset": "--split", "interpolate": "--pose-source"}.get(what)
+    if tool == "ns-eval":
+        raise UserError("This run's data holds no photos out, so there is nothing to score.")
+    if tool == "ns-render" and flag and _value(words, flag) != "train":
+        raise UserError(f"This run's data holds no photos out: add {flag} train.")
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:

@@ -24,7 +24,7 @@ from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
-from abcd_ns.nerfstudio.flags import hidden, opened
+from abcd_ns.nerfstudio.flags import as_a_command, hidden, opened
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
@@ -73,6 +73,16 @@ class AbcdTrainerConfig(TrainerConfig):
         """As nerfstudio's; of a run that a command opens, where its config.yml is by now."""
         config = opened(sys.argv)
         return super().get_base_dir() if config is None else config.parent
+
+    def get_checkpoint_dir(self) -> Path:
+        """As nerfstudio's, which fails with a traceback where a command opens a run without checkpoints."""
+        folder = super().get_checkpoint_dir()
+        with as_a_command():
+            if opened(sys.argv) is not None and not any(folder.glob("step-*.ckpt")):
+                raise UserError(
+                    f"{folder} has no checkpoint: resume the run until it saves one, or copy it all."
+                )
+        return folder
 
     def print_to_terminal(self) -> None:
         """A few lines instead of nerfstudio's some hundred; all of it is in config.yml."""

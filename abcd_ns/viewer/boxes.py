@@ -17,24 +17,7 @@ GAP = 0.004
 MOST_POINTS = 100_000
 """Of which the bulk is found."""
 
-_PATH = [
-    "000",
-    "100",
-    "110",
-    "010",
-    "000",
-    "001",
-    "101",
-    "100",
-    "101",
-    "111",
-    "110",
-    "111",
-    "011",
-    "010",
-    "011",
-    "001",
-]
+_PATH = (0, 4, 6, 2, 0, 1, 5, 4, 5, 7, 6, 7, 3, 2, 3, 1)
 """Corners in an order that follows all edges of a box; their bits say which are upper, x first."""
 
 

@@ -28,7 +28,7 @@ from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.images import curve_image, photo_image
 from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, time_left
 from abcd_ns.viewer.scenery import Scenery, first_look, nearest_view, views_that_see
-from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, sweep_line, workers_line
+from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, workers_line
 
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 10.0
@@ -152,10 +152,8 @@ class AbcdPanel(ViewerControl):
 
     def _report(self, coordinator: Trainer) -> None:
         history, state, seconds = self._history, coordinator.state, self._seconds
-        sweep, said = "", headline(self._where(state), coordinator.progress, time_left(coordinator))
-        if history.sweep is not None and not coordinator.finished:
-            visits = history.sweep_visits + len(state.queue) + len(history.of_sweep)
-            sweep = sweep_line(history.sweep, history.sweep_visits, visits)
+        said = headline(self._where(state), coordinator.progress, time_left(coordinator))
+        sweep = f"Sweep {state.sweep}: {len(state.queue)} visits are waiting" if state.queue else ""
         if over := coordinator.finished and not self._stage:
             said = "**Trained.**"
         if over and not self._was_over:

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
-from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS, BlockHealth
-from abcd_ns.engine.train.planner import LOOK_AGAIN
+from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.train.step.last_shedding import FEWEST, MOST, RANKING, ROUNDS, STEPS_EACH
 from abcd_ns.engine.train.trainer import Trainer
@@ -55,10 +54,6 @@ class RunHistory:
     """(seconds of training, mean PSNR of the crops since the last point)."""
     under_way: dict[int, VisitBegan] = field(default_factory=dict)
     """Visits, by number; several where workers train."""
-    sweep: int | None = None
-    """None before the first."""
-    sweep_visits: int = 0
-    """Visits that are over in this sweep."""
     _crops: dict[int, list[float]] = field(default_factory=dict)
     """By visit that is under way, the PSNR of its steps."""
     _recent: list[float] = field(default_factory=list)
@@ -66,16 +61,9 @@ class RunHistory:
 
     @staticmethod
     def resumed(state: RunState) -> "RunHistory":
-        """Of a run that goes on: which blocks had a visit follows from what their health tells, and from
-        the plan of the sweep."""
-        waiting = {plan.block for plan in state.queue}
-        if state.active is not None:
-            waiting.add(state.active.geometry.block)
-        records = {b: record for b, record in state.health.items() if record.visits and state.views.get(b)}
-        visits = {block: record.visits for block, record in records.items()}
-        over = sum(b not in waiting and not _passed_over(r, state.sweep) for b, r in records.items())
-        sweep = state.sweep if state.views else None
-        history = RunHistory(visits, sweep=sweep, sweep_visits=over)
+        """Of a run that goes on: which blocks had a visit follows from what their health tells."""
+        known = state.health.items()
+        history = RunHistory({b: of.visits for b, of in known if of.visits and state.views.get(b)})
         if (active := state.active) is not None:
             block = None if active.is_whole else active.geometry.block
             seen = len(active.trained_on)
@@ -86,8 +74,6 @@ class RunHistory:
         """Take an event in; `seconds` of training have passed."""
         match event:
             case VisitBegan():
-                if event.block is not None and event.sweep != self.sweep:
-                    self.sweep, self.sweep_visits = event.sweep, 0
                 self._begin(event)
             case StepTaken():
                 self._take_step(event, seconds)
@@ -118,7 +104,6 @@ class RunHistory:
         if visit.block is None:
             return
         self.visits[visit.block] = self.visits.get(visit.block, 0) + 1
-        self.sweep_visits += visit.sweep == self.sweep  # workers may still be at the last one
         if crops:
             self.psnr[visit.block] = sum(crops) / len(crops)
 
@@ -127,11 +112,6 @@ class RunHistory:
         self._recent = []
         if len(self.curve) > MOST_POINTS:
             del self.curve[-2::-2]
-
-    @property
-    def of_sweep(self) -> list[VisitBegan]:
-        """Visits to blocks that are under way in this sweep."""
-        return [v for v in self.under_way.values() if v.block is not None and v.sweep == self.sweep]
 
     def status(self, block: int, views: int | None) -> Status:
         """Of one block, on which so many views are worth training, if that is known."""
@@ -148,11 +128,6 @@ class RunHistory:
             BlockRow(b, self.status(b, views.get(b)), count, self.psnr.get(b), views.get(b))
             for b, count in counts.items()
         ]
-
-
-def _passed_over(record: BlockHealth, sweep: int) -> bool:
-    """Whether a block that is hidden has no visit in this sweep: then it has had fewer than one in each."""
-    return record.hidden and sweep % LOOK_AGAIN > 0 and record.visits <= sweep
 
 
 def time_left(run: Trainer) -> float | None:

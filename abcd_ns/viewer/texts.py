@@ -53,11 +53,6 @@ def _of_worker(worker: WorkerSeen) -> str:
     return f"Worker {worker.worker + 1}: {what}; {visits}{lost}"
 
 
-def sweep_line(sweep: int, over: int, visits: int) -> str:
-    """Where the sweep stands."""
-    return f"Sweep {sweep}: {over} of {visits} visits are over"
-
-
 def block_table(rows: Sequence[BlockRow]) -> str:
     """The blocks by number, counted from 1 as in the terminal, without columns that nothing is known of."""
     shown = list(rows)

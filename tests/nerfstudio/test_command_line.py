@@ -76,7 +76,6 @@ REFUSED = {
     "ns-eval --output-path scores.txt": "scores.txt must end in .json",
     "ns-render camera-path --camera-path-filename none.json": "none.json is no camera path",
     "ns-render camera-path --camera_path_filename=broken.json": "broken.json is no camera path",
-    "ns-viewer": "has no checkpoint",
 }
 
 

@@ -216,11 +216,15 @@ def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
     assert torch.equal(model.shs_0, gaussians.features_dc)
 
 
-def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch):
+def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch, capsys):
     moved = shutil.copytree(trained, tmp_path / "renamed")
     monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(moved / "config.yml")])
     _, _, checkpoint, _ = eval_setup(moved / "config.yml")
     assert checkpoint.parent == moved / "nerfstudio_models"
+    checkpoint.unlink()
+    with pytest.raises(SystemExit):
+        eval_setup(moved / "config.yml")
+    assert f"{checkpoint.parent} has no checkpoint" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("moved", "words"), [("data", "elsewhere"), ("photos", "is not a picture")])

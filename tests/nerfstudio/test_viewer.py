@@ -120,7 +120,7 @@ def test_the_panel_reports_the_run(watched):
     said = texts(watched)
     assert any("Warm-up of the whole scene" in text for text in said)
     assert any(text.startswith("**Block ") and " left" in text for text in said)
-    assert any(text.startswith("Sweep ") for text in said)
+    assert any(text.endswith("visits are waiting") for text in said)
     assert any("| RAM |" in text and "| layers |" in text for text in said)
     table = [text for text in said if text.startswith("| # | state |")][-1]
     assert table.count("| done |") == BLOCKS

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded, WorkerSeen
+from abcd_ns.engine.events import StepTaken, VisitBegan, VisitEnded, WorkerSeen
 from abcd_ns.engine.layers.survey import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
@@ -19,7 +19,6 @@ from abcd_ns.viewer.texts import (
     clock,
     headline,
     memory_table,
-    sweep_line,
     workers_line,
 )
 
@@ -132,15 +131,6 @@ def test_a_long_curve_is_thinned_and_keeps_its_end():
     assert len(history.curve) > MOST_POINTS / 2
 
 
-def test_visits_of_a_sweep_are_counted():
-    history = RunHistory()
-    for event in (began(0, 0), ended(0, 0), began(1, 1), ended(1, 1), SweepEnded(0, 20)):
-        history.note(event, 4.0)
-    assert (history.sweep, history.sweep_visits) == (0, 2)
-    history.note(began(2, 3, sweep=1), 9.0)
-    assert (history.sweep, history.sweep_visits) == (1, 0)
-
-
 def test_visits_of_workers_are_under_way_together():
     history = RunHistory()
     for visit, block in ((4, 0), (5, 2)):
@@ -153,19 +143,6 @@ def test_visits_of_workers_are_under_way_together():
     assert history.psnr == {0: 0.0}
     history.note(ended(5, 2), 3.0)
     assert history.psnr == {0: 0.0, 2: 20.0}
-
-
-def test_a_visit_of_the_last_sweep_does_not_count_in_this_one():
-    history = RunHistory()
-    for event in (began(0, 0), began(1, 1), ended(0, 0), began(2, 0, sweep=1)):
-        history.note(event, 0.0)
-    assert (history.sweep, history.sweep_visits) == (1, 0)
-    assert [visit.visit for visit in history.of_sweep] == [2]
-    history.note(ended(1, 1), 1.0)
-    assert history.sweep_visits == 0
-    assert history.visits == {0: 1, 1: 1}
-    history.note(ended(2, 0, sweep=1), 2.0)
-    assert history.sweep_visits == 1
 
 
 def test_what_workers_do_in_words():
@@ -210,24 +187,12 @@ def test_a_resumed_run_knows_which_blocks_had_their_visit():
     assert RunHistory.resumed(RunState()) == RunHistory()
 
 
-@pytest.mark.parametrize(("sweep", "over"), [(0, 2), (1, 1), (4, 2)])
-def test_a_resumed_run_knows_which_blocks_the_sweep_passes_over(sweep, over):
-    """Block 1 was hidden in its first visit: then it is looked at again in the fifth sweep."""
-    hidden = BlockHealth(visits=1 + sweep // 4, hidden=True)
-    health = {0: BlockHealth(visits=1 + sweep), 1: hidden, 2: BlockHealth(visits=sweep)}
-    state = RunState(sweep=sweep, views={0: 9, 1: 9, 2: 9}, health=health, active=active(2))
-    history = RunHistory.resumed(state)
-    assert history.sweep_visits == over
-    assert history.status(1, 9) is Status.DONE
-
-
 def test_words():
     assert clock(3725.9) == "1:02:05"
     assert clock(None) == "unknown"
     assert headline("Block 3, step 4 of 9", 0.25, 90.0) == (
         "**Block 3, step 4 of 9**  \n25% of the run, 0:01:30 left"
     )
-    assert sweep_line(2, 3, 8) == "Sweep 2: 3 of 8 visits are over"
     assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers", 2**20, 2**32)]).splitlines()[2:] == [
         "| RAM | 1.5 GiB | 16.0 GiB |",
         "| layers | 1 MiB | 4.0 GiB |",
