@@ -30,6 +30,8 @@ from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, time_left
 from abcd_ns.viewer.scenery import Scenery, first_look, nearest_view, views_that_see
 from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, workers_line
 
+AT_ONCE = (events.VisitBegan, events.VisitEnded, events.SweepEnded, events.ShedAtEnd)
+"""Events that the browser is told of at once, of others once in SECONDS_BETWEEN_UPDATES."""
 SECONDS_BETWEEN_UPDATES = 1.0
 SECONDS_BETWEEN_CURVES = 10.0
 HANDOVER_SECONDS = 0.002
@@ -101,13 +103,13 @@ class AbcdPanel(ViewerControl):
             self._update()
 
     def __call__(self, event: Event) -> None:
-        """Take an event in; the browser is told at visits' ends and otherwise once in a while."""
+        """Take an event in."""
         self._history.note(event, self._seconds)
         self._workers = event.workers if isinstance(event, WorkersSeen) else self._workers
         names = {LayersDrawn: "layers", Shedding: "final pruning"}
         self._stage = f"{names[type(event)]} {event.done} of {event.total}" if type(event) in names else ""
         due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
-        if due or isinstance(event, (events.VisitBegan, events.VisitEnded, events.SweepEnded)):
+        if due or isinstance(event, AT_ONCE):
             self._update()
         if isinstance(event, WorkersSeen) or (due and self._stage):
             self._let_viewer_draw()
@@ -169,11 +171,12 @@ class AbcdPanel(ViewerControl):
 
     def _where(self, state: RunState) -> str:
         active = state.active
-        if active is None and self._workers:
+        if active is None and self._workers and not self._stage:
             return workers_line(self._workers)
+        if active is None and self._coordinator.config.recipe.exact:
+            return "All blocks at once"
         if active is None:
-            between = self._stage.capitalize() or "Between visits"
-            return "All blocks at once" if self._coordinator.config.recipe.exact else between
+            return self._stage.capitalize() or "Between visits"
         steps = f" of {active.steps}" if 0 < active.steps < UNLIMITED else ""
         step = self._stage or f"step {active.done}{steps}"
         if active.is_whole:
