@@ -4,6 +4,7 @@ Ray carries blocks and answers, and nothing of a run lives in it: a worker that 
 one, and what it was at is given to another. The driver owns every object, so the end of a worker takes none.
 """
 
+import math
 import os
 import time
 import warnings
@@ -23,7 +24,6 @@ from abcd_ns.cluster.lease import (
     Lost,
     Member,
     Parcel,
-    RecentMean,
     Report,
     StepsSeen,
     VisitTask,
@@ -82,7 +82,7 @@ class Actor:
 
     def __init__(self) -> None:
         self._worker: VisitWorker | None = None
-        self._done, self._psnr = 0, RecentMean()
+        self._done, self._psnr = 0, math.nan
 
     def prepare(self, version: str, make: bytes) -> int:
         """Read what the run needs; gives the process' identifier.
@@ -100,17 +100,16 @@ class Actor:
 
     def visit(self, task: VisitTask, state: Shared, drawn: dict[int, Shared]) -> Parcel:
         """Train a block; gives what became of it."""
-        self._done, self._psnr = 0, RecentMean()
+        self._done, self._psnr = 0, math.nan
         return Parcel.of(self._worker.visit(task, state(), drawn, self._hear))
 
     def _hear(self, event: Event) -> None:
         if isinstance(event, StepTaken):
-            self._done = event.visit_step
-            self._psnr.add(event.psnr)
+            self._done, self._psnr = event.visit_step, event.psnr
 
     def progress(self) -> tuple[int, float]:
-        """Steps of the visit so far, and the mean PSNR of the last ones, dB."""
-        return self._done, self._psnr.value
+        """Steps of the visit so far, and the PSNR of the last one, dB."""
+        return self._done, self._psnr
 
 
 @dataclass
