@@ -270,6 +270,19 @@ class Dispatcher(Coordinator):
         super().restore()
         self._counted = self.state.step
 
+    def await_visits(self) -> bool:
+        # What no worker has, or has lost, is planned again when the run resumes.
+        self._lent = [lent for lent in self._lent if lent.submitted]
+        waits = bool(self._lent)
+        while self._lent:
+            self.resume()
+            for report in self.workers.wait(SECONDS):
+                self._hear(report)
+            self._lent = [lent for lent in self._lent if lent.submitted]
+            while self._lent and self._take_in_first():
+                pass
+        return waits
+
     def dismiss(self) -> None:
         self.workers.close()
 

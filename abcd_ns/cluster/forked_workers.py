@@ -27,7 +27,6 @@ from abcd_ns.cluster.lease import (
     Lost,
     Member,
     Parcel,
-    RecentMean,
     Report,
     StepsSeen,
     Workers,
@@ -191,15 +190,11 @@ class _Telling:
 
     def __init__(self, pipe: Connection) -> None:
         self._pipe, self._told = pipe, time.monotonic()
-        self._psnr = RecentMean()
 
     def __call__(self, event: Event) -> None:
-        steps = isinstance(event, StepTaken)
-        if steps:
-            self._psnr.add(event.psnr)
         if time.monotonic() - self._told >= TELL_EVERY:
             self._told = time.monotonic()
-            self._pipe.send((event.visit_step, self._psnr.value) if steps else None)
+            self._pipe.send((event.visit_step, event.psnr) if isinstance(event, StepTaken) else None)
 
 
 def _live(pipe: Connection, visit: Callable[[Callable[[Event], None]], Any]) -> NoReturn:

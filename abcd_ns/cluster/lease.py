@@ -1,9 +1,7 @@
 """What passes between the one who lends blocks and those who train them."""
 
-import math
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
@@ -110,7 +108,7 @@ class StepsSeen:
     lease: int
     done: int
     psnr: float
-    """Of recent steps, dB."""
+    """Of the last one, dB."""
 
 
 @dataclass(frozen=True)
@@ -232,20 +230,3 @@ class Workers(ABC, Generic[M]):
 
     def _longest_idle(self) -> M:
         return min((m for m in self._members if m.is_idle), key=lambda member: member.free_since)
-
-
-class RecentMean:
-    """Of the last 16 finite numbers; NaN where there is none."""
-
-    def __init__(self) -> None:
-        self._last: deque[float] = deque(maxlen=16)
-
-    def add(self, value: float) -> None:
-        """One more."""
-        if math.isfinite(value):
-            self._last.append(value)
-
-    @property
-    def value(self) -> float:
-        """The mean."""
-        return sum(self._last) / len(self._last) if self._last else math.nan

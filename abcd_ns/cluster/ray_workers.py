@@ -4,6 +4,7 @@ Ray carries blocks and answers, and nothing of a run lives in it: a worker that 
 one, and what it was at is given to another. The driver owns every object, so the end of a worker takes none.
 """
 
+import math
 import os
 import time
 import warnings
@@ -13,15 +14,16 @@ from typing import Any
 
 import ray
 import torch
+from ray import cloudpickle
 from ray import exceptions as of_ray
 
+from abcd_ns import __version__
 from abcd_ns.cluster.lease import (
     Finished,
     Lease,
     Lost,
     Member,
     Parcel,
-    RecentMean,
     Report,
     StepsSeen,
     VisitTask,
@@ -35,6 +37,7 @@ from abcd_ns.engine.gaussians.packed import Packed
 from abcd_ns.engine.kernels import share_cores
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError, first_line, is_out_of_memory
+from abcd_ns.machine import own_commit
 
 SILENCE, SLOW_START = 60.0, 600.0
 """Seconds after which a worker that does not answer, or does not begin, counts as lost."""
@@ -79,27 +82,34 @@ class Actor:
 
     def __init__(self) -> None:
         self._worker: VisitWorker | None = None
-        self._done, self._psnr = 0, RecentMean()
+        self._done, self._psnr = 0, math.nan
 
-    def prepare(self, make: Callable[[], VisitWorker]) -> int:
-        """Read what the run needs; gives the process' identifier."""
+    def prepare(self, version: str, make: bytes) -> int:
+        """Read what the run needs; gives the process' identifier.
+
+        Args:
+            version: of abcd_ns where the run was started.
+            make: what makes the worker, pickled: another version may not even read it.
+        """
+        if version != (own := _version()):
+            same = "install the same on all machines"
+            raise WorkersError(f"abcd_ns here is {own}, and {version} where the run was started: {same}.")
         share_cores(int(os.environ.get("OMP_NUM_THREADS", "1")))
-        self._worker = make()
+        self._worker = cloudpickle.loads(make)()
         return os.getpid()
 
     def visit(self, task: VisitTask, state: Shared, drawn: dict[int, Shared]) -> Parcel:
         """Train a block; gives what became of it."""
-        self._done, self._psnr = 0, RecentMean()
+        self._done, self._psnr = 0, math.nan
         return Parcel.of(self._worker.visit(task, state(), drawn, self._hear))
 
     def _hear(self, event: Event) -> None:
         if isinstance(event, StepTaken):
-            self._done = event.visit_step
-            self._psnr.add(event.psnr)
+            self._done, self._psnr = event.visit_step, event.psnr
 
     def progress(self) -> tuple[int, float]:
-        """Steps of the visit so far, and the mean PSNR of the last ones, dB."""
-        return self._done, self._psnr.value
+        """Steps of the visit so far, and the PSNR of the last one, dB."""
+        return self._done, self._psnr
 
 
 @dataclass
@@ -126,7 +136,7 @@ class RayWorkers(Workers[Remote]):
     def __init__(self, count: int, make: Callable[[], VisitWorker], *, gpus: int = 0, cores: int = 1) -> None:
         options = {"num_gpus": gpus, "num_cpus": cores, "max_concurrency": 2}
         self._class = ray.remote(**options, max_restarts=0, max_task_retries=0)(Actor)
-        self._make = ray.put(make)
+        self._make = ray.put(cloudpickle.dumps(make))
         self._failed_starts = 0
         super().__init__([self._start(Remote(number)) for number in range(count)])
 
@@ -163,13 +173,14 @@ class RayWorkers(Workers[Remote]):
         return self._replace(member, f"silent for {patience:.0f} s")
 
     def close(self) -> None:
-        for member in self._members:
+        for member in self._members if ray.is_initialized() else []:
             ray.kill(member.actor)
         self._members = []
+        ray.shutdown()
 
     def _start(self, member: Remote) -> Remote:
         member.actor = self._class.remote()
-        member.asked = member.actor.prepare.remote(self._make)
+        member.asked = member.actor.prepare.remote(_version(), self._make)
         member.question, member.lease, member.ready = None, None, False
         member.asked_at = member.free_since = time.monotonic()
         return member
@@ -221,6 +232,10 @@ class RayWorkers(Workers[Remote]):
             )
         self._start(member)
         return lost
+
+
+def _version() -> str:
+    return " at ".join(filter(None, (__version__, own_commit())))
 
 
 def _no_room(error: Exception) -> WorkersError:

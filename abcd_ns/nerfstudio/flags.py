@@ -1,10 +1,16 @@
 """Command lines of nerfstudio's: which are about our methods, and which options of a config are flags."""
 
+import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
+
+from abcd_ns.data.input_errors import exit_on_user_error
+from abcd_ns.errors import UserError
 
 METHODS = "abcd"
 """What the names of all our methods begin with."""
@@ -15,14 +21,73 @@ def trains_ours(words: Sequence[str]) -> bool:
     return Path(words[0]).stem == "ns-train" and len(words) > 1 and words[1].startswith(METHODS)
 
 
+def opened(words: Sequence[str]) -> Path | None:
+    """The config.yml that ns-eval, ns-viewer, ns-render or ns-export is to open; None of other commands."""
+    path = _value(words, "--load-config")
+    tool = Path(words[0]).stem
+    return Path(path) if path and tool.startswith("ns-") and tool != "ns-train" else None
+
+
 def opens_ours(words: Sequence[str]) -> bool:
     """Whether a command line opens a run of ours, OUTPUTS/SCENE/METHOD/TIME/config.yml: the path tells."""
+    path = opened(words)
+    return path is not None and any(part.startswith(METHODS) for part in path.parts[-3:-2])
+
+
+def as_a_command() -> AbstractContextManager:
+    """Where a command opens a run of ours, end it in one line by what the user can mend.
+
+    Python that opens one gets the exception, and so does `ns-train`, which has blocks to put on disk first.
+    """
+    return nullcontext() if opened(sys.argv) is None else exit_on_user_error()
+
+
+def check_tool(words: Sequence[str]) -> None:
+    """See that a command can do with a run of ours what it is asked for, before anything is loaded.
+
+    Raises:
+        UserError: other methods alone can, or a file that is named is of no use.
+    """
+    config = opened(words)
+    if config is None:
+        return
+    tool, what = Path(words[0]).stem, "".join(words[1:2])
+    if tool == "ns-export" and what in ("pointcloud", "tsdf", "poisson", "marching-cubes"):
+        raise UserError(f"ns-export {what} cannot draw Gaussians; `abcd mesh {config.parent}` makes a mesh.")
+    if tool == "ns-render" and what == "spiral":
+        raise UserError("ns-render spiral is for methods that train on rays: use ns-render interpolate.")
+    out = _value(words, "--output-path")
+    if tool == "ns-eval" and out and not out.endswith(".json"):
+        raise UserError(f"--output-path {out} must end in .json.")
+    if (path := _value(words, "--camera-path-filename")) is not None:
+        try:
+            json.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            refused = f"{path} is no camera path ({error}): make one in the viewer's Render tab."
+            raise UserError(refused) from None
+
+
+def check_held_out(words: Sequence[str]) -> None:
+    """See that a command asks for no held-out photos, where a run has none.
+
+    Raises:
+        UserError: it does.
+    """
+    tool, what = Path(words[0]).stem, "".join(words[1:2])
+    flag = {"dataset": "--split", "interpolate": "--pose-source"}.get(what)
+    if tool == "ns-eval":
+        raise UserError("This run's data holds no photos out, so there is nothing to score.")
+    if tool == "ns-render" and flag and _value(words, flag) != "train":
+        raise UserError(f"This run's data holds no photos out: add {flag} train.")
+
+
+def _value(words: Sequence[str], flag: str) -> str | None:
+    """What a command line gives for a flag; None where it does not name it."""
     flags = [word.partition("=")[0].replace("_", "-") for word in words]
-    if not Path(words[0]).stem.startswith("ns-") or "--load-config" not in flags:
-        return False
-    place = flags.index("--load-config")
-    path = words[place].partition("=")[2] or "".join(words[place + 1 : place + 2])
-    return any(part.startswith(METHODS) for part in Path(path).parts[-3:-2])
+    if flag not in flags:
+        return None
+    place = flags.index(flag)
+    return words[place].partition("=")[2] or "".join(words[place + 1 : place + 2])
 
 
 def hidden(*names: str) -> Callable[[type], type]:

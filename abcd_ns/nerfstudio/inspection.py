@@ -1,12 +1,14 @@
 """What there is to train on, read and checked before a run begins."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig
 
 from abcd_ns.data.dataset import PHOTOS, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.prepare import check_masks
+from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import reading
 
 
@@ -38,6 +40,24 @@ def inspect(config: DataParserConfig) -> Inspected:
     check_masks(sources)
     largest = max(width * height for width, height in (source.size for source in sources))
     return Inspected(largest, len(parts[0].metadata.get("points3D_xyz", ())), factor_of(parser))
+
+
+def where_data_is(data: Path | None, config: Path) -> Path | None:
+    """Where a run's data is: as its config.yml has it, seen from here or from a folder that the run lies in.
+
+    Raises:
+        UserError: nowhere.
+    """
+    places = [] if data is None else [base / data for base in (Path(), *config.absolute().parents)]
+    for place in places:
+        if place.exists():
+            return place
+    if places:
+        raise UserError(
+            f"{data}, on which this run was trained, does not exist: put it back, or a link to where it is "
+            f"now (ln -s NEW_PLACE {data})."
+        )
+    return None
 
 
 def factor_of(parser: DataParser) -> int:

@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 import torch
 import tyro
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback
 from nerfstudio.model_components import renderers
-from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
 from pytorch_msssim import SSIM
 from torch import Tensor
@@ -37,7 +37,7 @@ from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
 from abcd_ns.nerfstudio.fit import FREE_SHARE
-from abcd_ns.nerfstudio.flags import hidden
+from abcd_ns.nerfstudio.flags import as_a_command, hidden
 from abcd_ns.nerfstudio.metrics import image_metrics
 from abcd_ns.nerfstudio.options import HIDDEN
 from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
@@ -121,6 +121,16 @@ class AbcdModel(SplatfactoModel):
         """World to camera, by row of the training photos, of those that were refined."""
         return self._poses if self._coordinator is None else self._coordinator.run.poses.refined
 
+    @property
+    def colors(self) -> Tensor:
+        """RGB by harmonics of degree 0, [n, 3]. With no others, splatfacto's parameters are logits."""
+        return SH2RGB(self.features_dc)
+
+    @property
+    def shs_0(self) -> Tensor:
+        """The harmonics of degree 0, [n, 3]; as `colors`."""
+        return self.features_dc
+
     def scene(self) -> BlockScene:
         """The whole scene by blocks, the live one included."""
         if self._coordinator is not None:
@@ -202,11 +212,21 @@ class AbcdModel(SplatfactoModel):
         batch = (camera.metadata or {}).get(BATCH)
         if self.training and batch is not None:
             return rendered_outputs(batch, self._coordinator.render(batch))
-        return self._whole_outputs(self.view(camera))
+        with as_a_command():
+            return self._whole_outputs(self.view(camera))
 
     def view(self, camera: Cameras) -> View:
-        """The camera as the engine draws it: from the scene's near plane on, and on the CPU."""
-        return replace(view_of(camera.to("cpu")), near=self.near)
+        """The camera as the engine draws it: from the scene's near plane on, and on the CPU.
+
+        Raises:
+            UserError: it is no perspective camera. The viewer's, which previews such paths, becomes one.
+        """
+        if not isinstance(camera, Cameras):
+            raise UserError("Gaussians are drawn by cameras, not by rays; `abcd mesh RUN` makes a mesh.")
+        camera = camera.to("cpu")
+        if viewed.asked_by_viewer():
+            camera.camera_type = torch.full_like(camera.camera_type, CameraType.PERSPECTIVE.value)
+        return replace(view_of(camera), near=self.near)
 
     def _whole_outputs(self, view: View) -> dict[str, Tensor]:
         # ns-render's crop has a background of its own.

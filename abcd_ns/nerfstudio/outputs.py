@@ -1,7 +1,7 @@
 """What a model says of a whole picture: what nerfstudio's tools read, and what is drawn when one asks."""
 
 from collections import UserDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, KeysView, Mapping
 from typing import Any
 
 import torch
@@ -32,6 +32,10 @@ class Outputs(UserDict[str, Tensor]):
         for name in names:
             if name in self._later:
                 self[name] = self._later.pop(name)()
+
+    def keys(self) -> KeysView[str]:
+        """The names alone: ns-render prints this, and a `UserDict`'s would print all numbers."""
+        return self.data.keys()
 
     def __getitem__(self, name: str) -> Tensor:
         self.draw([name])

@@ -2,7 +2,6 @@
 
 import math
 import sys
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -15,7 +14,6 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import thin_out
 from abcd_ns.engine.render import loss
@@ -39,8 +37,8 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.fit import FITTED, SCAFFOLD, Demand, Fit, RamShares, device_budget, find_fit
-from abcd_ns.nerfstudio.flags import named_too, opens_ours, trains_ours
-from abcd_ns.nerfstudio.inspection import factor_of
+from abcd_ns.nerfstudio.flags import as_a_command, check_held_out, check_tool, named_too, opened
+from abcd_ns.nerfstudio.inspection import factor_of, where_data_is
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from abcd_ns.nerfstudio.options import SAME, mirror
@@ -97,13 +95,6 @@ class AbcdPipelineConfig(VanillaPipelineConfig):
     """Stop after this many seconds of training; evaluation and saving do not count."""
 
 
-def _as_a_command() -> AbstractContextManager:
-    """Where a command of nerfstudio's opens a run, what the user can mend ends it in one line. Who opens one
-    from Python is given the exception, and so is a training, which has blocks to put to rest before."""
-    opens = opens_ours(sys.argv) and not trains_ours(sys.argv)
-    return exit_on_user_error() if opens else nullcontext()
-
-
 class AbcdPipeline(VanillaPipeline):
     """ABCD in nerfstudio. Constructed without side effects: evaluation tools make one, too."""
 
@@ -118,12 +109,18 @@ class AbcdPipeline(VanillaPipeline):
             config.datamanager.photo_cache_gb = max(self._ram.photos, 1) / GIB
         # ns-viewer and ns-train start the viewer themselves, but neither does so before the pipeline exists.
         guard.install()
-        with _as_a_command():
+        with as_a_command():
+            check_tool(sys.argv)
+            if (opens := opened(sys.argv)) is not None:
+                config.datamanager.data = where_data_is(config.datamanager.data, opens)
             super().__init__(config, *args, **kwargs)
+            if not len(self.datamanager.eval_dataset):
+                check_held_out(sys.argv)
         self.coordinator: Trainer | None = None
         """Drives the training, once it has begun."""
         self._rendered: Rendered | None = None
-        self.panel = AbcdPanel(self.model, lambda: views_of(self.datamanager.train_dataset.cameras))
+        data = self.datamanager.train_dataset
+        self.panel = AbcdPanel(self.model, lambda: views_of(data.cameras), lambda row: data.photos.image(row))
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         """Everything exists by now, checkpoint included: begin or resume, and drive the coordinator."""
@@ -174,7 +171,7 @@ class AbcdPipeline(VanillaPipeline):
         if self.coordinator is not None:
             self.coordinator.pause()
         self.datamanager.take_poses(self.model.poses)
-        with _as_a_command():
+        with as_a_command():
             found = super().get_average_eval_image_metrics(*args, **kwargs)
         if self.coordinator is not None:
             self.coordinator.announce(HeldOutScored(float(found["psnr"]), found.get("ssim")))
@@ -184,7 +181,7 @@ class AbcdPipeline(VanillaPipeline):
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """As VanillaPipeline's; cameras stand where their poses were refined to."""
-        with _as_a_command():
+        with as_a_command():
             super().load_pipeline(loaded_state, step)
         self.datamanager.take_poses(self.model.poses)
 

@@ -24,7 +24,7 @@ from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
-from abcd_ns.nerfstudio.flags import hidden
+from abcd_ns.nerfstudio.flags import as_a_command, hidden, opened
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
@@ -69,6 +69,21 @@ class AbcdTrainerConfig(TrainerConfig):
             value = on_this_machine(value, sys.argv)
         super().__setattr__(name, value)
 
+    def get_base_dir(self) -> Path:
+        """As nerfstudio's; of a run that a command opens, where its config.yml is by now."""
+        config = opened(sys.argv)
+        return super().get_base_dir() if config is None else config.parent
+
+    def get_checkpoint_dir(self) -> Path:
+        """As nerfstudio's, which fails with a traceback where a command opens a run without checkpoints."""
+        folder = super().get_checkpoint_dir()
+        with as_a_command():
+            if opened(sys.argv) is not None and not any(folder.glob("step-*.ckpt")):
+                raise UserError(
+                    f"{folder} has no checkpoint: resume the run until it saves one, or copy it all."
+                )
+        return folder
+
     def print_to_terminal(self) -> None:
         """A few lines instead of nerfstudio's some hundred; all of it is in config.yml."""
         pipeline = self.pipeline
@@ -84,7 +99,8 @@ class AbcdTrainerConfig(TrainerConfig):
         try:
             super().save_config()
         except OSError as error:
-            print_error(f"{error.filename} cannot be made: {error.strerror}. Choose another --output-dir.")
+            place = error.filename or self.get_base_dir()  # a full disk names no file
+            print_error(f"{place} cannot be made: {error.strerror}. Choose another --output-dir.")
             raise SystemExit(2) from None
 
     def check(self) -> None:
@@ -93,9 +109,11 @@ class AbcdTrainerConfig(TrainerConfig):
 
         Exits with code 2 and one line for each fault that the user can mend.
         """
-        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+        device = self.machine.device_type
+        if device == "mps" or (device == "cuda" and not torch.cuda.is_available()):
             self.machine.device_type = "cpu"
-            CONSOLE.print("No CUDA device was found: training on the CPU with the torch rasterizer.")
+            why = "No CUDA device was found" if device == "cuda" else "MPS devices are not supported"
+            CONSOLE.print(f"{why}: training on the CPU.")
         with exit_on_user_error():
             start = find_start(self)
             check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
@@ -180,9 +198,9 @@ class AbcdTrainer(Trainer):
                 self._complete()
                 super().train()
         except Stopped as stopped:
-            self._end_report()
             with exit_on_user_error():
-                self.pipeline.coordinator.save()
+                self._save_at_stop()
+            self._end_report()
             name, step = stopped.received.name, self.pipeline.coordinator.state.step
             said = f"Stopped by {name} after step {step:,} of {self.total_steps:,}; nothing is lost."
             self._say_that_it_ended(said)
@@ -201,6 +219,17 @@ class AbcdTrainer(Trainer):
             with suppress(StoreError):  # what went wrong first is what matters
                 self.pipeline.coordinator.scene.flush()
             raise
+        finally:
+            self.pipeline.coordinator.dismiss()
+
+    def _save_at_stop(self) -> None:
+        """Save at once, as whoever stops the run may not wait for long; then again, with visits under way."""
+        coordinator = self.pipeline.coordinator
+        coordinator.save()
+        if coordinator.state.in_flight:
+            self._say("Visits under way are being finished; another Ctrl-C drops them.")
+        if coordinator.await_visits():
+            coordinator.save()
 
     def _complete(self) -> None:
         """A run that has had its steps or seconds takes no more; what comes after may be missing."""

@@ -21,7 +21,7 @@ def view_of(cameras: Cameras, row: int = 0) -> View:
     """
     if int(cameras.camera_type[row]) != CameraType.PERSPECTIVE.value:
         kind = CameraType(int(cameras.camera_type[row])).name.lower()
-        raise InputError(f"Camera {row} is {kind}; Gaussians are drawn by perspective cameras only.")
+        raise InputError(f"Camera {row} is {kind}; Gaussians are drawn by perspective cameras: choose these.")
     pose = cameras.camera_to_worlds[row].detach()
     rotation = pose[:3, :3] * pose.new_tensor([1.0, -1.0, -1.0])  # OpenGL to OpenCV: flip y and z
     viewmat = torch.eye(4, dtype=pose.dtype, device=pose.device)

@@ -135,8 +135,12 @@ def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int
     make = partial(make_worker, config, setup, 0 if not on_gpu else int(PHOTO_SHARE * budget))
     workers = RayWorkers(count, make, gpus=int(on_gpu), cores=threads)
     CONSOLE.print(f"{count} workers are starting.", highlight=False)
-    while not on_gpu and workers.idle < count:  # the warm-up, too, wants the cores that they start on
-        workers.wait(1.0)
+    try:
+        while not on_gpu and workers.idle < count:  # the warm-up, too, wants the cores that they start on
+            workers.wait(1.0)
+    except BaseException:  # Ctrl-C, too: the process may live on, as a notebook's does
+        workers.close()
+        raise
     return workers
 
 

@@ -1,8 +1,7 @@
 """Blocks as boxes. The outermost cells are infinite, so boxes are cut to the bulk of the points."""
 
-import numpy as np
 import torch
-from jaxtyping import Float, UInt32
+from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.space.tree import BlockTree, Box
@@ -18,10 +17,8 @@ GAP = 0.004
 MOST_POINTS = 100_000
 """Of which the bulk is found."""
 
-_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float32)
-_TRIANGLES = ("013", "032", "467", "475", "045", "051", "237", "276", "026", "064", "157", "173")
-_FACES = np.array([[int(corner) for corner in triangle] for triangle in _TRIANGLES], dtype=np.uint32)
-"""Of a box with these corners, as triangles that look outward."""
+_PATH = (0, 4, 6, 2, 0, 1, 5, 4, 5, 7, 6, 7, 3, 2, 3, 1)
+"""Corners in an order that follows all edges of a box; their bits say which are upper, x first."""
 
 
 def bulk(means: Float[Tensor, "n 3"]) -> Box:
@@ -47,22 +44,7 @@ def boxes_of(tree: BlockTree, bounds: Box) -> dict[int, Box]:
     return found
 
 
-def frame_mesh(box: Box, thickness: float) -> tuple[Float[np.ndarray, "v 3"], UInt32[np.ndarray, "f 3"]]:
-    """The twelve edges of a box as beams: vertices in the viewer's units, and triangles.
-
-    Lines would be simpler, but their options differ between versions of viser.
-
-    Args:
-        thickness: of a beam, world units.
-    """
-    low, high = box.lower.numpy(), box.upper.numpy()
-    beams = []
-    for axis in range(3):
-        for corner in _CORNERS[_CORNERS[:, axis] == 0]:
-            start = np.where(corner > 0, high, low)
-            stop = start.copy()
-            stop[axis] = high[axis]
-            beams.append((start - thickness / 2, stop + thickness / 2))
-    vertices = np.concatenate([start + _CORNERS * (stop - start) for start, stop in beams])
-    faces = np.concatenate([_FACES + 8 * k for k in range(len(beams))])
-    return (vertices * SCENE_SCALE).astype(np.float32), faces.astype(np.uint32)
+def edges_of(box: Box) -> tuple[tuple[float, float, float], ...]:
+    """The twelve edges of a box as one line through its corners, in the viewer's units."""
+    low, high = ((SCENE_SCALE * corner).tolist() for corner in (box.lower, box.upper))
+    return tuple(tuple((high if c & 4 >> k else low)[k] for k in range(3)) for c in _PATH)

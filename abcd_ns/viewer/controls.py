@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import viser
 
-from abcd_ns.viewer.chart import curve_image
+from abcd_ns.viewer.images import curve_image
 from abcd_ns.viewer.pictures import Show
 
 FOLLOW = "the one in training"
@@ -31,21 +30,22 @@ class Controls:
                 self._texts["headline"] = gui.add_markdown("Training has not begun.")
                 self._run = gui.add_progress_bar(0.0)
                 self._texts["sweep"] = gui.add_markdown("")
-                self._sweep = gui.add_progress_bar(0.0, color="teal")
             self._show = gui.add_dropdown("Show", options=tuple(show.value for show in Show))
             self._block = gui.add_dropdown("Block", options=(FOLLOW,) if trains else ("1",))
-            self.boxes = gui.add_checkbox("Boxes", initial_value=True)
+            self.boxes = gui.add_checkbox("Boxes", initial_value=trains)
             self.cameras = gui.add_checkbox("Its cameras", initial_value=False)
+            self.photo = gui.add_checkbox("Nearest photo", initial_value=False)
+            # A root for pictures' files, which viser asks for although there are none.
+            self._texts["photo"] = gui.add_markdown("", image_root=Path())
             with gui.add_folder("Table", expand_by_default=True):
                 self._texts["blocks"] = gui.add_markdown("")
             with gui.add_folder("Memory", expand_by_default=trains):
                 self._texts["memory"] = gui.add_markdown("")
             if trains:
                 with gui.add_folder("Accuracy over time", expand_by_default=True):
-                    # A root for pictures' files, which viser asks for although there are none.
                     self._texts["curve"] = gui.add_markdown(curve_image([], CURVE), image_root=Path())
                     gui.add_markdown(CURVE)
-        for handle in (self._show, self._block, self.boxes, self.cameras):
+        for handle in (self._show, self._block, self.boxes, self.cameras, self.photo):
             handle.on_update(lambda _: changed())
 
     @property
@@ -64,18 +64,13 @@ class Controls:
         self._block.options = (FOLLOW, *names) if self._trains else names
 
     def write(self, **texts: str) -> None:
-        """Set texts: headline, sweep, blocks, memory, curve."""
+        """Set texts: headline, sweep, photo, blocks, memory, curve."""
         for name, text in texts.items():
             if self._texts[name].content != text:
                 self._texts[name].content = text
 
-    def progress(self, run: float, sweep: float) -> None:
-        """Move the bars; 0..1."""
-        _move(self._run, run)
-        _move(self._sweep, sweep)
-
-
-def _move(bar: Any, share: float) -> None:
-    value = round(100 * min(max(share, 0.0), 1.0), 1)
-    if bar.value != value:
-        bar.value = value
+    def progress(self, share: float) -> None:
+        """Move the bar; 0..1."""
+        value = round(100 * min(max(share, 0.0), 1.0), 1)
+        if self._run.value != value:
+            self._run.value = value

@@ -9,27 +9,31 @@ import numpy as np
 import psutil
 import torch
 import viser
+import viser.transforms as vtf
+from jaxtyping import UInt8
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from abcd_ns.engine import events
-from abcd_ns.engine.events import Event, LayersDrawn, WorkerSeen, WorkersSeen
+from abcd_ns.engine.events import Event, LayersDrawn, Shedding, WorkerSeen, WorkersSeen
 from abcd_ns.engine.space.influence import worth_training
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.train.run_state import UNLIMITED, RunState
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import View
 from abcd_ns.viewer.boxes import boxes_of, bulk
-from abcd_ns.viewer.chart import curve_image
 from abcd_ns.viewer.controls import CURVE, Controls
 from abcd_ns.viewer.guard import rules_of
-from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, seconds_left, sweep_share
-from abcd_ns.viewer.scenery import Scenery, first_look, views_that_see
-from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, sweep_line, workers_line
+from abcd_ns.viewer.images import curve_image, photo_image
+from abcd_ns.viewer.run_history import BlockRow, RunHistory, Status, time_left
+from abcd_ns.viewer.scenery import Scenery, first_look, nearest_view, views_that_see
+from abcd_ns.viewer.texts import block_table, headline, memory_table, reach, workers_line
 
+AT_ONCE = (events.VisitBegan, events.VisitEnded, events.SweepEnded, events.ShedAtEnd)
+"""Events that the browser is told of at once, of others once in SECONDS_BETWEEN_UPDATES."""
 SECONDS_BETWEEN_UPDATES = 1.0
-SECONDS_BETWEEN_CURVES = 5.0
+SECONDS_BETWEEN_CURVES = 10.0
 HANDOVER_SECONDS = 0.002
 MOST_POINTS = 2000
 """Gaussians of a block that tell which cameras see it."""
@@ -44,20 +48,30 @@ class AbcdPanel(ViewerControl):
     Args:
         model: an AbcdModel: its `tree`, `choice` and `scene()` are read.
         views: gives the training views when asked.
+        photo: gives the photo of one by its index.
     """
 
-    def __init__(self, model: Any, views: Callable[[], list[View]]) -> None:
-        self._model, self._views = model, views
+    def __init__(
+        self,
+        model: Any,
+        views: Callable[[], list[View]],
+        photo: Callable[[int], UInt8[torch.Tensor, "h w c"]],
+    ) -> None:
+        self._model, self._views, self._photo = model, views, photo
         self._coordinator: Trainer | None = None
         self._history = RunHistory()
         self._controls: Controls | None = None
         self._scenery: Scenery | None = None
         self._cameras_of: int | None = None
-        self._layers = ""
+        self._photo_of: int | None = None
+        self._stage = ""
+        """What is done between steps."""
         self._workers: tuple[WorkerSeen, ...] = ()
+        self._was_over = False
         self._laid_out = 0
         """Blocks for which boxes and lists are made; 0 before that."""
         self._bounds: Box | None = None
+        self._training_views: list[View] = []
         self._first_look: tuple[np.ndarray, np.ndarray] | None = None
         self._updated = self._curve_drawn = 0.0
 
@@ -82,21 +96,22 @@ class AbcdPanel(ViewerControl):
     def follow(self, coordinator: Trainer) -> None:
         """From now on show how this run goes."""
         self._coordinator = coordinator
-        self._history = RunHistory.resumed(coordinator.state, coordinator.stopwatch.seconds)
+        self._history = RunHistory.resumed(coordinator.state)
         if self._controls is not None:
             self._lay_out()
             coordinator.announce.subscribe(self)
             self._update()
 
     def __call__(self, event: Event) -> None:
-        """Take an event in; the browser is told at visits' ends and otherwise once in a while."""
+        """Take an event in."""
         self._history.note(event, self._seconds)
         self._workers = event.workers if isinstance(event, WorkersSeen) else self._workers
-        self._layers = f"layers {event.done} of {event.total}" if isinstance(event, LayersDrawn) else ""
+        names = {LayersDrawn: "layers", Shedding: "final pruning"}
+        self._stage = f"{names[type(event)]} {event.done} of {event.total}" if type(event) in names else ""
         due = time.monotonic() - self._updated > SECONDS_BETWEEN_UPDATES
-        if due or isinstance(event, (events.VisitBegan, events.VisitEnded, events.SweepEnded)):
+        if due or isinstance(event, AT_ONCE):
             self._update()
-        if isinstance(event, WorkersSeen) or (due and isinstance(event, LayersDrawn)):
+        if isinstance(event, WorkersSeen) or (due and self._stage):
             self._let_viewer_draw()
 
     def _let_viewer_draw(self) -> None:
@@ -119,7 +134,8 @@ class AbcdPanel(ViewerControl):
             means = [scene.gaussians(block).means.cpu() for block in range(tree.num_blocks)]
             self._bounds = bulk(torch.cat(means))
         self._scenery.set_boxes(boxes_of(tree, self._bounds))
-        self._first_look = first_look(self._bounds, self._views())
+        self._training_views = self._views()
+        self._first_look = first_look(self._bounds, self._training_views)
         self._controls.set_blocks(tree.num_blocks)
         self._laid_out = tree.num_blocks
 
@@ -138,14 +154,15 @@ class AbcdPanel(ViewerControl):
 
     def _report(self, coordinator: Trainer) -> None:
         history, state, seconds = self._history, coordinator.state, self._seconds
-        share, sweep = sweep_share(history, state), ""
-        where, left = self._where(state), seconds_left(seconds, coordinator.progress)
-        if history.sweep is not None and not coordinator.finished:
-            visits = history.sweep_visits + len(state.queue) + len(history.of_sweep)
-            of_sweep = seconds_left(seconds - history.sweep_began, share, most=left)  # a run ends in a sweep
-            sweep = sweep_line(history.sweep, history.sweep_visits, visits, of_sweep)
-        self._controls.write(headline=headline(where, coordinator.progress, left), sweep=sweep)
-        self._controls.progress(coordinator.progress, share)
+        said = headline(self._where(state), coordinator.progress, time_left(coordinator))
+        sweep = f"Sweep {state.sweep}: {len(state.queue)} visits are waiting" if state.queue else ""
+        if over := coordinator.finished and not self._stage:
+            said = "**Trained.**"
+        if over and not self._was_over:
+            self._was_over, self._controls.boxes.value = True, False  # they were about the training
+        self._controls.write(headline=said, sweep=sweep)
+        self._controls.progress(coordinator.progress)
+        self.viewer.update_step(state.step)  # nerfstudio's own stands still between pictures
         if coordinator.finished:
             history.end(seconds)
         if coordinator.finished or self._updated - self._curve_drawn > SECONDS_BETWEEN_CURVES:
@@ -154,12 +171,14 @@ class AbcdPanel(ViewerControl):
 
     def _where(self, state: RunState) -> str:
         active = state.active
-        if active is None and self._workers:
+        if active is None and self._workers and not self._stage:
             return workers_line(self._workers)
+        if active is None and self._coordinator.config.recipe.exact:
+            return "All blocks at once"
         if active is None:
-            return "All blocks at once" if self._coordinator.config.recipe.exact else "Between visits"
+            return self._stage.capitalize() or "Between visits"
         steps = f" of {active.steps}" if 0 < active.steps < UNLIMITED else ""
-        step = self._layers or f"step {active.done}{steps}"
+        step = self._stage or f"step {active.done}{steps}"
         if active.is_whole:
             return f"Warm-up of the whole scene, {step}"
         return f"Block {active.geometry.block + 1}, {step}"
@@ -193,15 +212,31 @@ class AbcdPanel(ViewerControl):
         """Let a browser begin where the scene is to be seen."""
         if self._first_look is not None:
             client.camera.position, client.camera.look_at = self._first_look
+        client.camera.on_update(lambda _: self._show_photo(client))
 
     # -- what the user chooses -----------------------------------------------------------------------
 
     def _choose(self) -> None:
         with self.viewer.train_lock or nullcontext():
             self._model.choice.show, self._model.choice.block = self._controls.show, self._controls.block
-            self._cameras_of = None
+            self._cameras_of = self._photo_of = None
             self._update()
+        for client in self.viewer.viser_server.get_clients().values():
+            self._show_photo(client)
         self.viewer._trigger_rerender()
+
+    def _show_photo(self, client: viser.ClientHandle) -> None:
+        """The photo of the training view nearest to where a browser looks from, if that is wanted."""
+        view = None
+        if self._controls.photo.value:
+            forward = vtf.SO3(client.camera.wxyz).as_matrix()[:, 2]
+            view = nearest_view(client.camera.position, forward, self._training_views)
+        if view is None:
+            self._controls.write(photo="")
+        elif view.index != self._photo_of:
+            self._photo_of = view.index
+            name = f"Training photo {view.index + 1}"
+            self._controls.write(photo=f"{photo_image(self._photo(view.index).numpy(), name)}  \n{name}")
 
     def _chosen_block(self) -> int | None:
         visit = next(iter(self._history.under_way.values()), None)
@@ -220,4 +255,4 @@ class AbcdPanel(ViewerControl):
             kept = worth_training(known, self._coordinator.config.influence_share)
             return [self._coordinator.views[index] for index in kept]
         means = self._model.scene().gaussians(block).means
-        return views_that_see(means[:: max(len(means) // MOST_POINTS, 1)], self._views())
+        return views_that_see(means[:: max(len(means) // MOST_POINTS, 1)], self._training_views)

@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from abcd_ns.engine.events import BlockSplit, Event, StepTaken, VisitBegan, VisitEnded
-from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS, BlockHealth
-from abcd_ns.engine.train.planner import LOOK_AGAIN
-from abcd_ns.engine.train.run_state import UNLIMITED, RunState
+from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS
+from abcd_ns.engine.train.run_state import RunState
+from abcd_ns.engine.train.step.last_shedding import FEWEST, MOST, RANKING, ROUNDS, STEPS_EACH
+from abcd_ns.engine.train.trainer import Trainer
 
 SECONDS_BETWEEN_POINTS = 2.0
 """Of the curve, where visits are shorter, longer or do not exist."""
+FORWARD = 0.5
+"""Time of drawing a picture, in steps, which draw it backward, too."""
 MOST_POINTS = 400
 """Of the curve; then every second one goes."""
 
@@ -20,6 +23,7 @@ class Status(str, Enum):
     """Of a block; the values are the panel's words."""
 
     UNTRAINED = "untrained"
+    WARM_UP = "warm-up"
     ACTIVE = "active"
     DONE = "done"
     UNDER_OBSERVED = "under-observed"
@@ -50,44 +54,26 @@ class RunHistory:
     """(seconds of training, mean PSNR of the crops since the last point)."""
     under_way: dict[int, VisitBegan] = field(default_factory=dict)
     """Visits, by number; several where workers train."""
-    steps: dict[int, int] = field(default_factory=dict)
-    """By visit that is under way, its steps so far."""
-    sweep: int | None = None
-    """None before the first."""
-    sweep_began: float = 0.0
-    """Seconds of training when the sweep began."""
-    sweep_visits: int = 0
-    """Visits that are over in this sweep."""
     _crops: dict[int, list[float]] = field(default_factory=dict)
     """By visit that is under way, the PSNR of its steps."""
     _recent: list[float] = field(default_factory=list)
     """PSNR of the steps since the last point of the curve."""
 
     @staticmethod
-    def resumed(state: RunState, seconds: float) -> "RunHistory":
-        """Of a run that goes on: which blocks had a visit follows from what their health tells, and from
-        the plan of the sweep."""
-        waiting = {plan.block for plan in state.queue}
-        if state.active is not None:
-            waiting.add(state.active.geometry.block)
-        records = {b: record for b, record in state.health.items() if record.visits and state.views.get(b)}
-        visits = {block: record.visits for block, record in records.items()}
-        over = sum(b not in waiting and not _passed_over(r, state.sweep) for b, r in records.items())
-        sweep = state.sweep if state.views else None
-        history = RunHistory(visits, sweep=sweep, sweep_began=seconds, sweep_visits=over)
+    def resumed(state: RunState) -> "RunHistory":
+        """Of a run that goes on: which blocks had a visit follows from what their health tells."""
+        known = state.health.items()
+        history = RunHistory({b: of.visits for b, of in known if of.visits and state.views.get(b)})
         if (active := state.active) is not None:
             block = None if active.is_whole else active.geometry.block
             seen = len(active.trained_on)
             history._begin(VisitBegan(active.number, state.sweep, block, active.steps, seen, 0))
-            history.steps[active.number] = active.done
         return history
 
     def note(self, event: Event, seconds: float) -> None:
         """Take an event in; `seconds` of training have passed."""
         match event:
             case VisitBegan():
-                if event.block is not None and event.sweep != self.sweep:
-                    self.sweep, self.sweep_began, self.sweep_visits = event.sweep, seconds, 0
                 self._begin(event)
             case StepTaken():
                 self._take_step(event, seconds)
@@ -102,10 +88,9 @@ class RunHistory:
             self._add_point(seconds)
 
     def _begin(self, visit: VisitBegan) -> None:
-        self.under_way[visit.visit], self.steps[visit.visit], self._crops[visit.visit] = visit, 0, []
+        self.under_way[visit.visit], self._crops[visit.visit] = visit, []
 
     def _take_step(self, step: StepTaken, seconds: float) -> None:
-        self.steps[step.visit] = step.visit_step
         if not math.isfinite(step.psnr):
             return
         self._crops.setdefault(step.visit, []).append(step.psnr)
@@ -116,11 +101,9 @@ class RunHistory:
     def _end_visit(self, visit: VisitEnded) -> None:
         crops = self._crops.pop(visit.visit, [])
         self.under_way.pop(visit.visit, None)
-        self.steps.pop(visit.visit, None)
         if visit.block is None:
             return
         self.visits[visit.block] = self.visits.get(visit.block, 0) + 1
-        self.sweep_visits += visit.sweep == self.sweep  # workers may still be at the last one
         if crops:
             self.psnr[visit.block] = sum(crops) / len(crops)
 
@@ -130,15 +113,11 @@ class RunHistory:
         if len(self.curve) > MOST_POINTS:
             del self.curve[-2::-2]
 
-    @property
-    def of_sweep(self) -> list[VisitBegan]:
-        """Visits to blocks that are under way in this sweep."""
-        return [v for v in self.under_way.values() if v.block is not None and v.sweep == self.sweep]
-
     def status(self, block: int, views: int | None) -> Status:
         """Of one block, on which so many views are worth training, if that is known."""
-        if any(visit.block == block for visit in self.under_way.values()):
-            return Status.ACTIVE
+        for visit in self.under_way.values():
+            if visit.block in (block, None):
+                return Status.WARM_UP if visit.block is None else Status.ACTIVE
         if views is not None and views <= TOO_FEW_VIEWS:
             return Status.UNDER_OBSERVED
         return Status.DONE if self.visits.get(block) else Status.UNTRAINED
@@ -151,23 +130,17 @@ class RunHistory:
         ]
 
 
-def _passed_over(record: BlockHealth, sweep: int) -> bool:
-    """Whether a block that is hidden has no visit in this sweep: then it has had fewer than one in each."""
-    return record.hidden and sweep % LOOK_AGAIN > 0 and record.visits <= sweep
+def time_left(run: Trainer) -> float | None:
+    """Seconds that a run takes yet, the final pruning included, at its pace so far; None before a step.
 
-
-def sweep_share(history: RunHistory, state: RunState) -> float:
-    """Share of the sweep's visits that is done, 0..1; visits whose steps are planned count in part."""
-    visits = history.of_sweep
-    if not visits:
-        return 0.0
-    parts = (history.steps[v.visit] / v.steps for v in visits if 0 < v.steps < UNLIMITED)
-    return (history.sweep_visits + sum(parts)) / (history.sweep_visits + len(visits) + len(state.queue))
-
-
-def seconds_left(elapsed: float, share: float, most: float | None = None) -> float | None:
-    """How long the rest takes at the pace so far, `most` seconds at most; None if nothing is done yet."""
-    if not share > 0:
+    The pruning draws some views forward and backward, and a few others ROUNDS + 1 times forward alone.
+    """
+    config, progress, views = run.config, min(run.progress, 1.0), len(run.views)
+    if not run.state.step or not progress > 0:
         return None
-    left = elapsed * (1 - min(share, 1.0)) / min(share, 1.0)
-    return left if most is None else min(left, most)
+    steps, of_step = run.state.step / progress, run.stopwatch.seconds / run.state.step
+    prunes = config.density.price > 0 and config.density.strategy != "off" and not config.recipe.exact
+    ranking = min(max(steps / run.scene.tree.num_blocks / RANKING, FEWEST), views)
+    telling = min(max(steps / STEPS_EACH, FEWEST), MOST, views)
+    pruning = ranking + FORWARD * (ROUNDS + 1) * telling if prunes else 0
+    return of_step * (steps * (1 - progress) + pruning)

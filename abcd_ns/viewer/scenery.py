@@ -11,20 +11,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.engine.types import View
-from abcd_ns.viewer.boxes import SCENE_SCALE, frame_mesh
+from abcd_ns.engine.types import View, centers_of
+from abcd_ns.viewer.boxes import SCENE_SCALE, edges_of
 from abcd_ns.viewer.run_history import Status
 
 COLORS = {
     Status.UNTRAINED: (150, 150, 160),
+    Status.WARM_UP: (190, 170, 110),
     Status.ACTIVE: (255, 190, 40),
     Status.DONE: (40, 190, 140),
     Status.UNDER_OBSERVED: (235, 70, 70),
 }
-THICKNESS = 0.0015
-"""Of a box's edges, as a share of the diagonal of all boxes."""
-STRONGER = 3.0
-"""How much thicker the edges of the active block are."""
+WIDTH, ACTIVE_WIDTH = 1.0, 2.0
+"""Of a box's edges, px."""
 MOST_LABELS = 64
 """Blocks that get their number in the scene; with more they would hide it."""
 MOST_FRUSTA = 200
@@ -41,7 +40,6 @@ class Scenery:
     def __init__(self, scene: viser.SceneApi, frustum_scale: float) -> None:
         self._scene, self._frustum_scale = scene, frustum_scale
         self._boxes: dict[int, Box] = {}
-        self._thickness = 0.0
         self._status: dict[int, Status] = {}
         self._shown = True
         self._nodes: dict[int, list[viser.SceneNodeHandle]] = {}
@@ -50,8 +48,6 @@ class Scenery:
     def set_boxes(self, boxes: Mapping[int, Box]) -> None:
         """The boxes to show, by block; drawn when their states are known."""
         self._boxes, self._status = dict(boxes), {}
-        corners = torch.stack([c for box in boxes.values() for c in (box.lower, box.upper)])
-        self._thickness = THICKNESS * float((corners.amax(dim=0) - corners.amin(dim=0)).norm())
 
     def show_boxes(self, status: Mapping[int, Status], shown: bool) -> None:
         """Colour the boxes by the states of their blocks."""
@@ -65,10 +61,11 @@ class Scenery:
 
     def _draw_box(self, block: int, box: Box, status: Status, shown: bool) -> list[viser.SceneNodeHandle]:
         active = status is Status.ACTIVE
-        vertices, faces = frame_mesh(box, self._thickness * (STRONGER if active else 1))
-        number, look = block + 1, {"color": COLORS[status], "visible": shown}
+        edges, number = edges_of(box), block + 1
         name, label = f"/abcd/block_{number}", f"/abcd/label_{number}"
-        nodes = [self._scene.add_mesh_simple(name, vertices=vertices, faces=faces, **look)]
+        look = {"color": COLORS[status], "visible": shown, "line_width": ACTIVE_WIDTH if active else WIDTH}
+        straight = {"curve_type": "catmullrom", "tension": 0.0, "segments": len(edges) - 1}
+        nodes = [self._scene.add_spline_catmull_rom(name, edges, **straight, **look)]
         if len(self._boxes) <= MOST_LABELS:
             text = f"{number} {status.value}" if active else str(number)
             position = tuple(((box.lower + box.upper) / 2 * SCENE_SCALE).tolist())
@@ -106,10 +103,23 @@ def first_look(box: Box, views: Sequence[View]) -> tuple[Float[np.ndarray, "3"],
         views: the training views; without any, the scene is looked at from one corner of the box.
     """
     target = (box.lower + box.upper) / 2
-    centers = [view.center.double().cpu() for view in views] or [box.upper]
+    centers = list(centers_of(views)) if views else [box.upper]
     eye = max(centers, key=lambda center: float((center - target).norm()))
     lift = torch.tensor([0.0, 0.0, LIFT * float((eye - target).norm())]).double()
     return ((eye + lift) * SCENE_SCALE).numpy(), (target * SCENE_SCALE).numpy()
+
+
+def nearest_view(
+    eye: Float[np.ndarray, "3"], forward: Float[np.ndarray, "3"], views: Sequence[View]
+) -> View | None:
+    """The view that is taken nearest to `eye`, in the viewer's units, and most nearly along `forward`."""
+    if not views:
+        return None
+    centers = centers_of(views)
+    spread = (centers - centers.mean(dim=0)).norm(dim=1).mean().clamp_min(1e-9)
+    apart = (centers - torch.from_numpy(eye).double() / SCENE_SCALE).norm(dim=1) / spread
+    looks = torch.stack([view.viewmat[2, :3] for view in views]).double().cpu()
+    return views[int((apart - looks @ torch.from_numpy(forward).double()).argmin())]
 
 
 def views_that_see(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:

@@ -35,9 +35,7 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(where: str, progress: float, left: float | None) -> str:
-    """What is being trained, and how long the run takes yet."""
-    if progress >= 1:
-        return "**Trained.**"
+    """What is being done, and how long the run takes yet."""
     return f"**{where}**  \n{progress:.0%} of the run, {clock(left)} left"
 
 
@@ -53,11 +51,6 @@ def _of_worker(worker: WorkerSeen) -> str:
     lost = f", replaced {worker.deaths}x" if worker.deaths else ""
     visits = "1 visit" if worker.visits == 1 else f"{worker.visits} visits"
     return f"Worker {worker.worker + 1}: {what}; {visits}{lost}"
-
-
-def sweep_line(sweep: int, over: int, visits: int, left: float | None) -> str:
-    """Where the sweep stands."""
-    return f"Sweep {sweep}: {over} of {visits}" + ("" if left is None else f", {clock(left)} left")
 
 
 def block_table(rows: Sequence[BlockRow]) -> str:

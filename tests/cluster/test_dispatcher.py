@@ -183,6 +183,24 @@ def test_a_run_that_stops_goes_on_with_any_number_of_workers(make, photos, goes_
     assert len(whole_scene(resumed)) == len(whole_scene(stopped))
 
 
+def test_visits_that_are_under_way_are_kept_when_a_run_stops(make, photos):
+    stopped = make(workers=2, lag=4, density=STILL)
+    while stopped.state.step < 20 or stopped.workers.idle:
+        train_step(stopped, photos)
+    before, planned = stopped.state.step, stopped.state.planned
+    assert stopped.state.in_flight
+    assert stopped.await_visits()
+    assert (stopped.state.in_flight, stopped.state.planned) == ([], planned)
+    assert stopped.state.step == planned > before
+    assert not stopped.await_visits()
+    stopped.save()
+    stopped.close()
+    resumed = make(workers=2, resume=True, density=STILL)
+    assert resumed.state.step == stopped.state.step
+    train(resumed, photos)
+    assert resumed.state.step == 60
+
+
 def test_a_visit_that_ends_every_worker_ends_the_run_with_one_line(make, photos):
     run = make(workers=lambda r: Unreliable(in_process(r, photos, 2), lambda leases: (leases[0], "lost")))
     with pytest.raises(WorkersError, match=rf"lost {LOSSES} workers.*abcd plan"):

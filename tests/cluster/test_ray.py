@@ -82,9 +82,8 @@ def workers(steady, photos, traps):
         pytest.skip("this machine is too busy to start Ray, which gives itself 30 s")
     found = RayWorkers(2, partial(make_worker, steady[1], photos, traps=traps))
     yield found
-    if ray.is_initialized():  # else a test has ended this session, and with it the workers
-        found.close()
-        ray.shutdown()
+    found.close()
+    assert not ray.is_initialized()
 
 
 @pytest.fixture
@@ -169,6 +168,12 @@ def silence(workers: RayWorkers) -> None:
     member.asked_at -= ray_workers.SILENCE
 
 
+def end(workers: RayWorkers) -> None:
+    """End these alone: closing them would end all of Ray."""
+    for worker in workers._members:
+        ray.kill(worker.actor)
+
+
 def lent_first(run: Dispatcher) -> None:
     """Have both workers at it, however long they took to begin."""
     while run.workers.idle < 2:
@@ -182,7 +187,16 @@ def test_a_worker_that_cannot_begin_says_why():
     refusing = RayWorkers(1, refuse)
     with pytest.raises(WorkersError, match="worker 1: the photos are not here"):
         refusing.wait(60.0)
-    refusing.close()
+    end(refusing)
+
+
+@pytest.mark.usefixtures("workers")
+def test_a_worker_of_another_version_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setattr(ray_workers, "__version__", "0.0.9")
+    older = RayWorkers(1, refuse)
+    with pytest.raises(WorkersError, match=r"worker 1: abcd_ns here is .*, and 0\.0\.9.* install the same"):
+        older.wait(60.0)
+    end(older)
 
 
 @pytest.mark.usefixtures("workers")
@@ -193,7 +207,7 @@ def test_a_visit_that_does_not_fit_a_device_ends_the_run(steady, tmp_path, views
     (traps / "cuda").touch()
     with pytest.raises(torch.cuda.OutOfMemoryError, match=r"Tried to allocate 2\.00 GiB"):
         train(run, photos)
-    alone.close()
+    end(alone)
 
 
 @pytest.mark.usefixtures("workers")

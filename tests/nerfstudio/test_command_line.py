@@ -3,13 +3,16 @@
 import json
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import entrypoint
 
-from abcd_ns.nerfstudio.flags import opens_ours, trains_ours
+from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.flags import check_held_out, check_tool, opens_ours, trains_ours
+from abcd_ns.nerfstudio.inspection import where_data_is
 from tests.reference.colmap_scene import write_scene
 
 BIN = Path(sys.executable).parent
@@ -62,6 +65,52 @@ def test_a_flag_of_splatfactos_that_is_none_here_is_one_line():
 def test_command_lines_about_our_methods_are_known(line, ours):
     words = line.split()
     assert (trains_ours(words) or opens_ours(words)) == ours
+
+
+REFUSED = {
+    "ns-export poisson": "abcd mesh",
+    "ns-export tsdf": "abcd mesh",
+    "ns-export pointcloud": "abcd mesh",
+    "ns-export marching-cubes": "abcd mesh",
+    "ns-render spiral": "ns-render interpolate",
+    "ns-eval --output-path scores.txt": "scores.txt must end in .json",
+    "ns-render camera-path --camera-path-filename none.json": "none.json is no camera path",
+    "ns-render camera-path --camera_path_filename=broken.json": "broken.json is no camera path",
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_what_a_tool_cannot_do_with_a_run_is_said_before_it_is_opened(line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.json").write_text("{")
+    with pytest.raises(UserError, match=REFUSED[line]):
+        check_tool([*line.split(), "--load-config", "run/config.yml"])
+    check_tool(["ns-train", "abcd", "--load-config", "run/config.yml"])
+
+
+@pytest.mark.parametrize(
+    ("line", "remedy"),
+    [
+        ("ns-eval", "nothing to score"),
+        ("ns-render dataset", "--split train"),
+        ("ns-render interpolate --pose-source eval", "--pose-source train"),
+        ("ns-render dataset --split train", None),
+        ("ns-render camera-path", None),
+        ("ns-viewer", None),
+    ],
+)
+def test_held_out_photos_are_missed_where_they_are_asked_for(line, remedy):
+    with nullcontext() if remedy is None else pytest.raises(UserError, match=remedy):
+        check_held_out(line.split())
+
+
+def test_data_is_found_by_the_folder_that_the_run_lies_in(tmp_path):
+    data, config = tmp_path / "project/photos", tmp_path / "project/outputs/run/config.yml"
+    data.mkdir(parents=True)
+    assert where_data_is(Path("photos"), config) == data
+    assert where_data_is(None, config) is None
+    with pytest.raises(UserError, match="ln -s NEW_PLACE /gone"):
+        where_data_is(Path("/gone"), config)
 
 
 def test_a_wrong_folder_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):

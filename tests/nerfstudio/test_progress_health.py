@@ -1,8 +1,12 @@
 """What the terminal says of a run: the time left, alarms at once, the blocks' standing at the end."""
 
-import pytest
+import io
+import re
 
-from abcd_ns.engine.events import Mended, StepTaken, VisitBegan
+import pytest
+from rich.console import Console
+
+from abcd_ns.engine.events import Mended, Shedding, StepTaken, VisitBegan
 from abcd_ns.engine.train.health_record import BlockHealth
 from abcd_ns.engine.train.run_state import Stopwatch
 from abcd_ns.nerfstudio.run import progress
@@ -24,7 +28,27 @@ def test_no_time_is_left_before_a_step_tells_how_long_it_takes(coordinator, caps
     report(StepTaken(1, 0, 1, psnr=20.0))
     before, after = capsys.readouterr().out.splitlines()
     assert " left" not in before
-    assert after.endswith(" left")
+    assert " left  20.00 dB training  " in after
+
+
+def test_the_live_line_fits_the_terminal(coordinator, monkeypatch):
+    """What matters less is left out."""
+    file = io.StringIO()
+    monkeypatch.setattr(progress, "CONSOLE", Console(file=file, force_terminal=True, width=80))
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LOOKS", 0.0)
+    coordinator.run.stopwatch = Stopwatch(60.0)
+    coordinator.state.step = 1
+    report = ProgressReport(coordinator)
+    report(VisitBegan(0, 0, 2, steps=1000, views=3, gaussians=40))
+    report(StepTaken(1, 0, 999, psnr=20.0))
+    report(Shedding(2, 8))
+    report._live.refresh()
+    lines = [re.sub(r"\x1b\[[0-9?]*[a-zA-Z]", "", line) for line in re.split(r"[\r\n]", file.getvalue())]
+    assert any(
+        re.search(r"block 3/3 step 999/1000  \d:\d\d:\d\d left  20.00 dB training", line) for line in lines
+    )
+    assert any("final pruning 2/8" in line for line in lines)
+    assert max(len(line.rstrip()) for line in lines) < 80
 
 
 def test_what_is_no_number_is_said_at_once(coordinator, capsys):

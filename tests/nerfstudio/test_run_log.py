@@ -1,7 +1,9 @@
 """The log that every run writes: what is in it, what a resumed run keeps of it, what it survives."""
 
+import errno
 import json
 import math
+import os
 from collections import Counter
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -11,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from abcd_ns.engine.events import HeldOutScored, StepTaken, SweepEnded, VisitBegan, VisitEnded
+from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import run_log
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE, RunLog
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE, flat_options
@@ -54,6 +57,16 @@ def take_steps(log: RunLog, coordinator: FakeCoordinator, count: int, seconds: f
 def trained(data, tmp_path_factory):
     config = configure(data, tmp_path_factory.mktemp("out"), steps_per_eval_all_images=15)
     return run(config)
+
+
+def test_a_disk_that_is_full_at_the_start_is_one_line(tmp_path, monkeypatch):
+    def full(*_) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(run_log, "write_settings", full)
+    asked = SimpleNamespace(config=None, options={}, folder=tmp_path)
+    with pytest.raises(UserError, match=r"No space left on device\): free space"):
+        run_log.keep_log(asked, None, FakeCoordinator())
 
 
 def test_a_run_tells_its_visits_its_evaluations_and_its_end(trained):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.scripts import render
 from nerfstudio.scripts.eval import ComputePSNR
@@ -16,9 +17,11 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points
 from abcd_ns.engine.render.loss import psnr
+from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio import metrics
-from abcd_ns.nerfstudio.model import AbcdModel
+from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, VIEWS, WIDTH
 
@@ -195,6 +198,35 @@ def test_a_network_that_fails_is_one_line(monkeypatch):
         metrics._lpips.__wrapped__("cpu")
 
 
+def test_a_name_that_is_no_output_is_answered_by_names_alone(trained):
+    _, pipeline, _, _ = eval_setup(trained / "config.yml")
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    assert "tensor" not in repr(pipeline.model.get_outputs_for_camera(camera).keys())
+    with pytest.raises(UserError, match="abcd mesh"):
+        pipeline.model.get_outputs_for_camera_ray_bundle(camera.generate_rays(0, keep_shape=True))
+
+
+def test_an_export_of_degree_0_has_the_colours_that_are_drawn():
+    config = AbcdModelConfig(sh_degree=0)
+    model = config.setup(scene_box=SceneBox(torch.zeros(2, 3)), num_train_data=1)
+    color = torch.tensor([[0.8, 0.5, 0.1]])
+    gaussians = gaussians_from_points(torch.zeros(1, 3), 255 * color, sh_degree=0)
+    model.gauss_params["features_dc"] = torch.nn.Parameter(gaussians.features_dc)
+    assert model.colors.allclose(color, atol=0.01)
+    assert torch.equal(model.shs_0, gaussians.features_dc)
+
+
+def test_a_run_opens_where_it_was_moved_to(trained, tmp_path, monkeypatch, capsys):
+    moved = shutil.copytree(trained, tmp_path / "renamed")
+    monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(moved / "config.yml")])
+    _, _, checkpoint, _ = eval_setup(moved / "config.yml")
+    assert checkpoint.parent == moved / "nerfstudio_models"
+    checkpoint.unlink()
+    with pytest.raises(SystemExit):
+        eval_setup(moved / "config.yml")
+    assert f"{checkpoint.parent} has no checkpoint" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("moved", "words"), [("data", "elsewhere"), ("photos", "is not a picture")])
 def test_what_a_user_can_mend_ends_a_tool_in_one_line(
     data, trained, tmp_path, capsys, monkeypatch, moved, words
@@ -205,8 +237,7 @@ def test_what_a_user_can_mend_ends_a_tool_in_one_line(
             photo.write_bytes(b"no photo")
     config = yaml.load((trained / "config.yml").read_text(), Loader=yaml.Loader)
     config.data = config.pipeline.datamanager.data = scene
-    folder = tmp_path / "abcd" / "run"
-    folder.mkdir(parents=True)
+    folder = Path(shutil.copytree(trained, tmp_path / "run"))
     (folder / "config.yml").write_text(yaml.dump(config))
     monkeypatch.setattr("sys.argv", ["ns-eval", "--load-config", str(folder / "config.yml")])
     capsys.readouterr()

@@ -17,6 +17,8 @@ from abcd_ns.nerfstudio.trainer import on_this_machine
 from abcd_ns.nerfstudio.views import views_of
 from abcd_ns.viewer.guard import rules_of
 from abcd_ns.viewer.pictures import Show
+from abcd_ns.viewer.run_history import Status
+from abcd_ns.viewer.scenery import COLORS
 from tests.nerfstudio.test_training import configure, run
 from tests.viewer.client import CAMERA, Browser, ask, free_port, status
 
@@ -93,16 +95,16 @@ def test_the_run_was_guarded_from_the_start(watched):
 
 
 def test_every_block_has_its_box(watched):
-    meshes = {m["name"]: m for m in watched.browser.of("MeshMessage")}
+    meshes = {m["name"]: m for m in watched.browser.of("CatmullRomSplineMessage")}
     assert {f"/abcd/block_{b + 1}" for b in range(BLOCKS)} <= set(meshes)
     labels = {m["name"] for m in watched.browser.of("LabelMessage")}
     assert {f"/abcd/label_{b + 1}" for b in range(BLOCKS)} <= labels
 
 
 def test_the_active_block_was_marked_and_is_no_longer(watched):
-    drawn = [m for m in watched.browser.of("MeshMessage") if m["name"].startswith("/abcd/block_")]
-    colors = {m["color"] for m in drawn}
-    assert len(colors) == 3  # untrained, active, done
+    drawn = [m for m in watched.browser.of("CatmullRomSplineMessage") if m["name"].startswith("/abcd/block_")]
+    colors = {tuple(m["color"].to_bytes(3, "big")) for m in drawn}
+    assert {COLORS[status] for status in (Status.WARM_UP, Status.ACTIVE, Status.DONE)} <= colors
     texts = [m["text"] for m in watched.browser.of("LabelMessage")]
     assert any(text.endswith("active") for text in texts)
     last = {m["name"]: m["color"] for m in drawn}
@@ -118,7 +120,7 @@ def test_the_panel_reports_the_run(watched):
     said = texts(watched)
     assert any("Warm-up of the whole scene" in text for text in said)
     assert any(text.startswith("**Block ") and " left" in text for text in said)
-    assert any(text.startswith("Sweep ") for text in said)
+    assert any(text.endswith("visits are waiting") for text in said)
     assert any("| RAM |" in text and "| layers |" in text for text in said)
     table = [text for text in said if text.startswith("| # | state |")][-1]
     assert table.count("| done |") == BLOCKS
@@ -166,15 +168,26 @@ def test_the_user_sees_the_cameras_of_a_block(watched):
     )
 
 
-def test_boxes_can_be_hidden(watched):
+def test_boxes_are_there_while_it_trains_and_afterwards_when_wanted(watched):
+    def shows(visible: bool):
+        node = ("SetSceneNodeVisibilityMessage", "/abcd/block_1", visible)
+        return lambda m: (m["type"], m.get("name"), m.get("visible")) == node
+
+    watched.browser.wait_for(shows(False))  # when it was trained
     since = watched.browser.heard
-    watched.choose("Boxes", False)
-    watched.browser.wait_for(
-        lambda m: (
-            m["type"] == "SetSceneNodeVisibilityMessage" and m["name"] == "/abcd/block_1" and not m["visible"]
-        ),
-        since,
-    )
+    watched.choose("Boxes", True)
+    watched.browser.wait_for(shows(True), since)
+
+
+def test_the_step_moves_to_the_last_one(watched):
+    assert any(text.startswith(f"Step: {STEPS}") for text in texts(watched))
+
+
+def test_the_user_sees_the_photo_that_is_taken_nearest(watched):
+    since = watched.browser.heard
+    watched.choose("Nearest photo", True)
+    watched.browser.wait_for(lambda m: "Training photo 5" in m.get("updates", {}).get("markdown", ""), since)
+    watched.choose("Nearest photo", False)
 
 
 def test_what_the_viewer_shows_changes_no_evaluation(watched):
@@ -223,7 +236,9 @@ def test_ns_viewer_stays_on_this_machine_and_shows_blocks(finished):
     choices = browser.wait_for(lambda m: m.get("label") == "Block")
     assert tuple(choices["options"]) == ("1",)
     browser.wait_for(lambda m: "options" in m.get("updates", {}) and len(m["updates"]["options"]) == BLOCKS)
-    browser.wait_for(lambda m: m["type"] == "MeshMessage" and m["name"] == f"/abcd/block_{BLOCKS}")
+    browser.wait_for(
+        lambda m: m["type"] == "CatmullRomSplineMessage" and m["name"] == f"/abcd/block_{BLOCKS}"
+    )
     browser.wait_for(lambda m: "| 3 | done |" in m.get("updates", {}).get("markdown", ""))
     browser.send(CAMERA)
     browser.wait_for(lambda m: m["type"] == "SetCameraLookAtMessage")

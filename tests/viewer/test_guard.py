@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import viser
+from nerfstudio.viewer.render_panel import populate_render_tab
 from viser.infra import _infra
 from websockets.asyncio.client import connect as connect_async
 from websockets.asyncio.server import serve as serve_async
@@ -25,6 +26,7 @@ SECRET = b"the canary sings"
 def server() -> Iterator[viser.ViserServer]:
     assert guard.install()
     server = viser.ViserServer(host="127.0.0.1", port=free_port(), verbose=False)
+    guard.rules_of(server)
     yield server
     server.stop()
 
@@ -160,6 +162,28 @@ def test_no_attribute_of_a_control_can_be_overwritten(server, browser, answers):
     assert slider._impl.update_cb == []
     assert slider.value == 4
     slider.remove()
+
+
+def test_no_client_writes_a_file_outside_the_folder_of_camera_paths(server, browser, answers, tmp_path):
+    """nerfstudio's render panel writes DATA/camera_paths/NAME.json, with NAME as the client sends it."""
+    victim = tmp_path / "manifest.json"
+    victim.write_text("the run")
+    populate_render_tab(server, Path("config.yml"), tmp_path / "data")
+    browser.wait_for(lambda m: m.get("label") == "Generate Command")
+    labelled = {m["label"]: m["id"] for m in list(browser.messages) if "label" in m and "id" in m}
+
+    def set_to(label: str, value: object) -> None:
+        browser.send({"type": "GuiUpdateMessage", "id": labelled[label], "updates": {"value": value}})
+
+    for name in (str(victim.with_suffix("")), "../../manifest"):
+        set_to("Render name", name)
+        set_to("Generate Command", True)
+        browser.wait_for(lambda m: m["type"] == "GuiModalMessage")
+    assert victim.read_text() == "the run"
+    set_to("Render name", "tour")
+    set_to("Generate Command", True)
+    assert answers()
+    assert (tmp_path / "data/camera_paths/tour.json").exists()
 
 
 def test_another_viser_is_not_guarded_and_the_user_told(monkeypatch, capsys):

@@ -38,10 +38,15 @@ def test_a_name_that_was_configured_is_known():
 
 
 def test_a_viewer_on_all_networks_goes_by_addresses_and_own_names_alone(monkeypatch):
-    monkeypatch.setattr(rules_module.socket, "gethostname", lambda: "Lab7.example.org")
+    monkeypatch.setattr(rules_module.socket, "gethostname", lambda: "Lab7.local")
+    monkeypatch.setattr(rules_module.socket, "getfqdn", lambda: "lab7.example.org")
+    rules_module._own_names.cache_clear()
     known = ["192.168.1.5:7007", "[fe80::1]:7007", "lab7:7007", "lab7.example.org", "lab7.local", "localhost"]
     assert [host for host in known if not EVERYWHERE.knows(host)] == []
     assert not EVERYWHERE.knows("rebound.evil.example:7007")
+    assert Rules("lab7").knows("lab7.example.org:7007")
+    assert not HOME.knows("lab7.example.org:7007")  # a stranger's network may have given us this name
+    rules_module._own_names.cache_clear()
 
 
 def test_the_tunnels_name_is_known_only_where_sharing_is_on():
@@ -139,10 +144,74 @@ def test_sharing_takes_permission():
         assert Rules("127.0.0.1", share=True).admits(message(kind))
 
 
-def test_of_a_control_only_the_value_can_be_set():
-    assert HOME.admits(message("GuiUpdateMessage", updates={"value": 3}))
-    assert not HOME.admits(message("GuiUpdateMessage", updates={"value": 3, "update_cb": []}))
-    assert not HOME.admits(message("GuiUpdateMessage", updates=["value"]))
+ELEMENTS = {
+    "switch": SimpleNamespace(value=False, disabled=False),
+    "number": SimpleNamespace(value=4, disabled=False),
+    "disabled": SimpleNamespace(value=4, disabled=True),
+    "vector": SimpleNamespace(value=(1.0, 2.0), disabled=False),
+    "choice": SimpleNamespace(value="a/b", disabled=False, options=("a/b", "c")),
+    "text": SimpleNamespace(value="name", disabled=False),
+    "upload": SimpleNamespace(value=SimpleNamespace(name="x"), disabled=False),
+}
+FITTING = {
+    "switch": [True, False],
+    "number": [3, 0.5],
+    "vector": [[1, 2.5], (0, 0)],
+    "choice": ["a/b", "c"],
+    "text": ["2026-11-28-10-00-00", "Küche_2.final"],
+}
+UNFIT = {
+    "switch": [1, "True", [True]],
+    "number": ["nan", "1e999", math.nan, math.inf, 1e300, None, [1]],
+    "disabled": [3],
+    "vector": [[1], [1, 2, 3], ["1", "2"], [1, math.nan], 1, "12"],
+    "choice": ["d", "../a", ["c"], 0],
+    "text": [
+        "/etc/x",
+        "a/b",
+        "..",
+        ".x",
+        "a\\b",
+        "a\0b",
+        "a\n",
+        "-x",
+        "a b",
+        "$(x)",
+        "",
+        "x" * 101,
+        5,
+        ["a"],
+    ],
+    "upload": ["x", True],
+    "unknown": [True],
+}
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_an_element_takes_values_of_its_kind_alone(name):
+    rules = Rules("127.0.0.1", element=ELEMENTS.get)
+
+    def admitted(value):
+        return rules.admits(message("GuiUpdateMessage", id=name, updates={"value": value}))
+
+    assert [value for value in FITTING.get(name, []) if not admitted(value)] == []
+    assert [value for value in UNFIT[name] if admitted(value)] == []
+
+
+def test_of_an_element_only_the_value_can_be_set():
+    rules = Rules("127.0.0.1", element=ELEMENTS.get)
+    for updates in ({"value": 3, "update_cb": []}, {"disabled": False}, {}, ["value"]):
+        assert not rules.admits(message("GuiUpdateMessage", id="number", updates=updates))
+
+
+def test_other_messages_are_not_acted_on():
+    for kind in ("FileTransferStart", "FileTransferPart", "ScenePointerMessage", "GetRenderResponseMessage"):
+        assert not HOME.admits(message(kind))
+    assert HOME.admits(message("SceneNodeClickMessage", name="/crop"))
+    pose = {"name": "/crop", "wxyz": (1, 0, 0, 0), "position": (0, 0, 0)}
+    assert HOME.admits(message("TransformControlsUpdateMessage", **pose))
+    for wrong in ({"wxyz": (0, 0, 0, 0)}, {"position": (math.nan, 0, 0)}):
+        assert not HOME.admits(message("TransformControlsUpdateMessage", **{**pose, **wrong}))
 
 
 def test_the_page_may_connect_to_its_own_server_alone():

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from abcd_ns.engine.events import LayersDrawn, StepTaken
+from abcd_ns.engine.events import LayersDrawn, Shedding, StepTaken
 from abcd_ns.viewer import panel as panel_module
 from abcd_ns.viewer.panel import AbcdPanel
 
 
 def watched_panel(browsers: int = 1) -> AbcdPanel:
-    panel = AbcdPanel(SimpleNamespace(), list)
+    panel = AbcdPanel(SimpleNamespace(), list, lambda _: None)
     panel.viewer = SimpleNamespace(
         train_lock=threading.Lock(), render_statemachines=dict.fromkeys(range(browsers))
     )
@@ -42,11 +42,18 @@ def draws_meanwhile(panel: AbcdPanel, event) -> bool:
     ("browsers", "event", "seconds", "draws"),
     [
         (1, LayersDrawn(0, 1, 9), 0.0, True),
+        (1, Shedding(1, 9), 0.0, True),
         (0, LayersDrawn(0, 1, 9), 0.0, False),
         (1, StepTaken(1, 0, 1, 20.0), 0.0, False),
         (1, LayersDrawn(0, 1, 9), 1e6, False),
     ],
-    ids=["browsers get a picture while layers are drawn", "nobody", "a step", "once a second at most"],
+    ids=[
+        "browsers get a picture while layers are drawn",
+        "and in the final pruning",
+        "nobody",
+        "a step",
+        "once a second at most",
+    ],
 )
 def test_the_lock_is_handed_over(monkeypatch, browsers, event, seconds, draws):
     monkeypatch.setattr(panel_module, "HANDOVER_SECONDS", 0.5)

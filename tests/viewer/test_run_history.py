@@ -1,24 +1,24 @@
 """What the panel makes of a run's events: states of blocks, the table, the curve, time left."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
-from abcd_ns.engine.events import StepTaken, SweepEnded, VisitBegan, VisitEnded, WorkerSeen
+from abcd_ns.engine.events import StepTaken, VisitBegan, VisitEnded, WorkerSeen
 from abcd_ns.engine.layers.survey import VisitGeometry
 from abcd_ns.engine.store.special_blocks import WHOLE
 from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import UNLIMITED, ActiveVisit, RunState, VisitKind
+from abcd_ns.engine.train.run_state import ActiveVisit, RunState, VisitKind
 from abcd_ns.engine.train.schedule import VisitPlan
 from abcd_ns.engine.types import Crop
-from abcd_ns.viewer.run_history import MOST_POINTS, BlockRow, RunHistory, Status, seconds_left, sweep_share
+from abcd_ns.viewer.run_history import MOST_POINTS, BlockRow, RunHistory, Status, time_left
 from abcd_ns.viewer.texts import (
     MOST_ROWS,
     block_table,
     clock,
     headline,
     memory_table,
-    sweep_line,
     workers_line,
 )
 
@@ -59,7 +59,7 @@ def test_during_the_warm_up_no_block_is_active():
     history = RunHistory()
     history.note(began(0, None), 0.0)
     rows = history.rows({0: None, 1: None}, {})
-    assert [row.status for row in rows] == [Status.UNTRAINED] * 2
+    assert [row.status for row in rows] == [Status.WARM_UP] * 2
     history.note(ended(0, None), 1.0)
     assert history.visits == {}
 
@@ -131,62 +131,18 @@ def test_a_long_curve_is_thinned_and_keeps_its_end():
     assert len(history.curve) > MOST_POINTS / 2
 
 
-def test_progress_through_the_sweep():
-    history, state = RunHistory(), RunState(queue=[VisitPlan(1, 10), VisitPlan(2, 10), VisitPlan(3, 10)])
-    history.note(began(0, 0), 4.0)
-    history.note(StepTaken(5, visit=0, visit_step=5, psnr=20.0), 5.0)
-    assert history.sweep_began == 4.0
-    assert sweep_share(history, state) == pytest.approx(0.5 / 4)
-    history.note(ended(0, 0), 6.0)
-    history.note(began(1, 1), 6.0)
-    state.queue.pop(0)
-    assert sweep_share(history, state) == pytest.approx(1 / 4)
-    assert history.sweep_began == 4.0
-    history.note(ended(1, 1), 8.0)
-    history.note(SweepEnded(0, 20), 8.0)
-    history.note(began(2, 3, sweep=1), 9.0)
-    assert (history.sweep, history.sweep_began, history.sweep_visits) == (1, 9.0, 0)
-
-
-def test_visits_without_planned_steps_count_when_they_are_over():
-    history, state = RunHistory(), RunState(queue=[VisitPlan(1, 10)])
-    assert sweep_share(history, state) == 0.0
-    history.note(began(0, 0, steps=UNLIMITED), 0.0)
-    history.note(StepTaken(500, visit=0, visit_step=500, psnr=20.0), 1.0)
-    assert sweep_share(history, state) == 0.0
-    history.sweep_visits = 1
-    assert sweep_share(history, state) == pytest.approx(1 / 3)
-    warming = RunHistory()
-    warming.note(began(0, None), 0.0)
-    assert sweep_share(warming, RunState()) == 0.0
-
-
 def test_visits_of_workers_are_under_way_together():
-    history, state = RunHistory(), RunState(queue=[VisitPlan(3, 10)])
+    history = RunHistory()
     for visit, block in ((4, 0), (5, 2)):
         history.note(began(visit, block), 1.0)
         history.note(StepTaken(0, visit, visit_step=visit, psnr=10.0 * block), 2.0)
     statuses = [history.status(block, 9) for block in range(3)]
     assert statuses == [Status.ACTIVE, Status.UNTRAINED, Status.ACTIVE]
-    assert sweep_share(history, state) == pytest.approx((0.4 + 0.5) / 3)
     history.note(ended(4, 0), 3.0)
     assert history.status(0, 9) is Status.DONE
     assert history.psnr == {0: 0.0}
     history.note(ended(5, 2), 3.0)
     assert history.psnr == {0: 0.0, 2: 20.0}
-
-
-def test_a_visit_of_the_last_sweep_does_not_count_in_this_one():
-    history = RunHistory()
-    for event in (began(0, 0), began(1, 1), ended(0, 0), began(2, 0, sweep=1)):
-        history.note(event, 0.0)
-    assert (history.sweep, history.sweep_visits) == (1, 0)
-    assert [visit.visit for visit in history.of_sweep] == [2]
-    history.note(ended(1, 1), 1.0)
-    assert history.sweep_visits == 0
-    assert history.visits == {0: 1, 1: 1}
-    history.note(ended(2, 0, sweep=1), 2.0)
-    assert history.sweep_visits == 1
 
 
 def test_what_workers_do_in_words():
@@ -197,15 +153,24 @@ def test_what_workers_do_in_words():
     ]
 
 
-@pytest.mark.parametrize(
-    ("elapsed", "share", "most", "left"),
-    [
-        *((10.0, 0.5, None, 10.0), (10.0, 0.1, None, 90.0), (5.0, 1.0, None, 0.0), (5.0, 1.5, None, 0.0)),
-        *((5.0, 0.0, None, None), (50.0, 0.25, 100.0, 100.0), (50.0, 0.5, 100.0, 50.0)),
-    ],
-)
-def test_time_left(elapsed, share, most, left):
-    assert seconds_left(elapsed, share, most) == (None if left is None else pytest.approx(left))
+def a_run(step: int, progress: float, price: float = 8.0):
+    density = SimpleNamespace(price=price, strategy="error")
+    return SimpleNamespace(
+        config=SimpleNamespace(density=density, recipe=SimpleNamespace(exact=False)),
+        state=SimpleNamespace(step=step),
+        stopwatch=SimpleNamespace(seconds=10.0),
+        progress=progress,
+        views=dict.fromkeys(range(20)),
+        scene=SimpleNamespace(tree=SimpleNamespace(num_blocks=2)),
+    )
+
+
+def test_time_left_is_that_of_steps_and_of_the_final_pruning():
+    assert time_left(a_run(step=0, progress=0.0)) is None
+    assert time_left(a_run(step=100, progress=0.25, price=0.0)) == pytest.approx(30.0)
+    pruning = 0.1 * (12.5 + 0.5 * 7 * 5)  # 400 steps: 12.5 views rank, 5 tell
+    assert time_left(a_run(step=100, progress=0.25)) == pytest.approx(30.0 + pruning)
+    assert time_left(a_run(step=100, progress=1.0)) == pytest.approx(0.1 * (5 + 0.5 * 7 * 5))
 
 
 def test_a_resumed_run_knows_which_blocks_had_their_visit():
@@ -213,25 +178,13 @@ def test_a_resumed_run_knows_which_blocks_had_their_visit():
         visit=3, queue=[VisitPlan(2, 10)], views={0: 9, 1: 9, 2: 9, 3: 0, 4: 9}, active=active(1, done=4)
     )
     state.health = {WHOLE: BlockHealth(visits=1), 0: BlockHealth(visits=1)}
-    history = RunHistory.resumed(state, seconds=7.0)
+    history = RunHistory.resumed(state)
     statuses = [history.status(block, state.views[block]) for block in range(5)]
     none = Status.UNTRAINED  # the last one, whose share of the sweep was no step, too
     assert statuses == [Status.DONE, Status.ACTIVE, none, Status.UNDER_OBSERVED, none]
-    assert sweep_share(history, state) == pytest.approx((1 + 0.4) / 3)
     state.sweep, state.health[2] = 1, BlockHealth(visits=1)
-    assert RunHistory.resumed(state, 7.0).status(2, 9) is Status.DONE
-    assert RunHistory.resumed(RunState(), 0.0) == RunHistory()
-
-
-@pytest.mark.parametrize(("sweep", "over"), [(0, 2), (1, 1), (4, 2)])
-def test_a_resumed_run_knows_which_blocks_the_sweep_passes_over(sweep, over):
-    """Block 1 was hidden in its first visit: then it is looked at again in the fifth sweep."""
-    hidden = BlockHealth(visits=1 + sweep // 4, hidden=True)
-    health = {0: BlockHealth(visits=1 + sweep), 1: hidden, 2: BlockHealth(visits=sweep)}
-    state = RunState(sweep=sweep, views={0: 9, 1: 9, 2: 9}, health=health, active=active(2))
-    history = RunHistory.resumed(state, seconds=7.0)
-    assert history.sweep_visits == over
-    assert history.status(1, 9) is Status.DONE
+    assert RunHistory.resumed(state).status(2, 9) is Status.DONE
+    assert RunHistory.resumed(RunState()) == RunHistory()
 
 
 def test_words():
@@ -240,9 +193,6 @@ def test_words():
     assert headline("Block 3, step 4 of 9", 0.25, 90.0) == (
         "**Block 3, step 4 of 9**  \n25% of the run, 0:01:30 left"
     )
-    assert headline("Between visits", 1.0, 0.0) == "**Trained.**"
-    assert sweep_line(2, 3, 8, None) == "Sweep 2: 3 of 8"
-    assert sweep_line(2, 3, 8, 61.0) == "Sweep 2: 3 of 8, 0:01:01 left"
     assert memory_table([("RAM", 3 * 2**29, 2**34), ("layers", 2**20, 2**32)]).splitlines()[2:] == [
         "| RAM | 1.5 GiB | 16.0 GiB |",
         "| layers | 1 MiB | 4.0 GiB |",

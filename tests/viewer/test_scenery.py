@@ -1,16 +1,16 @@
 """Boxes and cameras in the viewer's scene."""
 
-import numpy as np
+import itertools
+
 import pytest
 import torch
-import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import Box
-from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, frame_mesh
-from abcd_ns.viewer.scenery import LIFT, first_look, views_that_see
+from abcd_ns.viewer.boxes import SCENE_SCALE, boxes_of, bulk, edges_of
+from abcd_ns.viewer.scenery import LIFT, first_look, nearest_view, views_that_see
 from tests.reference.scenes import ring_of_views
 
 
@@ -67,16 +67,21 @@ def test_a_cell_beyond_the_bulk_has_no_box():
     assert only == 1
 
 
-def test_a_frame_is_twelve_beams_along_the_edges_in_the_viewers_units():
-    shown = box((0, 0, 0), (1, 2, 3))
-    vertices, faces = frame_mesh(shown, thickness=0.1)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    assert mesh.is_watertight
-    assert mesh.body_count == 12
-    volumes = sorted(part.volume for part in mesh.split())
-    expected = sorted(0.1 * 0.1 * (length + 0.1) * SCENE_SCALE**3 for length in (1, 2, 3) for _ in range(4))
-    assert volumes == pytest.approx(expected, rel=1e-4)
-    assert mesh.bounds.tolist() == pytest.approx(np.array([[-0.5] * 3, [10.5, 20.5, 30.5]]))
+def test_a_line_follows_all_edges_and_nothing_else():
+    line = edges_of(box((0, 0, 0), (1, 2, 3)))
+    edges = {frozenset(pair) for pair in itertools.pairwise(line)}
+    assert len(edges) == 12
+    assert all(sum(a != b for a, b in zip(*edge, strict=True)) == 1 for edge in edges)
+    assert set(line) == set(itertools.product((0, 10), (0, 20), (0, 30)))
+
+
+def test_the_nearest_view_is_close_and_looks_the_same_way():
+    views = ring_of_views(8)
+    for view in views:
+        eye, forward = (view.center * SCENE_SCALE).numpy(), view.viewmat[2, :3].numpy()
+        assert nearest_view(0.9 * eye, forward, views).index == view.index
+    assert nearest_view(0 * eye, forward, views).index == view.index  # in the middle the direction decides
+    assert nearest_view(eye, forward, []) is None
 
 
 def test_views_that_see():

@@ -70,8 +70,12 @@ class Trainer(ABC):
         """
         raise RuntimeError("steps are taken here: call next_batch")
 
+    def await_visits(self) -> bool:
+        """Wait for what is trained elsewhere, without beginning more; whether there was any."""
+        return False
+
     def dismiss(self) -> None:  # noqa: B027 - most have nobody
-        """End whoever trains elsewhere."""
+        """End whoever trains elsewhere. Harmless when done twice."""
 
     def pause(self) -> None:
         """From now on no time counts, until the next step; but where others go on training it does."""

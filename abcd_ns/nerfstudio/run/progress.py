@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import psutil
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import Progress, TaskID, TextColumn
 
 from abcd_ns.engine.events import (
     Event,
@@ -27,7 +27,7 @@ from abcd_ns.engine.train.health_record import MENDED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.units import GIB, bytes_in_words
-from abcd_ns.viewer.run_history import seconds_left
+from abcd_ns.viewer.run_history import time_left
 from abcd_ns.viewer.texts import clock
 
 SECONDS_BETWEEN_LINES = 10.0
@@ -71,7 +71,9 @@ class ProgressReport:
             case SweepEnded() if self._coordinator.scene.tree.num_blocks > 1:
                 self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
             case Shedding():
-                self._show(f"last shedding {event.done}/{event.total}")
+                self._show(
+                    f"{event.done}/{event.total}", where="final pruning", share=event.done / event.total
+                )
             case ShedAtEnd():
                 self._print(_shed(event))
             case WorkersSeen():
@@ -134,42 +136,57 @@ class ProgressReport:
         """Of all visits that have ended."""
         return self._layer_seconds / self._visit_seconds if self._visit_seconds else 0.0
 
-    def _show(self, what: str) -> None:
+    def _show(self, what: str, pruned: float | None = None) -> None:
         now = time.monotonic()
         if CONSOLE.is_terminal:
             if now - self._last_look >= SECONDS_BETWEEN_LOOKS:
                 self._last_look = now
-                self._bar().update(self._task, completed=self._coordinator.progress, what=self._line(what))
+                line = fitting(self._parts(what, pruned), CONSOLE.width - 1)
+                self._bar().update(self._task, what=line)
         elif now - self._last_line > SECONDS_BETWEEN_LINES:
-            self._print(f"{self._coordinator.progress:6.1%}  {self._line(what)}")
+            self._print(f"  {'  '.join(self._parts(what, pruned))}")
 
     def _print(self, line: str) -> None:
         self._last_line = time.monotonic()
         CONSOLE.print(line, highlight=False, soft_wrap=True)
 
-    def _line(self, what: str) -> str:
+    def _parts(self, what: str, pruned: float | None) -> list[str]:
+        """Of the line, the most important first; `pruned` is the share of the final pruning that is done."""
         coordinator, visit = self._coordinator, self._visit
-        blocks = coordinator.scene.tree.num_blocks
-        if visit is not None and visit.block is None:
-            where = "warm-up of the whole scene"
+        if pruned is not None:
+            where = ""
+        elif visit is not None and visit.block is None:
+            where = "warm-up "
         elif self._workers:
-            where = f"sweep {self._sweep}  {_at_work(self._workers, blocks)}"
+            where = _at_work(self._workers)
         else:
-            where = f"sweep {self._sweep} block {'-' if visit is None else visit.block + 1}/{blocks}"
-        quality = "" if self._psnr is None else f"{self._psnr:.2f} dB  "
-        left = ""
-        if coordinator.state.step:  # what workers are at counts as progress, and says nothing of time
-            left = f"  {clock(seconds_left(coordinator.stopwatch.seconds, coordinator.progress))} left"
-        return f"{where}  {what}  {quality}{coordinator.count():,} Gaussians  {_memory()}{left}"
+            at = "-" if visit is None else visit.block + 1
+            where = f"block {at}/{coordinator.scene.tree.num_blocks} "
+        left = time_left(coordinator)  # what workers are at counts as progress, and says nothing of time
+        parts = [
+            f"{coordinator.progress:.1%}",
+            f"{where}{what}",
+            "" if left is None else f"{clock(left * (1 - (pruned or 0)))} left",
+            "" if self._psnr is None else f"{self._psnr:.2f} dB training",
+            f"{coordinator.count():,} Gaussians",
+            _memory(),
+        ]
+        return [part for part in parts if part]
 
     def _bar(self) -> Progress:
         if self._live is None:
-            percent = TextColumn("{task.percentage:>5.1f}%")
-            columns = (BarColumn(bar_width=20), percent, TextColumn("{task.fields[what]}"))
-            self._live = Progress(*columns, console=CONSOLE, transient=True)
+            self._live = Progress(TextColumn("{task.fields[what]}"), console=CONSOLE, transient=True)
             self._task = self._live.add_task("", total=1.0, what="")
             self._live.start()
         return self._live
+
+
+def fitting(parts: Sequence[str], width: int) -> str:
+    """As many parts as fit into a line of a terminal, the first two at least."""
+    shown = list(parts)
+    while len(shown) > 2 and len("  ".join(shown)) > width:
+        shown.pop()
+    return "  ".join(shown)[:width]
 
 
 def _shed(event: ShedAtEnd) -> str:
@@ -182,14 +199,11 @@ def _block(block: int | None) -> str:
     return "warm-up" if block is None else f"block {block + 1}"
 
 
-def _at_work(workers: Sequence[WorkerSeen], blocks: int) -> str:
+def _at_work(workers: Sequence[WorkerSeen]) -> str:
     """What workers are doing, in few words."""
-    busy = [worker for worker in workers if worker.block is not None]
-    which = ", ".join(f"{worker.block + 1} ({worker.done}/{worker.steps})" for worker in busy[:4])
-    more = ", ..." if len(busy) > 4 else ""
-    return f"{len(busy)} of {len(workers)} workers busy" + (
-        f": blocks {which}{more} of {blocks}" if busy else ""
-    )
+    busy = [str(worker.block + 1) for worker in workers if worker.block is not None]
+    which = f": blocks {', '.join(busy[:4])}{', ...' if len(busy) > 4 else ''}" if busy else ""
+    return f"{len(busy)} of {len(workers)} workers busy{which}"
 
 
 def _memory() -> str:

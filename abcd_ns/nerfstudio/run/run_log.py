@@ -29,6 +29,7 @@ from abcd_ns.engine.events import (
 from abcd_ns.engine.render.cuda import fused
 from abcd_ns.engine.store.atomic import write_file
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.errors import UserError
 from abcd_ns.machine import peak_device_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run.log_lines import KIND_OF, KINDS, SCHEMA
 from abcd_ns.nerfstudio.run.resuming import RunRequest
@@ -178,8 +179,16 @@ def past_of(coordinator: Trainer, log: Path) -> list[str]:
 
 
 def keep_log(run: RunRequest, photos: Photos, coordinator: Trainer) -> RunLog:
-    """Begin the log of a run, and write its settings beside it."""
-    write_settings(run.config, run.options, run.folder)
+    """Begin the log of a run, and write its settings beside it.
+
+    Raises:
+        UserError: the disk refused.
+    """
+    try:
+        write_settings(run.config, run.options, run.folder)
+    except OSError as error:
+        refused = f"{run.folder} cannot be written to ({error.strerror})"
+        raise UserError(f"{refused}: free space, or choose another --output-dir.") from error
     scene = coordinator.scene
     meters = {
         "photos": (lambda: photos.cached_bytes, photos.budget_bytes),

@@ -7,13 +7,13 @@ owner is us; an address needs no trust, since nobody can point an address elsewh
 """
 
 import ipaddress
-import itertools
 import math
 import re
 import socket
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 THIS_MACHINE = "127.0.0.1"
@@ -22,13 +22,16 @@ WILDCARDS = ("0.0.0.0", "::", "")
 """Hosts that a server binds to in order to be reached under all addresses of the machine."""
 SHARE_DOMAIN = ".share.viser.studio"
 """Names under which viser's public tunnel makes a viewer available."""
-SHARE_MESSAGES = ("ShareUrlRequest", "ShareUrlDisconnect")
 ASPECTS = (0.01, 100.0)
 """Width over height of a window that pictures are drawn for."""
+LARGEST = 1e9
+"""Numbers of a client must be below this."""
 
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::[0-9]{1,5})?")
 # Every segment begins with something else than a dot. No percent sign, backslash, control character or //.
 _PATH = re.compile(r"/|(/[A-Za-z0-9_~-][A-Za-z0-9_~.,-]*)+")
+# It becomes a file's name, and part of a command to copy: no slash, space, leading dot or leading dash.
+_TEXT = re.compile(r"\w[\w.-]{0,99}")
 
 
 @dataclass
@@ -38,10 +41,12 @@ class Rules:
     Args:
         host: the name or address that the server was told to listen on.
         share: whether viser's public tunnel may be used.
+        element: finds a GUI element of viser's by its id; None where there is none.
     """
 
     host: str
     share: bool = False
+    element: Callable[[str], Any] = lambda _: None
 
     def refusal(self, path: str, headers: Any) -> str | None:
         """Why a request is not answered, for a person to read; None if it is.
@@ -70,23 +75,27 @@ class Rules:
             return True
         with suppress(ValueError):  # it is a name
             return ipaddress.ip_address(name).is_loopback or configured in WILDCARDS
-        own = _plain_name(socket.gethostname())
-        short = own.partition(".")[0]
-        if configured in WILDCARDS and name in (own, short, f"{short}.local"):
+        if configured not in (THIS_MACHINE, "localhost") and name in _own_names():
             return True
         return self.share and name.endswith(SHARE_DOMAIN)
 
     def admits(self, message: Any) -> bool:
-        """Whether to act on a message of viser's protocol that a client sent."""
-        kind = type(message).__name__
-        if kind in SHARE_MESSAGES:
-            return self.share
-        if kind == "ViewerCameraMessage":
-            return is_camera(message)
-        if kind == "GuiUpdateMessage":
-            # Browsers set values alone; viser would set any attribute of the control.
-            return isinstance(message.updates, dict) and set(message.updates) <= {"value"}
-        return True
+        """Whether to act on a message of viser's protocol that a client sent: only on those named here."""
+        match type(message).__name__:
+            case "ViewerCameraMessage":
+                return is_camera(message)
+            case "GuiUpdateMessage":
+                # Browsers set values alone; viser would set any attribute of the element.
+                known = isinstance(message.updates, dict) and set(message.updates) == {"value"}
+                element = self.element(getattr(message, "id", None) or message.uuid) if known else None
+                return element is not None and fits(element, message.updates["value"])
+            case "TransformControlsUpdateMessage":
+                return _is_vector(message.wxyz, 4) and any(message.wxyz) and _is_vector(message.position, 3)
+            case "SceneNodeClickMessage":
+                return True  # viser looks its name up; nerfstudio reads no more of it
+            case "ShareUrlRequest" | "ShareUrlDisconnect":
+                return self.share
+        return False
 
 
 def plain_path(path: str) -> bool:
@@ -94,17 +103,51 @@ def plain_path(path: str) -> bool:
     return _PATH.fullmatch(path.partition("?")[0]) is not None
 
 
+def fits(element: Any, value: Any) -> bool:
+    """Whether a client may give a GUI element this value: it is enabled, and the value is of its kind.
+
+    Kinds are switches and buttons, numbers, vectors, choices among options, and text.
+    """
+    match element.value:
+        case _ if element.disabled:
+            return False
+        case bool():
+            return isinstance(value, bool)
+        case int() | float():
+            return _is_number(value)
+        case tuple():
+            return _is_vector(value, len(element.value))
+        case str() if (options := getattr(element, "options", None)) is not None:
+            return value in options
+        case str():
+            return isinstance(value, str) and _TEXT.fullmatch(value) is not None
+    return False
+
+
 def is_camera(message: Any) -> bool:
     """Whether a camera message describes a camera; nerfstudio's training loop computes with it unseen."""
     vectors = [getattr(message, name, None) for name in ("wxyz", "position", "look_at", "up_direction")]
-    if [len(v) if isinstance(v, (tuple, list)) else 0 for v in vectors] != [4, 3, 3, 3]:
-        return False
     aspect = getattr(message, "aspect", 1.0)  # viser 1 sends a size instead
-    numbers = [message.fov, aspect, *itertools.chain(*vectors)]
-    if not all(isinstance(x, (int, float)) and math.isfinite(x) for x in numbers):
+    if not all(map(_is_vector, vectors, (4, 3, 3, 3))) or not _is_vector((message.fov, aspect), 2):
         return False
     turned = any(abs(x) > 1e-6 for x in vectors[0])
     return turned and 0 < message.fov < math.pi and ASPECTS[0] <= aspect <= ASPECTS[1]
+
+
+def _is_vector(values: Any, size: int) -> bool:
+    return isinstance(values, (tuple, list)) and len(values) == size and all(map(_is_number, values))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and abs(value) < LARGEST
+
+
+@cache
+def _own_names() -> tuple[str, ...]:
+    """Names of this machine; the full one may be asked of the network, so only where it may reach us."""
+    own, full = _plain_name(socket.gethostname()), _plain_name(socket.getfqdn())
+    short = own.partition(".")[0]
+    return own, full, short, f"{short}.local"
 
 
 def content_policy(hosts: Iterable[str]) -> str:

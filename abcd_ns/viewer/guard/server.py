@@ -5,6 +5,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partial
 from http import HTTPStatus
 from importlib.metadata import version
 from typing import Any
@@ -16,6 +17,11 @@ from abcd_ns.viewer.guard.rules import Rules, content_policy
 
 UNREADABLE = (AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 """What viser's deserialisation raises on frames that are no message, beside msgspec's own errors."""
+
+REMEDY = (
+    b"403: the viewer does not answer to this address. Open http://localhost with its port, or start it with "
+    b"--viewer.websocket-host NAME, NAME being the host in the address."
+)
 
 _rules: dict[int, Rules] = {}
 _told: set[str] = set()
@@ -51,8 +57,23 @@ def install() -> bool:
 
 
 def rules_of(server: Any) -> Rules | None:
-    """The rules of a running `viser.ViserServer`; None if it was started before `install`."""
-    return _rules.get(server.get_port())
+    """The rules of a running `viser.ViserServer`; None if it was started before `install`.
+
+    Clients can set GUI elements from the first call on: before it the rules know none.
+    """
+    rules = _rules.get(server.get_port())
+    if rules is not None:
+        rules.element = partial(_element, server)
+    return rules
+
+
+def _element(server: Any, name: str) -> Any:
+    """The input element of the server's or of a client's GUI by its id."""
+    for gui in (server.gui, *(client.gui for client in server.get_clients().values())):
+        for known in ("_gui_input_handle_from_id", "_gui_input_handle_from_uuid"):  # viser 0.2, viser 1
+            if (element := getattr(gui, known, {}).get(name)) is not None:
+                return element
+    return None
 
 
 def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
@@ -72,8 +93,8 @@ def guarded(serve: Callable[..., Any]) -> Callable[..., Any]:
             if (reason := rules.refusal(path, headers)) is not None:
                 _tell(reason)
                 if older:
-                    return HTTPStatus.FORBIDDEN, {}, b"403"
-                return first.respond(HTTPStatus.FORBIDDEN, "403")
+                    return HTTPStatus.FORBIDDEN, {}, REMEDY
+                return first.respond(HTTPStatus.FORBIDDEN, REMEDY.decode())
             found = None if process_request is None else process_request(first, second)
             if inspect.isawaitable(found):
                 found = await found
@@ -131,6 +152,8 @@ class _Reader(_Overlay):
             if message is not None and self._rules.admits(message):
                 return frame
             what = "a frame that is no message" if message is None else type(message).__name__
+            if what == "GuiUpdateMessage":
+                what = "a value that its control does not take (a name has letters, digits, '_', '-' and '.')"
             _tell(f"{what} is not acted on")
 
 

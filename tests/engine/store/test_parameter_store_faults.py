@@ -229,12 +229,12 @@ def test_load_of_some_tensors_checks_each_file_once(store):
         fresh.load(0)
 
 
-@pytest.mark.parametrize("version", [4, 6, "5", None])
+@pytest.mark.parametrize("version", [5, 7, "6", None])
 def test_older_and_newer_formats_are_named(store, version):
     store.close()
     path = manifest_path(store.folder)
     path.write_text(json.dumps({**json.loads(path.read_bytes()), "version": version}))
-    with pytest.raises(StoreError, match=rf"format version {version}; this program reads version 5"):
+    with pytest.raises(StoreError, match=rf"format version {version}; this program reads version 6"):
         ParameterStore.open(store.folder)
 
 

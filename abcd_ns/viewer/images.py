@@ -1,0 +1,50 @@
+"""Small images in the panel, as Markdown: a curve, and a photo.
+
+viser can show plotly's figures, but sends every browser 5 MiB of script for it, and its version 0.2 may draw
+them wider than the panel.
+"""
+
+import base64
+import io
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.figure import Figure
+from PIL import Image
+
+WIDTH = 260
+"""Of the panel, px."""
+LINE, GRID, TEXT = "#ffd369", "#3a3f4b", "#c1c2c5"
+
+
+def curve_image(points: Sequence[tuple[float, float]], name: str) -> str:
+    """The curve through (x, y) points; a sentence if there are fewer than two.
+
+    Args:
+        name: what it shows, for readers that do not see it.
+    """
+    if len(points) < 2:
+        return "Nothing to show yet."
+    figure = Figure(figsize=(WIDTH / 96, WIDTH / 192), layout="constrained")  # at 96 px an inch
+    axes = figure.add_subplot(facecolor="none")
+    axes.plot(*zip(*points, strict=True), color=LINE, linewidth=1)
+    axes.tick_params(labelsize=6, labelcolor=TEXT, color=GRID)
+    axes.grid(color=GRID)
+    axes.spines[:].set_visible(False)
+    with matplotlib.rc_context({"svg.fonttype": "none"}):  # text stays text: a few KiB
+        figure.savefig(svg := io.BytesIO(), format="svg", transparent=True)
+    return _image(svg, name, "svg+xml")
+
+
+def photo_image(photo: UInt8[np.ndarray, "h w c"], name: str) -> str:
+    """A photo, as wide as the panel."""
+    image = Image.fromarray(photo[..., :3])
+    image.thumbnail((2 * WIDTH, 2 * WIDTH))  # sharp on screens of high resolution
+    image.save(jpeg := io.BytesIO(), format="JPEG")
+    return _image(jpeg, name, "jpeg")
+
+
+def _image(file: io.BytesIO, name: str, kind: str) -> str:
+    return f"![{name}](data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()})"
