@@ -10,6 +10,7 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
+from abcd_ns.data import DOWNSCALE
 from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_model, read_colmap
 from abcd_ns.data.input_errors import InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
@@ -23,8 +24,6 @@ from abcd_ns.progress_bar import ProgressBar
 
 MAX_AUTO_SIDE = 1600
 """Pixels along a photo's longer side, at most, where nothing is said: nerfstudio's MAX_AUTO_RESOLUTION."""
-DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
-"""The option by which something is said."""
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 
 

@@ -7,6 +7,7 @@ is a fair guess at what other views show there. Photos do tell how near things c
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -39,3 +40,14 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
         if bool(seen.any()):
             nearest = min(nearest, float(torch.quantile(depths[seen], OUTLIERS)))
     return max(SHARE * nearest, NEAR_PLANE) if math.isfinite(nearest) else NEAR_PLANE
+
+
+def with_near_plane(views: Sequence[View], points: Float[Tensor, "n 3"], near: float = 0.0) -> list[View]:
+    """The views as a scene is trained with them.
+
+    Args:
+        points: see `near_plane`.
+        near: from where on they see, world units; 0 finds that by the points.
+    """
+    near = near or near_plane(points, views)
+    return [replace(view, near=near) for view in views]
