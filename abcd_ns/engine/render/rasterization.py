@@ -73,7 +73,7 @@ def rasterization(
 
     Returns:
         Pictures, alphas, and of gsplat's `meta` what its densification strategies read: means2d [c, n, 2]
-        with a gradient after backward, radii [c, n], width, height, n_cameras, gaussian_ids.
+        (for its gradient call `retain_grad`), radii [c, n], width, height, n_cameras, gaussian_ids.
 
     Raises:
         ValueError: an argument has a value that is not supported.
