@@ -195,6 +195,7 @@ OFFENCES = [
     ("engine/types.py", "import rich.console", "abcd_ns.engine.types -> rich"),
     ("engine/types.py", "import tyro", "abcd_ns.engine.types -> tyro"),
     ("peers/exact.py", "import viser", "abcd_ns.peers.exact -> viser"),
+    ("run/begin.py", "import abcd_ns.nerfstudio.model", "abcd_ns.run.begin -> abcd_ns.nerfstudio.model"),
     ("engine/types.py", "import gsplat", "abcd_ns.engine.types -> gsplat"),
     (
         "nerfstudio/model.py",

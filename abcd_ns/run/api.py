@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,7 +26,6 @@ from abcd_ns.errors import UserError
 from abcd_ns.run import STATE, STORE
 from abcd_ns.run.begin import Capture, RunBuilder, gaussians_of_cloud
 from abcd_ns.run.options import RunOptions
-from abcd_ns.run.store import is_taken
 
 LOG = logging.getLogger("abcd_ns")
 
@@ -93,15 +93,17 @@ def train(
     builder = RunBuilder(options, Capture(views, names, target, first, len(places)), device, LOG.info)
     rasterizer = make_rasterizer("auto", device, primitive=training.primitive)
     live, budget = nothing_live(training.sh_degree, device), Budget(steps, options.max_seconds)
-    trainer = builder.build(folder, budget, rasterizer, *live)
-    if listener is not None:
-        trainer.announce.subscribe(listener)
+    threads = torch.get_num_threads()  # the kernels' own may take their place meanwhile
     try:
-        training_loop.train(trainer, photo)
-        trainer.save()
-        gaussians = trainer.scene.everything("cpu")
+        trainer = builder.build(folder, budget, rasterizer, *live)
+        with closing(trainer):
+            if listener is not None:
+                trainer.announce.subscribe(listener)
+            training_loop.train(trainer, photo)
+            trainer.save()
+            gaussians = trainer.scene.everything("cpu")
     finally:
-        trainer.close()
+        torch.set_num_threads(threads)
     return TrainedScene(gaussians, views[0].near, training.antialiased, training.primitive)
 
 
@@ -132,7 +134,7 @@ def _check(
 ) -> None:
     options.training.check()
     if manifest_path(folder).exists():
-        raise is_taken(folder)
+        raise UserError(f"{folder} holds a run already: choose another folder for `out`.")
     if len(views) != len(photos) or not views:
         raise UserError(f"There are {len(views)} views and {len(photos)} photos: give a photo for each view.")
     for index, view in enumerate(views):

@@ -39,7 +39,7 @@ from abcd_ns.peers.exact import ExactTrainer
 from abcd_ns.peers.independent import independent_at_rest, independent_trainer
 from abcd_ns.run.fit import FITTED, SCAFFOLD, Demand, Fit, RamShares, device_budget, find_fit
 from abcd_ns.run.options import RunOptions
-from abcd_ns.run.store import ASKED, MadeFor, Start, new_store, take_over
+from abcd_ns.run.store import ASKED, MadeFor, Start, take_over
 from abcd_ns.run.workers import blocks_to_begin_with, number_of_workers
 
 RemoteWorkers = Callable[[RunSetup, int, int], Workers]
@@ -251,7 +251,7 @@ class RunBuilder:
             tree = build_grid(gaussians.means, counts=grid_counts(gaussians, blocks))
         keep = self._scaffold_size(len(gaussians), tree.num_blocks, fitted)
         header = {"tree": tree.to_json(), **fitted, SCAFFOLD: keep or 0, ASKED: self.options.blocks}
-        store = new_store(folder, {**header, **made_for.header()})
+        store = ParameterStore.create(folder, {**header, **made_for.header()})
         at_rest = partial(blocks_at_rest, room=keep, seed=training.seed)
         if training.recipe.overlap > 0:
             at_rest = independent_at_rest

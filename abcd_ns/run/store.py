@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from abcd_ns.engine.render import PrimitiveName
-from abcd_ns.engine.store import ParameterStore, StoreError
-from abcd_ns.engine.store.manifest import manifest_path
+from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
@@ -106,23 +105,3 @@ def take_over(start: Start, folder: Path, made_for: MadeFor) -> ParameterStore:
             return store
         old.clone_to(folder, start.pin)
     return ParameterStore.open(folder)
-
-
-def new_store(folder: Path, header: dict[str, Any]) -> ParameterStore:
-    """An empty store for a run that begins.
-
-    Raises:
-        UserError: `folder` holds the store of another run, or the disk refused.
-    """
-    try:
-        return ParameterStore.create(folder, header)
-    except StoreError as error:
-        if not manifest_path(folder).exists():
-            raise
-        raise is_taken(folder) from error
-
-
-def is_taken(folder: Path) -> UserError:
-    """What to raise where `folder` holds another run's store."""
-    run = folder.parent.parent
-    return UserError(f"{folder} holds a run already: add --load-dir {run}, or another --timestamp.")

@@ -11,7 +11,7 @@ from abcd_ns.engine.store.manifest import manifest_path, pin_names
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.settings import Plain
-from abcd_ns.run.store import ASKED, Start, is_taken
+from abcd_ns.run.store import ASKED, Start
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,8 @@ def check_start(start: Start | None, folder: Path, asked: int) -> None:
     """
     if manifest_path(folder).exists():
         if start is None or not folder.samefile(start.store):
-            raise is_taken(folder)
+            run = folder.parent.parent
+            raise UserError(f"{folder} holds a run already: add --load-dir {run}, or another --timestamp.")
         ParameterStore.open(folder).close()
     if start is None or asked == 0:
         return
