@@ -41,6 +41,7 @@ TRAIN = (
     "peers",
     "lab",
     "nerfstudio",
+    "run",
     "cli",
     "benchmarks",
 )

@@ -220,6 +220,7 @@ OFFENCES = [
     ("engine/types.py", "rich.console"),
     ("engine/types.py", "tyro"),
     ("peers/exact.py", "viser"),
+    ("run/begin.py", "abcd_ns.nerfstudio.model"),
     ("engine/types.py", "gsplat"),
     ("nerfstudio/model.py", "gsplat.strategy"),
     ("cluster/dispatcher.py", "ray"),

@@ -23,7 +23,8 @@ def wheel(tmp_path_factory) -> zipfile.ZipFile:
     copy = tmp_path_factory.mktemp("copy")
     for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
         shutil.copy(ROOT / name, copy)
-    shutil.copytree(ROOT / "abcd_ns", copy / "abcd_ns", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("abcd_ns", "configs"):
+        shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     run = subprocess.run([sys.executable, "-c", BUILD], cwd=copy, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     return zipfile.ZipFile(copy / "out" / run.stdout.split()[-1])
@@ -32,6 +33,7 @@ def wheel(tmp_path_factory) -> zipfile.ZipFile:
 def test_the_wheel_holds_every_file_of_the_package_and_no_other(wheel):
     """Whatever is not code is opened by code: options, the report's page, the mark that types are there."""
     there = {path.relative_to(ROOT).as_posix() for path in (ROOT / "abcd_ns").rglob("*") if path.is_file()}
+    there |= {f"abcd_ns/configs/{path.name}" for path in (ROOT / "configs").iterdir()}
     there = {name for name in there if "__pycache__" not in name}
     assert {"abcd_ns/py.typed", "abcd_ns/configs/small-gpu.toml", "abcd_ns/cli/report/page.html"} <= there
     assert {name for name in wheel.namelist() if ".dist-info/" not in name} == there

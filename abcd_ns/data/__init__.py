@@ -2,3 +2,6 @@
 
 `prepare` reads a whole capture, `scene` is what comes of it, `photos` decodes, the others know file formats.
 """
+
+DOWNSCALE = "--pipeline.datamanager.dataparser.downscale-factor"
+"""The option by which photos are reduced."""

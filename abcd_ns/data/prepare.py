@@ -11,6 +11,7 @@ import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from torch import Tensor
 
+from abcd_ns.data import DOWNSCALE
 from abcd_ns.data.colmap_model import IMAGES, MODEL_FOLDERS, find_models, read_colmap
 from abcd_ns.data.input_errors import OPTION, InputError, Problems
 from abcd_ns.data.normalize import Center, Orientation, Similarity, normalizing_similarity
@@ -25,8 +26,6 @@ from abcd_ns.progress_bar import ProgressBar
 
 MAX_AUTO_SIDE = 1600
 """Pixels along a photo's longer side, at most, where nothing is said: nerfstudio's MAX_AUTO_RESOLUTION."""
-DOWNSCALE = f"{OPTION}downscale-factor"
-"""The option by which something is said."""
 MIP_NERF_360 = ("bicycle", "bonsai", "counter", "flowers", "garden", "kitchen", "room", "stump", "treehill")
 _MODEL_FILES = ("cameras.bin", "cameras.txt", f"{TRANSFORMS}.json", f"{TRANSFORMS}_train.json")
 """By which a model is found where nobody looks for it."""

@@ -1,6 +1,6 @@
 """Splatfacto's model around the engine: the live block in training, the merged scene for every other tool."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -17,11 +17,8 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from abcd_ns.data.ply import GREY
 from abcd_ns.engine.gaussians.block_state import checksum
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
-from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
@@ -36,12 +33,12 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
-from abcd_ns.nerfstudio.fit import FREE_SHARE
 from abcd_ns.nerfstudio.flags import as_a_command, hidden
 from abcd_ns.nerfstudio.metrics import image_metrics
 from abcd_ns.nerfstudio.options import HIDDEN
 from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
 from abcd_ns.nerfstudio.views import view_of
+from abcd_ns.run.fit import FREE_SHARE
 from abcd_ns.viewer import pictures as viewed
 
 Values = dict[str, Any]
@@ -146,23 +143,6 @@ class AbcdModel(SplatfactoModel):
         if self._coordinator is None:
             return live_gaussians(self.gauss_params).detach()
         return self._coordinator.scene.everything(device)
-
-    def initial_gaussians(self, views: Sequence[View], point_pixels: float) -> Gaussians:
-        """What a run begins with: random Gaussians, or one for each point that the views can tell apart.
-
-        Args:
-            point_pixels: see TrainingConfig.
-        """
-        config = self.config
-        if self.seed_points is None or config.random_init or len(self.seed_points[0]) == 0:
-            points, colors = random_points(config.num_random, config.random_scale)
-        else:
-            points, colors = (values.cpu().float() for values in self.seed_points)
-            if len(colors) != len(points):  # as of a .ply without colours
-                colors = torch.full_like(points, GREY)
-            points, colors = thin_points(points, colors, views, point_pixels)
-        flat = config.primitive == "2dgs"
-        return gaussians_from_points(points.float(), colors, sh_degree=config.sh_degree, flat=flat)
 
     # -- checkpoints ---------------------------------------------------------------------------------
 

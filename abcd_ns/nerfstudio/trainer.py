@@ -23,15 +23,16 @@ from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
 from abcd_ns.nerfstudio.flags import as_a_command, hidden, opened
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run import STATE, STORE
-from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, check_start, find_start, has_begun, pin_name
+from abcd_ns.nerfstudio.run.resuming import RunRequest, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_go_on
+from abcd_ns.run.fit import Demand, device_budget, find_fit
+from abcd_ns.run.store import Start
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
 

@@ -1,7 +1,6 @@
 """nerfstudio's cameras as the engine's views."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -9,7 +8,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from abcd_ns.data.input_errors import InputError
-from abcd_ns.engine.space.near_plane import near_plane, with_distances
+from abcd_ns.engine.space.near_plane import as_trained
 from abcd_ns.engine.types import View
 
 
@@ -53,7 +52,4 @@ def training_views(cameras: Cameras, points: Float[Tensor, "n 3"] | None, near: 
         points: what the capture knows of its scene.
         near: from where on they see; 0 finds that by the points.
     """
-    views = views_of(cameras)
-    points = torch.zeros(0, 3) if points is None else points.cpu()
-    near = near or near_plane(points, views)
-    return [replace(view, near=near) for view in with_distances(points, views)]
+    return as_trained(views_of(cameras), torch.zeros(0, 3) if points is None else points.cpu(), near)

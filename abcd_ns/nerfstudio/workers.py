@@ -1,7 +1,6 @@
-"""Workers of a run: what each reads when it starts, and who lends them blocks."""
+"""Workers that Ray starts: what is asked for, and what each reads when it starts."""
 
 import copy
-from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -9,24 +8,13 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from abcd_ns.cluster.connect import check_installed, connect
-from abcd_ns.cluster.dispatcher import Dispatcher
-from abcd_ns.cluster.forked_workers import ForkedWorkers, can_fork
 from abcd_ns.cluster.lease import Workers, WorkersError
 from abcd_ns.cluster.visit_worker import RunSetup, VisitWorker
 from abcd_ns.engine.render import make_rasterizer
-from abcd_ns.engine.train.config import TrainingConfig
-from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.memory import PHOTO_SHARE
-from abcd_ns.engine.train.recipe import Recipe
-from abcd_ns.engine.train.run import TrainingRun
-from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.errors import UserError
 from abcd_ns.machine import threads_wanted
-from abcd_ns.nerfstudio.fit import Fit
-from abcd_ns.units import bytes_in_words
-
-BLOCKS_EACH = 2
-"""Blocks for each worker at least, where their number is not given: one in training, one that rests."""
+from abcd_ns.run.workers import BLOCKS_EACH, works_at_once
 
 
 def check_workers(config: TrainerConfig) -> None:
@@ -45,7 +33,7 @@ def check_workers(config: TrainerConfig) -> None:
         return
     if cluster is not None or config.machine.device_type == "cuda":
         check_installed()
-    if not _works_at_once(pipeline.training.recipe):
+    if not works_at_once(pipeline.training.recipe):
         raise UserError("This method has no workers: leave out --pipeline.workers and --pipeline.cluster.")
     if 0 < blocks <= workers:
         raise UserError(
@@ -54,71 +42,16 @@ def check_workers(config: TrainerConfig) -> None:
         )
 
 
-def blocks_to_begin_with(fit: Fit, workers: int) -> int:
-    """As few as fit the device, but enough for every worker.
-
-    Args:
-        workers: 0 for none, also where one process trains.
-
-    Raises:
-        UserError: they need several blocks, and there is no room for the layers around one.
-    """
-    if workers and not fit.limit:
-        raise UserError(
-            f"{bytes_in_words(fit.budget)} of the device have no room for a block among others, which "
-            "workers need: leave --pipeline.workers out, or give smaller photos."
-        )
-    return max(fit.blocks, BLOCKS_EACH * workers)
-
-
-def _works_at_once(recipe: Recipe) -> bool:
-    return not recipe.exact and recipe.overlap == 0
-
-
-def number_of_workers(asked: int, blocks: int, training: TrainingConfig, device: torch.device | str) -> int:
-    """`AbcdPipelineConfig.workers`, its 0 resolved.
-
-    Args:
-        blocks: of the scene.
-    """
-    if asked:
-        return asked
-    # Workers learn nothing of light and poses: two of them may show one photo.
-    learns = training.light != "none" or training.poses != "off"
-    if learns or not _works_at_once(training.recipe) or not can_fork(torch.device(device)):
-        return 1
-    return max(min(threads_wanted(), blocks // BLOCKS_EACH), 1)
-
-
-def dispatcher_for(
-    run: TrainingRun,
-    config: TrainerConfig,
-    count: int,
-    budget: int,
-    source: LayerSource,
-    target: Callable[[Sample], Target],
-) -> Dispatcher:
-    """Lends the blocks of a run to workers: on the cores of this machine by forking, else by Ray.
+def ray_workers(config: TrainerConfig, setup: RunSetup, count: int, budget: int) -> Workers:
+    """Workers of a run with a GPU each, or on the machines of a cluster.
 
     Args:
         count: of them.
         budget: bytes of each worker's device that training may take.
-        source, target: see Coordinator; workers share the room of the one, where they share a device.
 
     Raises:
         WorkersError: they cannot be had.
     """
-    room, of_device = source.room, 1 if config.machine.device_type == "cuda" else count
-    setup = RunSetup.of(run, LayerRoom(room.device // of_device, room.ram // count))
-    if config.pipeline.cluster is None and can_fork(run.device):
-        workers = ForkedWorkers(count, VisitWorker(setup, run.rasterizer, target, run.device))
-        lag = count  # nothing is on its way for long: no slack is needed
-    else:
-        workers, lag = _ray_workers(setup, config, count, budget), None
-    return Dispatcher(run, workers, lag, source, target)
-
-
-def _ray_workers(setup: RunSetup, config: TrainerConfig, count: int, budget: int) -> Workers:
     pipeline, on_gpu = config.pipeline, config.machine.device_type == "cuda"
     config = copy.deepcopy(config)
     config.pipeline.datamanager.photo_cache_gb = pipeline.datamanager.photo_cache_gb / count

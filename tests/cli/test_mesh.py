@@ -32,8 +32,8 @@ from abcd_ns.engine.store.scene import MemoryScene
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run.resuming import MadeFor
 from abcd_ns.nerfstudio.run.settings import flat_options, write_settings
+from abcd_ns.run.store import MadeFor
 from tests.nerfstudio.test_training import configure
 from tests.reference.colmap_scene import LEFT, RIGHT, write_scene
 from tests.reference.scenes import ring_of_views

@@ -15,8 +15,8 @@ from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import FITTED, Fit
-from abcd_ns.nerfstudio.workers import blocks_to_begin_with
+from abcd_ns.run.fit import FITTED, Fit
+from abcd_ns.run.workers import blocks_to_begin_with
 from abcd_ns.units import GIB
 from tests.reference.scenes import random_gaussians, ring_of_views
 

@@ -6,7 +6,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.train.recipe import Limits
 from abcd_ns.engine.train.step.last_shedding import LastShedding
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager
-from abcd_ns.nerfstudio.fit import Fit
+from abcd_ns.run.fit import Fit
 from abcd_ns.units import GIB
 from tests.nerfstudio.crash_training import gaussians
 from tests.nerfstudio.test_training import configure, run
@@ -25,7 +25,7 @@ def test_a_run_keeps_to_what_it_chose_and_so_does_one_that_goes_on(data, tmp_pat
     monkeypatch.setattr(AbcdDataManager, "photo", noted)
     monkeypatch.setattr(LastShedding, "is_wanted", False)  # it reads whole photos, and reduces them
     with monkeypatch.context() as patched:
-        patched.setattr("abcd_ns.nerfstudio.pipeline.find_fit", lambda *_: FIT)
+        patched.setattr("abcd_ns.run.begin.find_fit", lambda *_: FIT)
         straight = run(configure(data, tmp_path / "straight", blocks=0, steps=STEPS))
         stopped = run(configure(data, tmp_path / "stopped", blocks=0, steps=STEPS), stop_after=9)
     assert "a step draws 0.0006 megapixels of 2 views" in capsys.readouterr().out

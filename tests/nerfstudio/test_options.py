@@ -33,8 +33,8 @@ from abcd_ns.nerfstudio.options import (
     mirror,
     refuse_flags,
 )
-from abcd_ns.nerfstudio.pipeline import grid_counts
 from abcd_ns.nerfstudio.run.settings import flat_options
+from abcd_ns.run.begin import grid_counts
 from tests.reference.scenes import random_gaussians
 
 METHODS = {

@@ -15,7 +15,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run_state import RunState
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.run.resuming import MadeFor
+from abcd_ns.run.store import MadeFor
 from tests.nerfstudio.crash_training import STEPS_PER_SAVE, Trainings, gaussians, run_folder
 from tests.nerfstudio.test_training import STEPS, configure, run
 from tests.reference.crash_runs import Kill
@@ -175,9 +175,9 @@ def test_a_second_ctrl_c_ends_a_run_in_one_line(data, tmp_path, capsys, monkeypa
 @pytest.mark.parametrize(
     ("where", "words"),
     [
-        ("trainer.inspect", "Stopped before anything was written."),
-        ("pipeline.build_kd", "Stopped before training began."),
-        ("pipeline.blocks_at_rest", "Stopped before training began."),
+        ("nerfstudio.trainer.inspect", "Stopped before anything was written."),
+        ("run.begin.build_kd", "Stopped before training began."),
+        ("run.begin.blocks_at_rest", "Stopped before training began."),
     ],
 )
 def test_ctrl_c_before_the_first_step_ends_a_run_in_one_line(
@@ -187,7 +187,7 @@ def test_ctrl_c_before_the_first_step_ends_a_run_in_one_line(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sys.argv", ["ns-train", "abcd", "--data", "wall"])
-    monkeypatch.setattr(f"abcd_ns.nerfstudio.{where}", interrupt)
+    monkeypatch.setattr(f"abcd_ns.{where}", interrupt)
     with pytest.raises(SystemExit) as ended:
         run(configure(data, tmp_path / "signal"))
     assert ended.value.code == 130

@@ -21,6 +21,7 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig, _save_atomically
+from abcd_ns.run.fit import RamShares
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
 
 STEPS = 36
@@ -90,7 +91,7 @@ def trained(data, tmp_path_factory) -> AbcdTrainer:
 
 def test_on_the_cpu_layers_and_photos_have_room_under_the_ram_budget_alone(trained):
     assert trained.pipeline.datamanager.device_photo_bytes == 0
-    assert trained.pipeline.coordinator.layer_limit == trained.pipeline._ram.layers
+    assert trained.pipeline.coordinator.layer_limit == RamShares.of(0).layers
 
 
 def test_a_checkpoint_takes_away_its_own_leftovers_and_no_others(tmp_path):

@@ -8,6 +8,7 @@ from nerfstudio.utils.eval_utils import eval_load_checkpoint
 from abcd_ns import methods
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.types import Crop
+from abcd_ns.run.fit import RamShares, device_budget
 from abcd_ns.viewer.pictures import Choice, Show
 from tests.nerfstudio.test_training import configure, run
 from tests.reference.colmap_scene import HEIGHT, WIDTH, write_scene
@@ -72,8 +73,9 @@ def loaded(folder):
 
 def test_layers_and_photos_have_an_eighth_of_the_device_each(trained):
     pipeline = trained.pipeline
-    assert pipeline.datamanager.device_photo_bytes == pipeline._budget // 8 > 0
-    assert pipeline.coordinator.layer_limit == pipeline._budget // 8 + pipeline._ram.layers
+    eighth = device_budget(pipeline.config.device_budget_gb, DEVICE) // 8
+    assert pipeline.datamanager.device_photo_bytes == eighth > 0
+    assert pipeline.coordinator.layer_limit == eighth + RamShares.of(pipeline.config.ram_budget_gb).layers
 
 
 def test_a_run_is_on_the_device_and_leaves_a_checkpoint(trained):

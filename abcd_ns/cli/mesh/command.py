@@ -28,14 +28,14 @@ from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.train.memory import drawing_bytes, free_bytes
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import FREE_SHARE, RamShares
 from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.run import STORE
-from abcd_ns.nerfstudio.run.resuming import MadeFor
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 from abcd_ns.nerfstudio.views import training_views
 from abcd_ns.progress_bar import ProgressBar
+from abcd_ns.run.fit import FREE_SHARE, RamShares
+from abcd_ns.run.store import MadeFor
 
 VOXEL_PIXELS = 2.0
 """The side of a voxel by default, in pixels as wide as most are where they meet the surface."""

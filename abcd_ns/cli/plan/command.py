@@ -35,9 +35,9 @@ from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.checks import Number, check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.fit import Demand, Fit, device_budget, find_fit
 from abcd_ns.nerfstudio.views import training_views
-from abcd_ns.nerfstudio.workers import blocks_to_begin_with
+from abcd_ns.run.fit import Demand, Fit, device_budget, find_fit
+from abcd_ns.run.workers import blocks_to_begin_with
 from abcd_ns.units import bytes_in_words
 
 

@@ -15,7 +15,7 @@ from abcd_ns.engine.train.health_record import TOO_FEW_VIEWS
 from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.train.step.batch import part_to_draw
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.nerfstudio.fit import Fit, RamShares
+from abcd_ns.run.fit import Fit, RamShares
 from abcd_ns.units import bytes_in_words
 
 STATES = 3

@@ -41,18 +41,22 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
     return max(SHARE * nearest, NEAR_PLANE * min(typical, 1.0))
 
 
-def with_distances(points: Float[Tensor, "n 3"], views: Sequence[View]) -> list[View]:
-    """The views, each with the nearest and the median distance of the points that it sees; where it sees none
-    with the median of the others'."""
+def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float = 0.0) -> list[View]:
+    """The views as a scene is trained with them: from their near plane on, each with the nearest and the
+    median distance of the points that it sees. Where it sees none it has the median of the others'.
+
+    Args:
+        points: see `near_plane`.
+        near: from where on they see, world units; 0 finds that by the points.
+    """
+    near = near or near_plane(points, views)
     found = {
         view.index: (float(torch.quantile(depths, OUTLIERS)), float(depths.median()))
         for view, depths in _depths(points, views)
     }
-    if not found:
-        return list(views)
-    others = 0.0, median(distance for _, distance in found.values())
+    others = 0.0, median(distance for _, distance in found.values()) if found else 1.0
     seen = ((view, *found.get(view.index, others)) for view in views)
-    return [replace(view, nearest=nearest, distance=distance) for view, nearest, distance in seen]
+    return [replace(view, near=near, nearest=nearest, distance=distance) for view, nearest, distance in seen]
 
 
 def _depths(

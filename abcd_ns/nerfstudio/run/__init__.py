@@ -1,6 +1,4 @@
-"""A run as its user meets it: progress, settings, log, how it stops and how it goes on."""
+"""A run as its user meets it: progress, settings, log, how it stops and how it resumes."""
 
-STATE = "abcd"
-"""The folder of a run, beside `nerfstudio_models`, that holds the one that follows."""
-STORE = "store"
-"""The blocks at rest."""
+from abcd_ns.run import STATE as STATE
+from abcd_ns.run import STORE as STORE

@@ -14,7 +14,7 @@ from abcd_ns.engine.render.extents import extents_of
 from abcd_ns.engine.render.primitive import DRAWN_SIGMAS, SPLATS
 from abcd_ns.engine.render.tile_grid import TileGrid
 from abcd_ns.engine.space.intervals import ray_directions
-from abcd_ns.engine.space.near_plane import near_plane, with_distances
+from abcd_ns.engine.space.near_plane import as_trained, near_plane
 from abcd_ns.engine.space.tree import Box
 from abcd_ns.engine.space.visibility import footprint, reach_radius, reaches, widest_slant, world_size
 from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
@@ -185,7 +185,7 @@ def test_a_camera_far_away_changes_nothing_for_the_others():
         seen = [replace(v, viewmat=v.viewmat.clone()) for v in (*views, far)]
         for view in seen:
             view.viewmat[:3, 3] *= scale
-        alone, beside = with_distances(points * scale, seen[:4]), with_distances(points * scale, seen)
+        alone, beside = as_trained(seen[:4], points * scale), as_trained(seen, points * scale)
         assert [view.distance for view in alone] == [view.distance for view in beside[:4]]
         assert alone[0].distance == pytest.approx(3.38 * scale, rel=1e-2)
         assert near_plane(points * scale, seen) == pytest.approx(near_plane(points, views) * scale, rel=1e-3)
@@ -195,8 +195,8 @@ def test_a_view_that_sees_no_point_is_as_far_as_the_others():
     near, other = ring_of_views(2)
     away = replace(near, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ near.viewmat, index=1)
     points = ahead(near, 2.0, 5)
-    assert [view.distance for view in with_distances(points, [near, away])] == pytest.approx([2.0, 2.0])
-    assert [view.distance for view in with_distances(torch.zeros(0, 3), [near, other])] == [1.0, 1.0]
+    assert [view.distance for view in as_trained([near, away], points)] == pytest.approx([2.0, 2.0])
+    assert [view.distance for view in as_trained([near, other], torch.zeros(0, 3))] == [1.0, 1.0]
 
 
 def test_no_more_points_and_views_than_needed_are_looked_at():

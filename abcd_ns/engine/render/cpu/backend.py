@@ -12,7 +12,6 @@ from abcd_ns.engine.kernels import library
 from abcd_ns.engine.kernels.native import suits
 from abcd_ns.engine.render.base import Cut, CutShot, Raster, Rasterizer, Shot
 from abcd_ns.engine.render.cpu import native, reference
-from abcd_ns.engine.render.image_size import image_size
 from abcd_ns.engine.render.primitive import PRIMITIVES, PrimitiveName
 from abcd_ns.engine.render.projection import Splats, camera_numbers, check_degree, project_in_torch
 from abcd_ns.engine.render.residual_sums import ResidualSums, SumsApart
@@ -296,7 +295,19 @@ def _info(
     return {
         "means2d": means2d,
         "radii": planes[:, -1].detach().int(),
-        **image_size([shot.view for shot in shots], planes.device),
+        **_image_size([shot.view for shot in shots], planes.device),
         "n_cameras": len(shots),
         "gaussian_ids": None,
     }
+
+
+def _image_size(views: Sequence[View], device: torch.device | str) -> dict[str, int | Tensor]:
+    """`width` and `height` of an `info`: of all views, or, where they differ, of each, [v, 1].
+
+    gsplat's strategies multiply gradients [v, n] by them, to bring these to one scale.
+    """
+    sizes = [(view.width, view.height) for view in views]
+    if len(set(sizes)) == 1:
+        return dict(zip(("width", "height"), sizes[0], strict=True))
+    width, height = torch.tensor(sizes, device=device).T[..., None]
+    return {"width": width, "height": height}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import psutil
 import torch
 
-from abcd_ns.data.prepare import DOWNSCALE
+from abcd_ns.data import DOWNSCALE
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, fewest_blocks, free_on_gpu, levels_of

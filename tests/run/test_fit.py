@@ -14,7 +14,7 @@ from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.splitting import FULL
 from abcd_ns.engine.train.memory import DeviceNeeds, levels_of, scaffold_size
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.fit import LEAST_BLOCK, Demand, Fit, RamShares, find_fit
+from abcd_ns.run.fit import LEAST_BLOCK, Demand, Fit, RamShares, find_fit
 from abcd_ns.units import GIB
 from tests.reference.scenes import training_config
 

@@ -1,0 +1,127 @@
+"""gsplat 1.4.0's `rasterization` on any device: this package's rasterizers behind gsplat's signature."""
+
+import functools
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
+from abcd_ns.engine.render import PrimitiveName, Rasterizer, Shot, make_rasterizer
+from abcd_ns.engine.types import Gaussians, View
+
+FIXED = {
+    "far_plane": 1e10,
+    "radius_clip": 0.0,
+    "eps2d": 0.3,
+    "packed": False,
+    "tile_size": 16,
+    "sparse_grad": False,
+    "absgrad": False,
+    "channel_chunk": 32,
+    "distributed": False,
+    "camera_model": "pinhole",
+    "covars": None,
+}
+"""gsplat's other arguments and the one value that each may have: gsplat's default, but for `packed`."""
+LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-7
+"""Gaussians are kept before activation, which maps 0 to infinity."""
+
+
+@functools.cache
+def rasterizer_on(device: torch.device, primitive: PrimitiveName = "3dgs") -> Rasterizer:
+    """The one rasterizer of a device, made and checked at the first call."""
+    return make_rasterizer("auto", device, primitive=primitive)
+
+
+def rasterization(
+    means: Float[Tensor, "n 3"],
+    quats: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    opacities: Float[Tensor, "n"],
+    colors: Float[Tensor, "n 3"] | Float[Tensor, "n k 3"],
+    viewmats: Float[Tensor, "c 4 4"],
+    Ks: Float[Tensor, "c 3 3"],
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    sh_degree: int | None = None,
+    backgrounds: Float[Tensor, "c _d"] | None = None,
+    render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    **fixed: Any,
+) -> tuple[Float[Tensor, "c height width d"], Float[Tensor, "c height width 1"], dict[str, Any]]:
+    """Draw Gaussians by pinhole cameras, as gsplat 1.4.0's `rasterization(packed=False)` does.
+
+    On a CPU by this package's kernels, on CUDA by gsplat's. Differentiable in the Gaussians.
+
+    Args:
+        means: centres, world units.
+        quats: rotations (w, x, y, z); need not be normalised.
+        scales: standard deviations, world units.
+        opacities: 0..1.
+        colors: 0 or more; with `sh_degree` the coefficients of spherical harmonics, k of 1, 4, 9 or 16.
+        viewmats: world to camera, OpenCV convention.
+        Ks: intrinsics in pixels.
+        near_plane: Gaussians whose mean has a smaller camera z are not drawn; world units.
+        sh_degree: in use; at most what k allows.
+        backgrounds: behind the colours; depth has none.
+        render_mode: D is the sum of weight x camera z, ED the same over alpha; the last channel.
+        fixed: see FIXED.
+
+    Returns:
+        Pictures, alphas, and of gsplat's `meta` what its densification strategies read: means2d [c, n, 2]
+        (for its gradient call `retain_grad`), radii [c, n], width, height, n_cameras, gaussian_ids.
+
+    Raises:
+        ValueError: an argument has a value that is not supported.
+        TypeError: gsplat has no such argument.
+    """
+    for name, value in fixed.items():
+        if name not in FIXED:
+            raise TypeError(f"rasterization has no argument {name}.")
+        if value != FIXED[name]:
+            raise ValueError(f"{name}={value} is not supported here: leave it out.")
+    if colors.shape[-1] != 3 or colors.ndim != (2 if sh_degree is None else 3):
+        wanted = "[n, 3]" if sh_degree is None else "[n, k, 3]"
+        raise ValueError(f"colors must be {wanted}, not {list(colors.shape)}.")
+    gaussians = _before_activation(means, quats, scales, opacities, colors)
+    cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
+    views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
+    rasters = rasterizer_on(means.device).draw(
+        gaussians,
+        [Shot(view, view.full) for view in views],
+        sh_degree=sh_degree or 0,
+        antialiased=rasterize_mode == "antialiased",
+    )
+    alphas = 1 - torch.stack([raster.transmittance for raster in rasters])[..., None]
+    channels = []
+    if "RGB" in render_mode:
+        color = torch.stack([raster.color for raster in rasters])
+        channels.append(color if backgrounds is None else color + (1 - alphas) * backgrounds[:, None, None])
+    if "D" in render_mode:
+        depth = torch.stack([raster.depth for raster in rasters])[..., None]
+        channels.append(depth / alphas.clamp_min(1e-10) if "ED" in render_mode else depth)
+    return torch.cat(channels, dim=-1), alphas, rasters[0].info
+
+
+def _before_activation(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
+) -> Gaussians:
+    if colors.ndim == 2:
+        colors = ((colors - 0.5) / SH_C0)[:, None]
+    return Gaussians(
+        means=means,
+        scales=_between(scales, LEAST_SCALE, torch.inf).log(),
+        quats=quats,
+        features_dc=colors[:, 0],
+        features_rest=colors[:, 1:],
+        opacities=_between(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY).logit()[:, None],
+    )
+
+
+def _between(values: Tensor, least: float, most: float) -> Tensor:
+    """Clamped, with the gradient of what is not clamped."""
+    return values + (values.clamp(least, most) - values).detach()

@@ -1,0 +1,145 @@
+"""Training and rendering from Python: the engine without nerfstudio."""
+
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from abcd_ns.cluster.forked_workers import can_fork
+from abcd_ns.engine.events import Event
+from abcd_ns.engine.gaussians.param_swap import nothing_live
+from abcd_ns.engine.layers.compositing import composite
+from abcd_ns.engine.render import PrimitiveName, make_rasterizer
+from abcd_ns.engine.render.rasterization import rasterizer_on
+from abcd_ns.engine.space.near_plane import as_trained
+from abcd_ns.engine.store.manifest import manifest_path
+from abcd_ns.engine.train import training_loop
+from abcd_ns.engine.train.run_state import Budget
+from abcd_ns.engine.train.step.batch import Sample, Target
+from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.errors import UserError
+from abcd_ns.run import STATE, STORE
+from abcd_ns.run.begin import Capture, RunBuilder, gaussians_of_cloud
+from abcd_ns.run.options import RunOptions
+
+LOG = logging.getLogger("abcd_ns")
+
+Photo = UInt8[Tensor, "_h _w 3"] | Float[Tensor, "_h _w 3"]
+"""0..255 as integers, or 0..1."""
+
+
+@dataclass(frozen=True)
+class TrainedScene:
+    """Gaussians, and how they were drawn in training."""
+
+    gaussians: Gaussians
+    """On the CPU, before activation."""
+    near: float
+    """Nothing closer to a camera is drawn; world units along its axis."""
+    antialiased: bool
+    primitive: PrimitiveName
+
+
+def train(
+    views: Sequence[View],
+    photos: Sequence[Photo],
+    points: tuple[Float[Tensor, "n 3"], UInt8[Tensor, "n 3"]],
+    out: Path | str,
+    *,
+    steps: int = 30_000,
+    options: RunOptions | None = None,
+    device: torch.device | str | None = None,
+    listener: Callable[[Event], None] | None = None,
+) -> TrainedScene:
+    """Train a scene as `ns-train abcd` does.
+
+    Args:
+        views: the cameras in one world space. Their `index` and `near` are set here.
+        photos: one of each view, of its size. A sequence may read them when they are asked for.
+        points: of structure from motion: places in world space, and colours 0..255.
+        out: a folder for the run. The blocks are kept there, in `abcd/store`, as they are trained.
+        steps: optimisation steps for the whole scene.
+        options: None for the defaults.
+        device: None for a GPU if there is one.
+        listener: is told what happens, see `abcd_ns.engine.events`.
+
+    Raises:
+        UserError: photos and views do not match, an option is out of range, `out` holds a run already, or
+            nothing fits on the device.
+    """
+    options, folder = options or RunOptions(), Path(out) / STATE / STORE
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    training, (places, colors) = options.training, points
+    _check(views, photos, options, device, folder)
+    numbered = [replace(view.to("cpu"), index=index) for index, view in enumerate(views)]
+    views = as_trained(numbered, places, options.near_plane)
+
+    def photo(index: int, crop: Crop) -> Float[Tensor, "h w 3"]:
+        pixels = photos[index][crop.slices]
+        return (pixels if pixels.is_floating_point() else pixels.float() / 255).to(device)
+
+    def target(sample: Sample) -> Target:
+        return sample.reduced(photo(sample.view.index, sample.source)), None
+
+    def first() -> Gaussians:
+        return gaussians_of_cloud(places, colors, views, training)
+
+    names = [Path(str(view.index)) for view in views]
+    builder = RunBuilder(options, Capture(views, names, target, first, len(places)), device, LOG.info)
+    rasterizer = make_rasterizer("auto", device, primitive=training.primitive)
+    live, budget = nothing_live(training.sh_degree, device), Budget(steps, options.max_seconds)
+    threads = torch.get_num_threads()  # the kernels' own may take their place meanwhile
+    try:
+        trainer = builder.build(folder, budget, rasterizer, *live)
+        with closing(trainer):
+            if listener is not None:
+                trainer.announce.subscribe(listener)
+            training_loop.train(trainer, photo)
+            trainer.save()
+            gaussians = trainer.scene.everything("cpu")
+    finally:
+        torch.set_num_threads(threads)
+    return TrainedScene(gaussians, views[0].near, training.antialiased, training.primitive)
+
+
+@torch.no_grad()
+def render(
+    scene: TrainedScene,
+    view: View,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    device: torch.device | str | None = None,
+) -> Float[Tensor, "h w 3"]:
+    """A picture of a trained scene, 0..1, on the device.
+
+    Args:
+        view: any camera in the world space of the training views.
+        background: what is seen where nothing is.
+        device: None for a GPU if there is one.
+    """
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    gaussians, placed = scene.gaussians.to(device), replace(view.to("cpu"), near=scene.near)
+    options = {"sh_degree": gaussians.sh_degree, "antialiased": scene.antialiased}
+    raster = rasterizer_on(device, scene.primitive)(gaussians, placed, **options)
+    return composite(raster.layer, torch.tensor(background, device=device)).clamp(0, 1)
+
+
+def _check(
+    views: Sequence[View], photos: Sequence[Photo], options: RunOptions, device: torch.device, folder: Path
+) -> None:
+    options.training.check()
+    if manifest_path(folder).exists():
+        raise UserError(f"{folder} holds a run already: choose another folder for `out`.")
+    if len(views) != len(photos) or not views:
+        raise UserError(f"There are {len(views)} views and {len(photos)} photos: give a photo for each view.")
+    for index, view in enumerate(views):
+        if tuple(photos[index].shape) != (view.height, view.width, 3):
+            wanted, shape = [view.height, view.width, 3], list(photos[index].shape)
+            raise UserError(f"Photo {index} has shape {shape}, but its view has {wanted}.")
+    if options.cluster is not None or (options.workers > 1 and not can_fork(device)):
+        raise UserError("Workers on GPUs or a cluster need ns-train: leave out workers and cluster.")

@@ -1,0 +1,126 @@
+"""The public `rasterization`, by gsplat 1.4.0's signature, against the naive twin and on a device."""
+
+import inspect
+from dataclasses import replace
+from types import SimpleNamespace
+
+import gsplat
+import pytest
+import torch
+
+from abcd_ns import rasterization
+from abcd_ns.engine.render.rasterization import FIXED
+from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
+from tests.reference.gsplat_stand_ins import lent
+from tests.reference.naive_rasterizer import naive_rasterize
+from tests.reference.rasterizer_scenes import gradients, random_gaussians, relative_error, small_view
+from tests.reference.simulated_device import DEVICE, simulated_device
+
+VIEWS = (small_view(), replace(small_view(), viewmat=torch.eye(4, dtype=torch.float64)))
+
+
+def drawn(gaussians: Gaussians, views=VIEWS, sh_degree: int | None = 2, **options):
+    """By `rasterization`, with activated values as gsplat takes them."""
+    colors = torch.cat((gaussians.features_dc[:, None], gaussians.features_rest), dim=1)
+    if sh_degree is None:
+        colors = (0.28209479177387814 * gaussians.features_dc + 0.5).clamp_min(0)
+    return rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        gaussians.opacities[:, 0].sigmoid(),
+        colors,
+        torch.stack([view.viewmat for view in views]),
+        torch.stack([view.K for view in views]),
+        views[0].width,
+        views[0].height,
+        sh_degree=sh_degree,
+        **options,
+    )
+
+
+def as_raster(gaussians: Gaussians, view: View, **options) -> SimpleNamespace:
+    pictures, alphas, _ = drawn(gaussians, [view], render_mode="RGB+D", **options)
+    return SimpleNamespace(
+        color=pictures[0, ..., :3], transmittance=1 - alphas[0, ..., 0], depth=pictures[0, ..., 3]
+    )
+
+
+@pytest.mark.parametrize(("sh_degree", "mode"), [(None, "classic"), (0, "antialiased"), (3, "classic")])
+@pytest.mark.parametrize("view", VIEWS, ids=["turned", "straight"])
+def test_picture_and_gradient_equal_the_naive_twins(view, sh_degree, mode):
+    gaussians = random_gaussians(12)
+    options = {"sh_degree": sh_degree or 0, "antialiased": mode == "antialiased"}
+    expected, expected_grads = gradients(lambda g: naive_rasterize(g, view, **options), gaussians)
+    found, grads = gradients(
+        lambda g: as_raster(g, view, sh_degree=sh_degree, rasterize_mode=mode), gaussians
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-11)
+    for name in PARAM_NAMES:
+        assert relative_error(grads[name], expected_grads[name]) < 1e-9, name
+
+
+@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+def test_every_mode_draws_all_cameras_on_their_backgrounds(mode):
+    gaussians, grounds = random_gaussians(12), torch.rand(2, 3, dtype=torch.float64)
+    pictures, alphas, meta = drawn(gaussians, render_mode=mode, backgrounds=grounds)
+    for k, view in enumerate(VIEWS):
+        naive = naive_rasterize(gaussians, view, sh_degree=2)
+        color = naive.color + naive.transmittance[..., None] * grounds[k]
+        depth = naive.depth / (1 - naive.transmittance).clamp_min(1e-10) if "ED" in mode else naive.depth
+        parts = [color] * ("RGB" in mode) + [depth[..., None]] * ("D" in mode)
+        torch.testing.assert_close(pictures[k], torch.cat(parts, dim=-1), rtol=1e-9, atol=1e-10)
+        torch.testing.assert_close(alphas[k, ..., 0], 1 - naive.transmittance, rtol=1e-10, atol=1e-11)
+        assert meta["radii"][k].tolist() == naive.radii
+    assert (meta["width"], meta["height"], meta["n_cameras"]) == (VIEWS[0].width, VIEWS[0].height, 2)
+
+
+def test_gsplats_kernels_draw_the_same_on_a_device():
+    found = []
+    with simulated_device(), lent():
+        for device in ("cpu", DEVICE):
+            leaves = random_gaussians(40, dtype=torch.float32).to(device)
+            leaves = Gaussians(**{name: value.requires_grad_() for name, value in leaves.items()})
+            pictures, alphas, meta = drawn(leaves, [view.to(torch.float32) for view in VIEWS])
+            meta["means2d"].retain_grad()
+            (pictures.square().sum() + alphas.sum()).backward()
+            results = [pictures, alphas, meta["means2d"].grad, *(value.grad for _, value in leaves.items())]
+            found.append([value.detach().cpu() for value in results])
+    for ours, gsplats in zip(*found, strict=True):
+        assert relative_error(ours, gsplats) < 1e-3
+
+
+def test_what_is_exactly_opaque_or_flat_has_gradients():
+    opaque, flat = torch.ones(1, requires_grad=True), torch.zeros(1, 3, requires_grad=True)
+    view, at = small_view(dtype=torch.float32), torch.tensor([[0.0, 0.0, 4.0]])
+    camera = (view.viewmat[None], view.K[None], view.width, view.height)
+    pictures, _, _ = rasterization(at, torch.eye(4)[:1], flat, opaque, torch.ones(1, 3), *camera)
+    pictures.sum().backward()
+    assert 0 < pictures.max() <= 1
+    assert opaque.grad > 0
+    assert flat.grad.isfinite().all()
+
+
+def test_every_argument_of_gsplats_is_taken_or_refused():
+    theirs = inspect.signature(gsplat.rasterization).parameters
+    own = {name for name, p in inspect.signature(rasterization).parameters.items() if p.kind != p.VAR_KEYWORD}
+    assert own | set(FIXED) == set(theirs)
+    assert not own & set(FIXED)
+    others = {name: value for name, value in FIXED.items() if name != "packed"}
+    assert others == {name: theirs[name].default for name in others}
+    drawn(random_gaussians(3), **FIXED)
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "says"),
+    [
+        ({"absgrad": True}, ValueError, "absgrad=True is not supported here"),
+        ({"camera_model": "fisheye"}, ValueError, "camera_model=fisheye"),
+        ({"ortho": True}, TypeError, "no argument ortho"),
+        ({"sh_degree": 4}, ValueError, "sh_degree is 4"),
+    ],
+)
+def test_what_is_not_supported_is_refused_in_one_line(options, kind, says):
+    with pytest.raises(kind, match=says) as refused:
+        drawn(random_gaussians(3), **options)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,85 @@
+"""Training and rendering from Python: the README's lines, the same results as `ns-train`, and refusals."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from abcd_ns import RunOptions, TrainingConfig, UserError, train
+from abcd_ns.cli.export.command import export
+from abcd_ns.engine.events import StepTaken
+from abcd_ns.nerfstudio.views import views_of
+from tests.nerfstudio.crash_training import gaussians
+from tests.nerfstudio.test_training import configure, run
+from tests.reference.colmap_scene import write_scene
+from tests.reference.scenes import ring_of_views
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+BEFORE = """
+import sys
+import abcd_ns
+assert "torch" not in sys.modules
+"""
+AFTER = """
+assert "nerfstudio" not in sys.modules
+assert float((picture - photos[0] / 255).abs().mean()) < 0.1
+"""
+
+
+def test_the_lines_of_the_readme_train_and_render_without_nerfstudio(tmp_path):
+    write_scene(tmp_path / "garden")
+    (lines,) = re.findall(r"^```python\n(.*?)^```", README.read_text(), re.DOTALL | re.MULTILINE)
+    command = [sys.executable, "-c", BEFORE + lines + AFTER]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "garden-view-0.png").exists()
+    assert export(tmp_path / "garden-run", out=tmp_path / "garden.ply", frame="nerfstudio") == 0
+
+
+def test_it_trains_as_ns_train_does(tmp_path):
+    steps, heard = 24, []
+    config = configure(write_scene(tmp_path / "wall"), tmp_path / "out", steps=steps)
+    trainer = run(config)
+    dataset = trainer.pipeline.datamanager.train_dataset
+    photos = [dataset.photos.image(row) for row in range(len(dataset))]
+    points = dataset.metadata["points3D_xyz"], dataset.metadata["points3D_rgb"]
+    options = RunOptions(**{f.name: getattr(config.pipeline, f.name) for f in dataclasses.fields(RunOptions)})
+    found = train(
+        views_of(dataset.cameras),
+        photos,
+        points,
+        tmp_path / "alone",
+        steps=steps,
+        options=options,
+        listener=lambda event: heard.append(event) if isinstance(event, StepTaken) else None,
+    )
+    assert len(heard) == steps
+    assert found.near == trainer.pipeline.model.near
+    expected = gaussians(trainer.base_dir)
+    assert all(
+        torch.equal(value, expected[f"_model.gauss_params.{name}"]) for name, value in found.gaussians.items()
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"photos": [torch.zeros(36, 48, 3)]}, "2 views and 1 photos"),
+        ({"photos": [torch.zeros(36, 48, 3), torch.zeros(36, 48, 4)]}, "Photo 1 has shape"),
+        ({"options": RunOptions(cluster="head:6379", workers=2)}, "need ns-train"),
+        ({"options": RunOptions(training=TrainingConfig(warmup=2.0))}, "warmup"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_anything_is_written(tmp_path, change, says):
+    given = {
+        "photos": [torch.zeros(36, 48, 3)] * 2,
+        "points": (torch.rand(9, 3), torch.zeros(9, 3)),
+        **change,
+    }
+    with pytest.raises(UserError, match=says):
+        train(ring_of_views(2), out=tmp_path / "out", **given)
+    assert not (tmp_path / "out").exists()
