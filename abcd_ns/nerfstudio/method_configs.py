@@ -22,13 +22,13 @@ PAPER = TrainingConfig(
         migrate=False,
         pixel_loss="l2",
         fast_start=False,
+        visit_views=10**6,
+        heal=False,
+        means_lr_decay=ALONE,
     ),
     warmup=0.0,
     batch=1,
-    visit_views=10**6,
-    heal=False,
     ssim_lambda=0.0,
-    means_lr_decay=ALONE,
     point_pixels=0.0,
     coarse=0.0,
     density=DensityConfig(price=0.0),
@@ -74,9 +74,8 @@ abcd_partition = _method(
     "Partition, train, merge: overlapping blocks, each trained once and by itself.",
     blocks=PEER_BLOCKS,
     training=TrainingConfig(
-        recipe=Recipe(layers=False, overlap=0.2, migrate=False),
+        recipe=Recipe(layers=False, overlap=0.2, migrate=False, means_lr_decay=ALONE),
         warmup=0.0,
-        means_lr_decay=ALONE,
         density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
     ),
 )
@@ -84,7 +83,7 @@ abcd_exact = _method(
     "abcd-exact",
     "Exact joint training over blocks, one on the device at a time: slow, the reference.",
     blocks=PEER_BLOCKS,
-    training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0, means_lr_decay=ALONE),
+    training=TrainingConfig(recipe=Recipe(exact=True, means_lr_decay=ALONE), warmup=0.0),
 )
 abcd_paper = _method(
     "abcd-paper",

@@ -307,7 +307,7 @@ class AbcdModel(SplatfactoModel):
         )
         settings = self._settings(sh_degree)
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
-        return viewed.BlockPictures(painter, view, settings, training.window_weight)
+        return viewed.BlockPictures(painter, view, settings, training.recipe.window_weight)
 
     def _settings(self, sh_degree: int | None = None) -> PaintSettings:
         degree = self.config.sh_degree if sh_degree is None else sh_degree

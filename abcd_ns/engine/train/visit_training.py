@@ -113,7 +113,7 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next; listeners are told the views of the steps to
         come, too."""
         run = self.run
-        decay = exponential_decay(run.share, run.config.means_lr_decay)
+        decay = exponential_decay(run.share, run.config.recipe.means_lr_decay)
         # A first visit, perhaps the only one, has all.
         settles = run.config.recipe.fast_start and (run.active.sole or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views
