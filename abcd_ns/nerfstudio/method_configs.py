@@ -1,6 +1,5 @@
 """The configurations of the methods that `abcd_ns.methods` registers."""
 
-from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
@@ -9,7 +8,6 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
-from abcd_ns.viewer.guard.rules import THIS_MACHINE
 
 ALONE = 0.01
 """3DGS's share that the rate of means falls to, where no other rate falls."""
@@ -46,15 +44,12 @@ def _method(name: str, description: str, **pipeline) -> MethodSpecification:
         steps_per_eval_image=500,
         steps_per_eval_batch=0,
         steps_per_eval_all_images=2000,
-        steps_per_save=2000,
-        max_num_iterations=30_000,
         mixed_precision=False,
         pipeline=AbcdPipelineConfig(**pipeline),
         optimizers={
             name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
             for name, rate in LEARNING_RATES.items()
         },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host=THIS_MACHINE),
         vis="viewer",
     )
     # ABCD reports its own progress, by visit; nerfstudio's table would run through it.

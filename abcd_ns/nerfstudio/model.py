@@ -37,9 +37,8 @@ from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
 from abcd_ns.nerfstudio.fit import FREE_SHARE
-from abcd_ns.nerfstudio.flags import hidden
+from abcd_ns.nerfstudio.flags import shown
 from abcd_ns.nerfstudio.metrics import image_metrics
-from abcd_ns.nerfstudio.options import HIDDEN
 from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.viewer import pictures as viewed
@@ -49,14 +48,16 @@ VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
 
 
-@hidden(*HIDDEN)
+@shown("rasterizer", "random_init")
 @dataclass
 class AbcdModelConfig(SplatfactoModelConfig):
     """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""
 
     _target: type = field(default_factory=lambda: AbcdModel)
     rasterizer: Literal["auto", "torch", "gsplat"] = "auto"
-    """What draws: gsplat's CUDA kernels or the torch rasterizer; auto takes gsplat on CUDA devices."""
+    """gsplat: CUDA kernels. torch: any device. auto takes gsplat on CUDA devices."""
+    random_init: bool = False
+    """Start with Gaussians at random places, as splatfacto does, instead of the points."""
     render: Literal["merged", "composited"] = "merged"
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, Literal
 
 import torch
-import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import writer
@@ -29,7 +28,6 @@ from abcd_ns.engine.train.coordinator import Coordinator
 from abcd_ns.engine.train.density.splitting import cut_at_rest
 from abcd_ns.engine.train.layer_source import LayerRoom, LayerSource
 from abcd_ns.engine.train.memory import LAYER_SHARE, PHOTO_SHARE, scaffold_size
-from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget, RunState
 from abcd_ns.engine.train.step.batch import Rendered
@@ -39,11 +37,11 @@ from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
 from abcd_ns.nerfstudio.fit import FITTED, SCAFFOLD, Demand, Fit, RamShares, device_budget, find_fit
-from abcd_ns.nerfstudio.flags import named_too, opens_ours, trains_ours
+from abcd_ns.nerfstudio.flags import opens_ours, shown, trains_ours
 from abcd_ns.nerfstudio.inspection import factor_of
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
-from abcd_ns.nerfstudio.options import SAME, mirror
+from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import ASKED, MadeFor, RunRequest, new_store, take_over
@@ -56,45 +54,45 @@ from abcd_ns.units import GIB
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
 
-# What makes a method and what memory decides stand in config.yml, and are no flags of `ns-train`.
-for _not_offered in (Recipe, Limits):
-    tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
-for _config, _flags in SAME.items():
-    named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
 
-
+@shown(
+    "max_seconds", "blocks", "device_budget_gb", "ram_budget_gb", "workers", "cluster",
+    "datamanager", "training", "model",
+)  # fmt: skip
 @dataclass
 class AbcdPipelineConfig(VanillaPipelineConfig):
     """ABCD: how space is cut and how its blocks are trained."""
 
     _target: type = field(default_factory=lambda: AbcdPipeline)
     datamanager: AbcdDataManagerConfig = field(default_factory=AbcdDataManagerConfig)
+    """How photos are served."""
     model: AbcdModelConfig = field(default_factory=AbcdModelConfig)
+    """What draws, and what a run begins with."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    """How blocks are trained."""
+    """How blocks are trained. docs/reference.md has more options, for files and this command line."""
     blocks: int = 0
-    """Number of blocks. 0 takes as few as `device_budget_gb` allows and splits those that outgrow it. A
-    number forces that many blocks; the memory budget is then not enforced."""
+    """Number of blocks. 0 takes as few as the device's budget allows, and splits those that outgrow it.
+    A number forces that many blocks; the memory budget is then not enforced."""
     device_budget_gb: float = 0.0
-    """Device memory for training, GiB; sets the number of blocks where `blocks` is 0. Of a GPU's, an eighth
-    is for layers and one for photos. 0 takes 90% of a GPU's free memory; on a CPU, a quarter of the RAM."""
+    """Device memory for training, GiB. 0 takes 90% of a GPU's free memory, or a quarter of the RAM.
+    Of a GPU's, an eighth is for layers and one for photos."""
     partition: Literal["kd", "grid"] = "kd"
     """kd: cells with equally many points. grid: equal cells, as the paper has, at least `blocks` of them."""
     near_plane: float = 0.0
     """Gaussians closer to a camera than this, along its axis, are not drawn; world units. 0 takes half
     the nearest distance at which a photo shows a point."""
     ram_budget_gb: float = 0.0
-    """RAM for cached photos, blocks and layers, GiB. Does not change results. Setting it turns off automatic
-    workers. 0 takes 8, or 40% of the machine's memory where that is less."""
+    """RAM for cached photos, blocks and layers, GiB. 0 takes 8, or 40% of the RAM if that is less.
+    Does not change results. Setting it turns off automatic workers."""
     workers: int = 0
-    """Blocks that are trained at once, each by a process of its own: on a core each, or on a GPU each, which
-    needs Ray (pip install 'abcd-ns[cluster]'). 0 takes all cores where there is no GPU, as far as there are
-    two blocks for each; and else, or with `ram_budget_gb`, light or poses set, one."""
+    """Blocks trained at once, each by its own process. On GPUs this needs Ray, in 'abcd-ns[cluster]'.
+    0 takes 1 on a GPU, or with light, poses or a RAM budget set.
+    Else it takes all cores, as far as there are two blocks for each."""
     cluster: str | None = None
-    """Address (host:port) of the head of a Ray cluster that is to have the workers, instead of this machine;
-    --data and --output-dir must be paths that all its machines see."""
+    """Address (host:port) of the head of a Ray cluster that runs the workers.
+    The folders of data and outputs must be paths that all its machines see."""
     max_seconds: float | None = None
-    """Stop after this many seconds of training; evaluation and saving do not count."""
+    """Stop after this many seconds of training. Evaluation and saving do not count."""
 
 
 def _as_a_command() -> AbstractContextManager:

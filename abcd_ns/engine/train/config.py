@@ -29,7 +29,7 @@ class TrainingConfig:
     light: LightKind = "none"
     """Colour transform of each finished picture, for photos taken in different light.
     exposure: a gain for each channel. affine: a 3 x 4 matrix.
-    The mean over the photos is the identity, which draws held-out views. These are also scored as `cc_psnr`."""
+    The mean over the photos is the identity. Held-out views are drawn with it and scored as `cc_psnr` too."""
     poses: PosesKind = "off"
     """SO3xR3 refines the poses of the training photos by pictures of the whole scene.
     Rounds run in the warm-up and between visits; with workers, in the warm-up only."""

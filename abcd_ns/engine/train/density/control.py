@@ -63,12 +63,12 @@ class DensityConfig:
     max_gaussians: int = 0
     """Limit for the whole scene. 0 is none (mcmc: 1,000,000). Of more points, a random choice starts."""
     price: float = 8.0
-    """Minimum contribution, px: prune a Gaussian whose blend weights, summed over all views of its block, are
-    less. Applies once growth ends, in the `default` strategy. 0 turns all pruning by contribution off, of
-    floaters too, and the final pruning of a complete run (`mcmc` as well)."""
+    """Minimum contribution, px: prune a Gaussian whose blend weights in all views of its block sum to less.
+    Applies once growth ends. Strategy mcmc has the final pruning only.
+    0 turns all pruning by contribution off, of floaters too, and the final pruning."""
     split_pixels: float = 8.0
-    """Split a Gaussian if that removes as much squared error, over all views of its block, as this many
-    average pixels have. A refinement splits a tenth of the block at most (`default` strategy)."""
+    """Split a Gaussian if that removes as much squared error as this many average pixels have.
+    Both count in all views of its block. A refinement splits a tenth of the block at most."""
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
