@@ -24,7 +24,8 @@ except IMPORT_TROUBLE as error:
 else:
     if trains_ours(sys.argv):  # before tyro reads them, which knows no reasons
         with exit_on_user_error():
-            refuse_flags(sys.argv[2:])
+            if (_named := getattr(_methods, sys.argv[1].replace("-", "_"), None)) is not None:
+                refuse_flags(sys.argv[2:], _named.config)
 
 
 @dataclass

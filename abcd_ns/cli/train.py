@@ -19,7 +19,7 @@ Run `ns-train` with the options of a TOML file, then those given here: what come
 The file says `method = "abcd"`, or another method of ns-train, and options under their names, in tables:
 --pipeline.device-budget-gb 6 stands in [pipeline] as device-budget-gb = 6. small-gpu, cpu and garden
 come with abcd; a file of your own is named by its path.
-`ns-train abcd --help` lists all options."""
+docs/reference.md lists all options."""
 METHOD = "method"
 
 

@@ -42,22 +42,20 @@ class SceneOptions(DataParserConfig):
     colmap_path: Path | None = None
     """The folder of the COLMAP model, from `data`. None takes that with most photos."""
     images_path: Path = IMAGES
-    """The folder of a COLMAP model's photos, from `data`."""
+    """Folder of a COLMAP model's photos, relative to the data."""
     masks_path: Path | None = None
-    """The folder of their masks, from `data`: of the photo a.jpg it is a.png, a.jpg.png or a.jpg. Black and
-    transparent pixels are not trained on. A photo without a mask counts as a whole. None for no masks."""
+    """Folder of their masks, relative to the data. The mask of a.jpg is a.png, a.jpg.png or a.jpg.
+    Black and transparent pixels are not trained on. A photo without a mask counts as a whole."""
     downscale_factor: int | None = None
-    """Divides the photos' width and height. None takes the smallest of 1, 2, 4, ... with which no photo is
-    wider or higher than 1,600 px, as splatfacto's data parsers do; 1 keeps photos as they are. images_N is
-    read where it fits the model; otherwise photos are reduced in memory by area averaging, to sizes rounded
-    down, and nothing is written. Intrinsics follow the sizes: fx x new width / old width, fy x new height /
-    old height."""
+    """Divides the photos' width and height.
+    None takes the smallest of 1, 2, 4, ... that leaves no side over 1,600 px.
+    Reads images_N if it fits the model; else photos are reduced in memory, by area averaging."""
     scale_factor: float = 1.0
     """Multiplies the scene's size, after auto_scale_poses."""
     scene_scale: float = 1.0
     """Half the side of the scene box, in scaled units: for methods that have one, which ABCD does not."""
     orientation_method: Orientation = "up"
-    """How the scene is turned; "up" makes the mean of the cameras' up vectors +z."""
+    """How the scene is turned. up: the mean of the cameras' up vectors becomes +z."""
     center_method: Center = "poses"
     """What becomes the origin: the mean of the cameras, the point that they look at, or nothing."""
     auto_scale_poses: bool = True

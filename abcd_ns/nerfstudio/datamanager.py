@@ -28,7 +28,7 @@ from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import IMPORT_TROUBLE
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.flags import hidden
+from abcd_ns.nerfstudio.flags import shown
 from abcd_ns.nerfstudio.views import place_cameras
 from abcd_ns.units import GIB
 
@@ -57,7 +57,7 @@ UNUSED = {
     "masks_on_gpu": "masks are kept on the device as far as --pipeline.device-budget-gb allows",
     "max_thread_workers": "photos are read ahead of the steps on a GPU, and on a CPU when they are needed",
     "train_cameras_sampling_strategy": "each block takes its views in shuffled turns",
-    "train_cameras_sampling_seed": "the order of views follows --pipeline.training.seed",
+    "train_cameras_sampling_seed": "the order of views follows --machine.seed",
     "fps_reset_every": "each block takes its views in shuffled turns",
     "camera_res_scale_factor": "the reader of data reduces photos, by its --downscale-factor",
     "eval_num_images_to_sample_from": "all held-out photos are evaluated",
@@ -95,17 +95,16 @@ def reading(config: DataParserConfig) -> Iterator[None]:
         ) from error
 
 
-@hidden(*UNUSED)
+@shown("dataparser", "data_format")
 @dataclass
 class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     """Photos, served by crop to the block in training."""
 
     _target: type = field(default_factory=lambda: AbcdDataManager)
     dataparser: DataParserConfig = field(default_factory=AbcdDataParserConfig)
-    """Where photos, poses and points come from: a COLMAP folder or a transforms.json. Another reader takes
-    its place by its name at the end of the command, as in `ns-train abcd --data DIR colmap`."""
+    """How the data is read. Another reader may end the command: `ns-train abcd --data DIR colmap`."""
     data_format: DataFormat = None
-    """What reads the data, if not abcd-data as told above; its own options follow its name."""
+    """What reads the data, if not abcd-data. Its own options follow its name."""
     cache_images: Literal["cpu", "gpu"] = "cpu"
     """Of no use: see UNUSED. nerfstudio would speak of it where it is "gpu"."""
     photo_cache_gb: float = 0.0

@@ -5,7 +5,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import (
@@ -21,8 +20,10 @@ from torch import Tensor
 from abcd_ns.data.dataset import PHOTOS, pinhole_cameras
 from abcd_ns.data.input_errors import OPTION, InputError, one_line
 from abcd_ns.data.prepare import Prepared, SceneOptions, prepare
+from abcd_ns.nerfstudio.flags import shown
 
 
+@shown("downscale_factor", "images_path", "masks_path", "eval_mode", "eval_interval", "orientation_method")
 @dataclass
 class AbcdDataParserConfig(SceneOptions):
     """A folder with a COLMAP model or a transforms.json, and photos. `--data DIR` alone is enough."""
@@ -30,15 +31,14 @@ class AbcdDataParserConfig(SceneOptions):
     _target: type = field(default_factory=lambda: AbcdDataParser)
     """target class to instantiate"""
     eval_mode: Literal["auto", "interval", "fraction", "all"] = "auto"
-    """"auto" follows train_list.txt, val_list.txt and test_list.txt, or transforms.json's train_filenames,
-    val_filenames and test_filenames, or transforms_test.json; without them it is "interval", which holds out
-    every eval_interval-th view. "fraction" trains on evenly spaced views, train_split_fraction of all, as
-    splatfacto's nerfstudio-data does. "all" trains and evaluates on all views."""
+    """Which photos are held out. auto follows the data's own lists, and is interval without any.
+    interval: every n-th by name, see `eval_interval`. all: none, all are trained on and evaluated.
+    fraction: a tenth, evenly spaced, as nerfstudio-data does."""
     eval_interval: int = 8
-    """Views 0, n, 2n, ... of the list sorted by name are held out; at least 2."""
+    """Photos 0, n, 2n, ... by name are held out; at least 2."""
     train_split_fraction: float = 0.9
     """Share of the views that is trained on by "fraction"."""
-    as_stored: tyro.conf.Suppress[bool] = False
+    as_stored: bool = False
     """Give the cameras of the files as they lie on the disk, distortion included: for methods that read
     photos by nerfstudio's means."""
 

@@ -1,5 +1,6 @@
-"""Command lines of nerfstudio's: which are about our methods, and which options of a config are flags."""
+"""Command lines of nerfstudio's: which are about our methods, and which options `--help` lists."""
 
+import dataclasses
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import tyro
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 
 from abcd_ns.data.input_errors import exit_on_user_error
 from abcd_ns.errors import UserError
@@ -90,12 +92,18 @@ def _value(words: Sequence[str], flag: str) -> str | None:
     return words[place].partition("=")[2] or "".join(words[place + 1 : place + 2])
 
 
-def hidden(*names: str) -> Callable[[type], type]:
-    """Of a config class, above `@dataclass`: these fields are no flags; files and Python may set them."""
+def shown(*names: str) -> Callable[[type], type]:
+    """Of a config class, above `@dataclass`: the fields that `--help` lists, in this order.
+
+    The other fields are options as well, for files, Python and the command line.
+    """
 
     def decorate(cls: type) -> type:
+        fields = {field.name: field for field in dataclasses.fields(cls)}
+        others = [name for name in fields if name not in names and not name.startswith("_")]
+        cls.__dataclass_fields__ = {name: fields[name] for name in (*names, *fields)}
         hints = get_type_hints(cls, include_extras=True)
-        return _annotate(cls, {name: tyro.conf.Suppress[hints[name]] for name in names})
+        return _annotate(cls, {name: tyro.conf.Suppress[hints[name]] for name in others})
 
     return decorate
 
@@ -111,3 +119,18 @@ def _annotate(cls: type, annotations: dict[str, Any]) -> type:
     # tyro reads annotations when it makes its command line; the class itself stays as it was.
     cls.__annotations__ = {**cls.__annotations__, **annotations}
     return cls
+
+
+@shown("device_type", "seed")
+@dataclasses.dataclass
+class AbcdMachineConfig(MachineConfig):
+    """nerfstudio's machine; its seed is the run's."""
+
+    seed: int = 0
+    """Seed of the order of blocks and views, of backgrounds, and of `mcmc`."""
+
+
+@shown("websocket_port", "websocket_host", "quit_on_train_completion")
+@dataclasses.dataclass
+class AbcdViewerConfig(ViewerConfig):
+    """nerfstudio's viewer, fewer of its options in the help."""

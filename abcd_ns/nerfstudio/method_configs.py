@@ -1,6 +1,5 @@
 """The configurations of the methods that `abcd_ns.methods` registers."""
 
-from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from abcd_ns.engine.gaussians.param_swap import LEARNING_RATES
@@ -9,7 +8,6 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.nerfstudio.pipeline import AbcdPipelineConfig
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig, FusedAdamConfig
-from abcd_ns.viewer.guard.rules import THIS_MACHINE
 
 ALONE = 0.01
 """3DGS's share that the rate of means falls to, where no other rate falls."""
@@ -22,13 +20,13 @@ PAPER = TrainingConfig(
         migrate=False,
         pixel_loss="l2",
         fast_start=False,
+        visit_views=10**6,
+        heal=False,
+        means_lr_decay=ALONE,
     ),
     warmup=0.0,
     batch=1,
-    visit_views=10**6,
-    heal=False,
     ssim_lambda=0.0,
-    means_lr_decay=ALONE,
     point_pixels=0.0,
     coarse=0.0,
     density=DensityConfig(price=0.0),
@@ -46,15 +44,12 @@ def _method(name: str, description: str, **pipeline) -> MethodSpecification:
         steps_per_eval_image=500,
         steps_per_eval_batch=0,
         steps_per_eval_all_images=2000,
-        steps_per_save=2000,
-        max_num_iterations=30_000,
         mixed_precision=False,
         pipeline=AbcdPipelineConfig(**pipeline),
         optimizers={
             name: {"optimizer": FusedAdamConfig(lr=rate, eps=1e-15), "scheduler": None}
             for name, rate in LEARNING_RATES.items()
         },
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host=THIS_MACHINE),
         vis="viewer",
     )
     # ABCD reports its own progress, by visit; nerfstudio's table would run through it.
@@ -74,9 +69,8 @@ abcd_partition = _method(
     "Partition, train, merge: overlapping blocks, each trained once and by itself.",
     blocks=PEER_BLOCKS,
     training=TrainingConfig(
-        recipe=Recipe(layers=False, overlap=0.2, migrate=False),
+        recipe=Recipe(layers=False, overlap=0.2, migrate=False, means_lr_decay=ALONE),
         warmup=0.0,
-        means_lr_decay=ALONE,
         density=DensityConfig(price=0.0),  # blocks have one visit, and nothing after it
     ),
 )
@@ -84,7 +78,7 @@ abcd_exact = _method(
     "abcd-exact",
     "Exact joint training over blocks, one on the device at a time: slow, the reference.",
     blocks=PEER_BLOCKS,
-    training=TrainingConfig(recipe=Recipe(exact=True), warmup=0.0, means_lr_decay=ALONE),
+    training=TrainingConfig(recipe=Recipe(exact=True, means_lr_decay=ALONE), warmup=0.0),
 )
 abcd_paper = _method(
     "abcd-paper",

@@ -33,9 +33,8 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
-from abcd_ns.nerfstudio.flags import as_a_command, hidden
+from abcd_ns.nerfstudio.flags import as_a_command, shown
 from abcd_ns.nerfstudio.metrics import image_metrics
-from abcd_ns.nerfstudio.options import HIDDEN
 from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.run.fit import FREE_SHARE
@@ -46,14 +45,16 @@ VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """What splatfacto puts behind whole pictures when it trains on random backgrounds: viser's own colour."""
 
 
-@hidden(*HIDDEN)
+@shown("rasterizer", "random_init")
 @dataclass
 class AbcdModelConfig(SplatfactoModelConfig):
     """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""
 
     _target: type = field(default_factory=lambda: AbcdModel)
     rasterizer: Literal["auto", "torch", "gsplat"] = "auto"
-    """What draws: gsplat's CUDA kernels or the torch rasterizer; auto takes gsplat on CUDA devices."""
+    """gsplat: CUDA kernels. torch: any device. auto takes gsplat on CUDA devices."""
+    random_init: bool = False
+    """Start with Gaussians at random places, as splatfacto does, instead of the points."""
     render: Literal["merged", "composited"] = "merged"
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 
@@ -307,7 +308,7 @@ class AbcdModel(SplatfactoModel):
         )
         settings = self._settings(sh_degree)
         training = TrainingConfig() if self._coordinator is None else self._coordinator.config
-        return viewed.BlockPictures(painter, view, settings, training.window_weight)
+        return viewed.BlockPictures(painter, view, settings, training.recipe.window_weight)
 
     def _settings(self, sh_degree: int | None = None) -> PaintSettings:
         degree = self.config.sh_degree if sh_degree is None else sh_degree

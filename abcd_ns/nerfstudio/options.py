@@ -1,21 +1,27 @@
 """Which options of a run go together, and which of nerfstudio's count."""
 
 import dataclasses
+import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from itertools import product
+from itertools import takewhile
 from operator import attrgetter
 from typing import Any
 
+import tyro
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from abcd_ns.engine.space.partition import MAX_BLOCKS
 from abcd_ns.engine.train.config import TrainingConfig
 from abcd_ns.engine.train.density.control import DensityConfig
+from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
+from abcd_ns.nerfstudio.flags import named_too, shown
+from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.workers import check_workers
 
 MIRRORED = {
@@ -47,10 +53,19 @@ SAME = {
     DensityConfig: {"refine_every": "refine-every", "cull_alpha_thresh": "cull-alpha-thresh"},
 }
 """By class and field, the flag of splatfacto's under --pipeline.model that means the same; taken too."""
+# What makes a method and what memory decides stand in config.yml, and are no options.
+for _not_offered in (Recipe, Limits):
+    tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
+_first = ("primitive", "sh_degree", "background", "light", "poses", "antialiased", "warmup", "density")
+shown(*_first)(TrainingConfig)
+shown("strategy", "max_gaussians", "price", "split_pixels")(DensityConfig)
+for _config, _flags in SAME.items():
+    named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
+
 _HALVES = "each that grows becomes two, large or small"
 _ERROR = "set --pipeline.training.density.split-pixels instead: Gaussians grow by error, not by gradients"
 _REDUCED = "set --pipeline.training.coarse, a share of the run, instead"
-_GIANTS = "--pipeline.training.heal shrinks giants"
+_OVERSIZED = "oversized Gaussians are shrunk, by their size as the nearest camera sees it"
 _GRIDS = "set --pipeline.training.light affine instead, which measured as good"
 _RAYS = "it is about rays, and Gaussians are not drawn by rays"
 UNUSED_OF_MODEL = {
@@ -62,9 +77,9 @@ UNUSED_OF_MODEL = {
     **dict.fromkeys(("densify_grad_thresh", "use_absgrad"), _ERROR),
     "sh_degree_interval": "the degree rises over a tenth of the run, whatever its length",
     **dict.fromkeys(("num_downscales", "resolution_schedule"), _REDUCED),
-    **dict.fromkeys(("cull_screen_size", "stop_screen_size_at"), _GIANTS),
+    **dict.fromkeys(("cull_screen_size", "stop_screen_size_at"), _OVERSIZED),
     "split_screen_size": "nothing is split for its size",
-    **dict.fromkeys(("cull_scale_thresh", "use_scale_regularization", "max_gauss_ratio"), _GIANTS),
+    **dict.fromkeys(("cull_scale_thresh", "use_scale_regularization", "max_gauss_ratio"), _OVERSIZED),
     **dict.fromkeys(("use_bilateral_grid", "grid_shape"), _GRIDS),
     "camera_optimizer": "set --pipeline.training.poses SO3xR3 instead",
     "output_depth_during_training": "no loss here needs depth; trained scenes have it",
@@ -81,20 +96,38 @@ UNUSED = {
     "prompt": "ABCD trains on photos",
 }
 """Options of nerfstudio's trainer that ABCD has no use for, and why."""
+UNUSED_OF_MACHINE = dict.fromkeys(
+    ("num_devices", "num_machines", "machine_rank", "dist_url"), "for several devices set --pipeline.workers"
+)
+"""Options of nerfstudio's machine that ABCD has no use for, and why."""
 NOT_CLIPPED = "steps whose gradients are no numbers are skipped, and others are not clipped"
 UNUSED_OF_OPTIMIZERS = {
     "camera_opt": "poses are refined by steps of their own, see --pipeline.training.poses",
     "bilateral_grid": _GRIDS,
-    "*.scheduler.*": "rates follow the run: see --pipeline.training.means-lr-decay",
+    "*.scheduler.*": "rates follow the run",
     "*.optimizer.max_norm": NOT_CLIPPED,
+    "*.optimizer.fused": "a parameter and its moments are updated by one kernel in any case",
 }
 """Options of splatfacto's optimizers that ABCD has no use for, and why."""
+SEED = "set --machine.seed instead"
+NO_FLAGS = {
+    **UNUSED,
+    **{f"machine.{name}": why for name, why in UNUSED_OF_MACHINE.items()},
+    **{f"pipeline.model.{name}": why for name, why in UNUSED_OF_MODEL.items()},
+    **{f"pipeline.datamanager.{name}": why for name, why in UNUSED_OF_DATA.items()},
+    **{f"optimizers.{name}": why for name, why in UNUSED_OF_OPTIMIZERS.items()},
+    "viewer.num_rays_per_chunk": _RAYS,
+    "pipeline.training.seed": SEED,
+    "pipeline.training.recipe": "choose another method; `abcd compare --vary` can change parts of one",
+    "pipeline.training.limits": "they follow from --pipeline.device-budget-gb",
+}
+"""By the pattern of their names, what are no flags of `ns-train abcd`, and why."""
 HIDDEN = tuple(
     option.name
     for option in dataclasses.fields(SplatfactoModelConfig)
     if option.name not in HONOURED and not option.name.startswith("_")
 )
-"""Options of splatfacto's model that are no flags of `ns-train abcd`, or under other names."""
+"""Options of splatfacto's model that have no effect, or are set under other names."""
 
 
 def check_options(config: TrainerConfig) -> None:
@@ -104,8 +137,6 @@ def check_options(config: TrainerConfig) -> None:
         UserError: one is out of range, two contradict each other, or ABCD cannot do what is asked for.
     """
     pipeline = config.pipeline
-    if config.machine.num_devices * config.machine.num_machines > 1:
-        raise UserError("For several devices give --pipeline.workers; leave out --machine.num-devices.")
     for name in ("blocks", "device_budget_gb", "near_plane", "ram_budget_gb", "datamanager.photo_cache_gb"):
         value = attrgetter(name)(pipeline)
         if not 0 <= value < math.inf:
@@ -122,7 +153,10 @@ def check_options(config: TrainerConfig) -> None:
     if pipeline.training.recipe.overlap > 0 and pipeline.blocks == 0:
         raise UserError("abcd-partition cuts no block that outgrows the device: give --pipeline.blocks.")
     check_workers(config)
+    if pipeline.training.seed not in (TrainingConfig.seed, config.machine.seed):
+        raise UserError(_no_effect("pipeline.training.seed", SEED))
     refuse_changed(config, UNUSED, "")
+    refuse_changed(config.machine, UNUSED_OF_MACHINE, "machine.")
     refuse_changed(pipeline.datamanager, UNUSED_OF_DATA, "pipeline.datamanager.")
     for name, group in config.optimizers.items():
         if group["optimizer"].max_norm is not None:
@@ -145,27 +179,41 @@ def refuse_changed(config: Any, unused: Mapping[str, str], prefix: str) -> None:
             raise UserError(_no_effect(f"{prefix}{name}", why))
 
 
-def refuse_flags(words: Sequence[str]) -> None:
-    """See that no word is a flag of splatfacto's that is none here; tyro would name other methods' flags.
+def refuse_flags(words: Sequence[str], config: TrainerConfig) -> None:
+    """See that every flag is an option with an effect; tyro would name other methods' flags.
 
     Args:
-        words: of `ns-train`, after the method's name.
+        words: of `ns-train`, after the method's name; what follows the name of a reader is the reader's.
+        config: of the method.
 
     Raises:
-        UserError: one is.
+        UserError: a flag is none; names the reason, or the nearest option.
     """
-    taken = {flag.replace("-", "_") for flags in SAME.values() for flag in flags.values()} | HONOURED
-    found = {
-        **UNUSED,
-        **{f"pipeline.model.{name}": why for name, why in UNUSED_OF_MODEL.items()},
-        **{f"pipeline.datamanager.{name}": why for name, why in UNUSED_OF_DATA.items()},
-        **{f"optimizers.{name}": why for name, why in UNUSED_OF_OPTIMIZERS.items()},
-    }
-    flags = (word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--"))
-    refused = [flag for flag in flags if flag.removeprefix("pipeline.model.") not in taken]
-    for flag, (pattern, why) in product(refused, found.items()):
-        if fnmatchcase(f"{flag}.", f"{pattern}.*"):
-            raise UserError(_no_effect(flag, why))
+    same = (name.replace("-", "_") for flags in SAME.values() for name in flags.values())
+    taken = {f"pipeline.model.{name}" for name in (*same, *HONOURED)}
+    known = {*flat_options(config)} - {f"pipeline.model.{name}" for name in MIRRORED} | taken
+    for word in takewhile(lambda word: word not in READERS, words):
+        name = word[2:].partition("=")[0].replace("-", "_")
+        if not word.startswith("--") or name == "help" or name.startswith("tyro_"):
+            continue
+        why = next((why for part, why in NO_FLAGS.items() if fnmatchcase(f"{name}.", f"{part}.*")), None)
+        if why is not None and name not in taken:
+            raise UserError(_no_effect(name, why))
+        if name not in known:
+            near = " or ".join(f"--{each.replace('_', '-')}" for each in nearest(name, known))
+            hint = f"did you mean {near}?" if near else "docs/reference.md lists all."
+            raise UserError(f"There is no option --{name.replace('_', '-')}; {hint}")
+
+
+def nearest(name: str, known: Iterable[str]) -> list[str]:
+    """The three names most like `name`, by the whole of it or by its last part; splatfacto's come last."""
+    by_end = {each: each.rpartition(".")[2] for each in known}
+    last = name.rpartition(".")[2]
+    same = [each for each, end in by_end.items() if end == last]
+    ends = difflib.get_close_matches(last, sorted(set(by_end.values())), n=3, cutoff=0.8)
+    alike = [each for end in ends for each, known_end in by_end.items() if known_end == end]
+    whole = difflib.get_close_matches(name, by_end, n=3, cutoff=0.8)
+    return sorted(dict.fromkeys([*same, *whole, *alike]), key=lambda each: "model." in each)[:3]
 
 
 def mirror(training: TrainingConfig, model: SplatfactoModelConfig) -> None:

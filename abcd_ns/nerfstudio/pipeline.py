@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import torch
-import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import writer
@@ -16,18 +15,17 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from abcd_ns.data.ply import GREY
 from abcd_ns.engine.events import HeldOutScored
 from abcd_ns.engine.gaussians.initialize import random_points
-from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.step.batch import Rendered
 from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.nerfstudio.datamanager import AbcdDataManager, AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParser
-from abcd_ns.nerfstudio.flags import as_a_command, check_held_out, check_tool, named_too, opened
+from abcd_ns.nerfstudio.flags import as_a_command, check_held_out, check_tool, opened, shown
 from abcd_ns.nerfstudio.inspection import factor_of, where_data_is
 from abcd_ns.nerfstudio.metrics import lpips_missing
 from abcd_ns.nerfstudio.model import AbcdModel, AbcdModelConfig
-from abcd_ns.nerfstudio.options import SAME, mirror
+from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.run.progress import ProgressReport
 from abcd_ns.nerfstudio.run.resuming import RunRequest
@@ -41,20 +39,20 @@ from abcd_ns.units import GIB
 from abcd_ns.viewer import guard
 from abcd_ns.viewer.panel import AbcdPanel
 
-# What makes a method and what memory decides stand in config.yml, and are no flags of `ns-train`.
-for _not_offered in (Recipe, Limits):
-    tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
-for _config, _flags in SAME.items():
-    named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
 
-
+@shown(
+    "max_seconds", "blocks", "device_budget_gb", "ram_budget_gb", "workers", "cluster",
+    "datamanager", "training", "model",
+)  # fmt: skip
 @dataclass
 class AbcdPipelineConfig(RunOptions, VanillaPipelineConfig):
     """ABCD: how space is cut and how its blocks are trained."""
 
     _target: type = field(default_factory=lambda: AbcdPipeline)
     datamanager: AbcdDataManagerConfig = field(default_factory=AbcdDataManagerConfig)
+    """How photos are served."""
     model: AbcdModelConfig = field(default_factory=AbcdModelConfig)
+    """What draws, and what a run begins with."""
 
 
 class AbcdPipeline(VanillaPipeline):

@@ -23,10 +23,10 @@ from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.flags import as_a_command, hidden, opened
+from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_command, opened, shown
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
-from abcd_ns.nerfstudio.options import UNUSED, check_options
-from abcd_ns.nerfstudio.pipeline import AbcdPipeline
+from abcd_ns.nerfstudio.options import check_options
+from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.resuming import RunRequest, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
@@ -36,7 +36,6 @@ from abcd_ns.run.store import Start
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
 
-@hidden("max_norm")
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam as 3DGS uses it, one pass over memory for each parameter."""
@@ -58,12 +57,33 @@ def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerCon
     return dataclasses.replace(viewer, websocket_host=THIS_MACHINE)
 
 
-@hidden(*UNUSED)
+@shown(
+    "data", "max_num_iterations", "output_dir", "experiment_name", "load_dir", "steps_per_save", "vis",
+    "pipeline", "machine", "viewer",
+)  # fmt: skip
 @dataclass
 class AbcdTrainerConfig(TrainerConfig):
     """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""
 
     _target: type = field(default_factory=lambda: AbcdTrainer)
+    data: Path | None = None
+    """Folder of photos with a COLMAP model or a transforms.json, or such a .json file."""
+    max_num_iterations: int = 30_000
+    """Steps of the whole run, those before it was resumed included. All schedules are shares of it."""
+    output_dir: Path = Path("outputs")
+    """The run's files go to a folder in this one."""
+    experiment_name: str | None = None
+    """Name of the scene in the outputs; None takes that of its folder."""
+    load_dir: Path | None = None
+    """Resume the run in this folder."""
+    steps_per_save: int = 2000
+    """Steps between checkpoints, which nerfstudio's other commands open."""
+    pipeline: AbcdPipelineConfig = field(default_factory=AbcdPipelineConfig)
+    """What the run may take: time, blocks, memory, workers."""
+    machine: AbcdMachineConfig = field(default_factory=AbcdMachineConfig)
+    """What trains, and by which random numbers."""
+    viewer: AbcdViewerConfig = field(default_factory=partial(AbcdViewerConfig, websocket_host=THIS_MACHINE))
+    """The viewer in a browser."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "viewer" and "viewer" in self.__dict__:
@@ -150,6 +170,7 @@ class AbcdTrainer(Trainer):
         super().__init__(config, *args, **kwargs)
         self.total_steps = config.max_num_iterations
         """Steps of the whole run, those before a resume included."""
+        config.pipeline.training.seed = config.machine.seed
         self._options = flat_options(config)
         self._signals = StopSignals()
 

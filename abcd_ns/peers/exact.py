@@ -97,7 +97,7 @@ class ExactTrainer(Trainer):
     def next_batch(self) -> Batch:
         """Set the learning rate and say what to train on next: whole views, or random parts."""
         self.stopwatch.start()
-        decay = exponential_decay(self.progress, self.config.means_lr_decay) * self._reach
+        decay = exponential_decay(self.progress, self.config.recipe.means_lr_decay) * self._reach
         self._pace.set(self.batch, self.state.step * self.batch, decay)
         step, views = self.state.step, self.run.views_at(self.run.reduction)
         rows, samples, first = tuple(sorted(views)), [], step * self.batch

@@ -252,7 +252,7 @@ class AbcdPanel(ViewerControl):
         """The views that the block is trained on, or, as far as that is unknown, those that see it."""
         if self._coordinator is not None and block in self._coordinator.state.influence:
             known = self._coordinator.state.influence[block]
-            kept = worth_training(known, self._coordinator.config.influence_share)
+            kept = worth_training(known, self._coordinator.config.recipe.influence_share)
             return [self._coordinator.views[index] for index in kept]
         means = self._model.scene().gaussians(block).means
         return views_that_see(means[:: max(len(means) // MOST_POINTS, 1)], self._training_views)

@@ -32,13 +32,13 @@ def test_a_name_that_is_none_gets_those_that_train(capsys):
 
 def test_tables_become_dotted_names_and_later_words_count(tmp_path, told):
     path = tmp_path / "mine.toml"
-    path.write_text('method = "abcd"\nvis = "tensorboard"\n[pipeline.training]\nheal = false\nwarmup = 0.5\n')
+    path.write_text('method = "abcd"\nvis = "tensorboard"\n[pipeline.training]\nbatch = 2\nwarmup = 0.5\n')
     cli.main(["train", str(path), "--data", "garden"])
     options = [
         "--vis",
         "tensorboard",
-        "--pipeline.training.heal",
-        "False",
+        "--pipeline.training.batch",
+        "2",
         "--pipeline.training.warmup",
         "0.5",
     ]

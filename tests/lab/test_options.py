@@ -46,7 +46,7 @@ def test_several_options_may_change_at_once():
         ("training.warmpu=0.1", "no option 'training.warmpu'; did you mean training.warmup?"),
         ("warmup=0.1", "did you mean training.warmup?"),
         ("cull_alpha_thres=0.1", "did you mean training.density.cull_alpha_thresh or"),
-        ("nonsense=1", "`ns-train abcd --help` lists them"),
+        ("nonsense=1", "docs/reference.md lists them"),
         ("training.batch=many", "training.batch must be a whole number"),
         ("training.warmup=nan", "training.warmup must be a number"),
         ("training.recipe.layers=maybe", "training.recipe.layers must be true or false"),

@@ -41,11 +41,20 @@ def test_train_then_evaluate(tmp_path):
 
 
 @pytest.mark.cli
-def test_a_flag_of_splatfactos_that_is_none_here_is_one_line():
-    ended = shell("ns-train", "abcd", "--data", "x", "--pipeline.model.stop-split-at", 99)
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ("pipeline.model]\nstop-split-at = 99", "--pipeline.model.stop-split-at has no effect here"),
+        ("pipeline.training]\nwarmpu = 0.1", "There is no option --pipeline.training.warmpu; did you mean"),
+    ],
+)
+def test_an_option_of_a_file_that_is_none_here_is_one_line(tmp_path, table, says):
+    path = tmp_path / "mine.toml"
+    path.write_text(f'method = "abcd"\n[{table}\n')
+    ended = shell("abcd", "train", path, "--data", "x")
     assert ended.returncode == 2
     (line,) = (ended.stdout + ended.stderr).splitlines()
-    assert line.startswith("error: --pipeline.model.stop-split-at has no effect here")
+    assert line.startswith(f"error: {says}")
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_several_steps_are_those_of_a_plain_loop_over_everything(exact, photos):
         batch = blocks.next_batch()
         (sample,) = batch.samples
         for name, rate in rates.items():
-            decay = blocks.config.means_lr_decay ** (step / 12) if name == "means" else 1.0
+            decay = blocks.config.recipe.means_lr_decay ** (step / 12) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * rates_of_young(step, 1)
         raster = blocks.run.rasterizer(Gaussians(**params), sample.view, sh_degree=blocks.run.sh_degree)
         picture = composite(raster.layer, sample.background).clamp(0, 1)

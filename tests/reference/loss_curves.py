@@ -37,7 +37,8 @@ def options_of(method: str) -> dict:
         name: getattr(training, name) for name in own if getattr(training, name) != getattr(default, name)
     }
     changed["density"] = replace(training.density, **OFTEN)
-    return {**changed, **asdict(training.recipe), "visit_steps": 5 * (training.recipe.visit_steps > 0)}
+    recipe = {**asdict(training.recipe), "passes": 4}
+    return {**changed, **recipe, "visit_steps": 5 * (training.recipe.visit_steps > 0)}
 
 
 def curve_of(method: str, folder: Path) -> dict[str, list[float]]:

@@ -30,7 +30,7 @@ def train_plain(
         view = views[row]
         share = settling(taken / steps, taken) * rates_of_young(taken, 1)
         for name, rate in LEARNING_RATES.items():
-            decay = exponential_decay(taken / steps, config.means_lr_decay) if name == "means" else 1.0
+            decay = exponential_decay(taken / steps, config.recipe.means_lr_decay) if name == "means" else 1.0
             adam[name].param_groups[0]["lr"] = rate * decay * share
         raster = draw(
             Gaussians(**{name: params[name] for name in PARAM_NAMES}), view, sh_degree=degree, judge=True

@@ -22,7 +22,7 @@ ABOUT_THE_PLACE = {
     "timestamp",
 }
 """Options that say where a run was made and kept, not how it was trained."""
-TAKEN_OVER = {f"pipeline.model.{name}" for name in MIRRORED}
+TAKEN_OVER = {"pipeline.training.seed", *(f"pipeline.model.{name}" for name in MIRRORED)}
 """Options that follow others."""
 READER = "pipeline.datamanager.dataparser."
 NO_FLAGS = ("pipeline.training.recipe.", "pipeline.training.limits.")

@@ -29,7 +29,7 @@ class VisitLayers:
     Args:
         store: where they are kept; new for each visit.
         own: the block's Gaussians when the visit began; they decide the windows.
-        window_weight: see TrainingConfig.
+        window_weight: see Recipe.
         views: all views, by index.
         parts_bytes: size of the layers held while units are folded.
     """

@@ -1,6 +1,5 @@
 """How a scene is trained: every option of the engine, with its default."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -22,64 +21,40 @@ class TrainingConfig:
     limits: Limits = field(default=Limits())
     """What fits on the device; set by whoever knows its memory."""
     primitive: PrimitiveName = "3dgs"
-    """What a Gaussian is: 3DGS's ellipsoid, or the flat disc of 2DGS, a surfel. Part of the scene: whoever
-    draws it later takes it from the run's options."""
-    window_weight: float = 0.06
-    """Frozen fragments between a block's nearest and farthest ones are sorted in with these, in each tile of
-    4 x 4 pixels (gsplat: 16 x 16). This much of their weight, in a picture of the block alone, may be nearer
-    than the nearest that counts, and as much farther than the farthest; 0 counts all, which is exact and
-    dear."""
-    warmup: float = 0.35
-    """Share of the run for which a scaffold is trained before blocks are: Gaussians all over the scene, which
-    grow to as many as take no more memory than a visit to the largest block. Twice as long, if need be, for
-    each view to be used 24 times. Where not all points have room it ends after this share or 24 uses of each
-    view, whichever comes first. 0 for none."""
-    batch: int = 0
-    """Views drawn in one step. 0 takes 1 where the scene is one block, which is 3DGS, and in the
-    warm-up, and elsewhere 4, but for a block that was trained on few views: with small blocks a step's
-    overhead would outweigh its work."""
-    influence_share: float = 0.995
-    """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
-    the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this
-    share of what it weighs there alone. 1 takes all views and pixels that it may touch."""
-    coarse: float = 0.2
-    """Share of the run in which the warm-up, or a scene of one block, is trained on reduced pictures: first
-    at a quarter of their width, then at half, where no side is below 100 pixels then. 0 for none."""
-    visit_views: int = 64
-    """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
-    passes: int = 8
-    """Uses of each of these views in a visit, where they are 32 or fewer; in proportion fewer uses where they
-    are more."""
-    heal: bool = True
-    """Shrink oversized Gaussians where blocks are trained within layers. Values that are no numbers are
-    repaired in any case."""
-    commit_seconds: float = 60.0
-    """A kill loses at most so many seconds of the run; what happens is written to disk beside the training.
-    0 commits at the end of every visit, which waits for the disk."""
+    """What a Gaussian is: an ellipsoid (3DGS) or a flat disc, a surfel (2DGS). Part of the scene."""
     sh_degree: int = 3
-    """Highest degree of spherical harmonics."""
-    ssim_lambda: float = 0.2
-    """Weight of 1 - SSIM in the loss; the rest is the difference of pixels."""
-    antialiased: bool = False
-    """Scale opacities by gsplat's compensation for its low-pass filter."""
+    """Highest degree of spherical harmonics, 0 to 3."""
     background: Literal["random", "black", "white"] = "random"
     """What lies behind the scene while training."""
     light: LightKind = "none"
-    """Colour transform of each finished picture, for photos taken in different light. exposure: a gain for
-    each channel. affine: a 3 x 4 matrix. The mean over the photos is the identity, in which held-out views
-    are drawn; these are scored as `cc_psnr`, too."""
+    """Colour transform of each finished picture, for photos taken in different light.
+    exposure: a gain for each channel. affine: a 3 x 4 matrix.
+    The mean over the photos is the identity. Held-out views are drawn with it and scored as `cc_psnr` too."""
     poses: PosesKind = "off"
-    """Refines where photos were taken from, by whole pictures in the warm-up and between visits. SO3xR3: how
-    each camera turns and where it is. Held-out views keep the poses that were given. With `workers` poses are
-    refined in the warm-up only."""
-    means_lr_decay: float = 0.1
-    """What the means' learning rate falls to over the run, exponentially, as a share; all fall to another
-    tenth at its end, which together is 3DGS's hundredth."""
+    """SO3xR3 refines the poses of the training photos by pictures of the whole scene.
+    Rounds run in the warm-up and between visits; with workers, in the warm-up only."""
+    antialiased: bool = False
+    """Scale opacities by gsplat's compensation for its low-pass filter."""
+    warmup: float = 0.35
+    """Share of the run that trains a coarse model of the whole scene, before blocks. 0 for none.
+    Lasts up to twice as long, until each view was used 24 times.
+    Ends after 24 uses of each view if not all points have room."""
+    coarse: float = 0.2
+    """Share of the run in which the warm-up, or a scene of one block, is trained on reduced pictures.
+    First at a quarter of their width, then at half. No side falls below 100 pixels. 0 for none."""
+    batch: int = 0
+    """Views per step. 0 takes 1 with one block and in the warm-up.
+    Elsewhere 0 takes 4, and fewer for a block that was trained on few views."""
+    ssim_lambda: float = 0.2
+    """Weight of 1 - SSIM in the loss; the rest is the difference of pixels."""
     point_pixels: float = 2.0
-    """Points of the cloud that lie in a cube so many pixels wide, in the view that sees them from nearest,
-    begin as one Gaussian; 0 begins with all."""
+    """Points in a cube this many pixels wide start as one Gaussian. 0 starts with all.
+    The width is that in the view that sees the points from nearest."""
+    commit_seconds: float = 60.0
+    """Seconds of the run that a kill may cost; blocks are written to disk beside the training.
+    0 commits at the end of every visit, which waits for the disk."""
     seed: int = 0
-    """Of the order of blocks and views, of backgrounds, and of what `mcmc` moves."""
+    """Seed of the order of blocks and views, of backgrounds, and of `mcmc`."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Growing and pruning."""
 
@@ -102,12 +77,7 @@ class TrainingConfig:
             ("warmup", 0 <= self.warmup < 1, "from 0 to below 1"),
             ("coarse", 0 <= self.coarse < 1, "from 0 to below 1"),
             ("sh-degree", 0 <= self.sh_degree <= MAX_SH_DEGREE, f"from 0 to {MAX_SH_DEGREE}"),
-            ("influence-share", self.influence_share > 0, "above 0"),
-            ("window-weight", 0 <= self.window_weight < 1, "from 0 to below 1"),
             ("batch", self.batch >= 0, "0 or more"),
-            ("visit-views", self.visit_views > 0, "above 0"),
-            ("means-lr-decay", 0 < self.means_lr_decay < math.inf, "above 0 and finite"),
-            ("passes", self.passes > 0, "above 0"),
         ):
             if not fits:
                 value = getattr(self, name.replace("-", "_"))

@@ -59,7 +59,7 @@ class LayerSource:
             run.scene.gaussians_at_rest(active.geometry.block),
             run.views,
             PaintSettings(active.sh_degree, config.antialiased),
-            window_weight=config.window_weight,
+            window_weight=config.recipe.window_weight,
             parts_bytes=parts_bytes(run, painted, blocks=2),
         )
         wanted = dict.fromkeys(views)

@@ -159,7 +159,7 @@ class Planner(Visits):
         doubted = visit_views(doubtful, DOUBTED, earlier, seed) if doubtful else ()
         # Of thousands of views, only those that it uses are asked where they see the block.
         asked = {view: views[view] for view in (*chosen, *doubted)}
-        found = self._survey(block, asked, self._config.influence_share)
+        found = self._survey(block, asked, self._config.recipe.influence_share)
         chosen, doubted = (tuple(v for v in some if v in found.crops) for some in (chosen, doubted))
         if not chosen:
             return None
@@ -190,10 +190,10 @@ class Planner(Visits):
         """Of the views that may see the block, those that show nearly all that is to be seen of it, as far as
         that is known; empty if it is not."""
         known = state.influence.get(block)
-        if known is None or self._config.influence_share >= 1:
+        if known is None or self._config.recipe.influence_share >= 1:
             return ()
         seen = {view: known[view] for view in views if view in known}
-        return worth_training(seen, self._config.influence_share)
+        return worth_training(seen, self._config.recipe.influence_share)
 
     def _next_plan(self, state: RunState, at_once: int) -> VisitPlan:
         while not state.queue:
@@ -217,7 +217,7 @@ class Planner(Visits):
         remaining = None if self._budget.steps is None else self._budget.steps - state.planned
         used = {block: self._views_used(state, seen) for block, seen in state.views.items()}
         blocks = self._scene.tree.num_blocks
-        passes = passes_of_visit(config.passes, max(used.values()), at_once, blocks)
+        passes = passes_of_visit(config.recipe.passes, max(used.values()), at_once, blocks)
         if state.sweep % LOOK_AGAIN:
             hidden = {block for block, record in state.health.items() if record.hidden}
             used = {block: views for block, views in used.items() if block not in hidden}
@@ -246,7 +246,7 @@ class Planner(Visits):
     def _views_used(self, state: RunState, seen: int) -> int:
         """Of the views that see a block, how many a visit uses."""
         most = max(state.views.values())
-        return views_per_visit(seen, most, self._config.visit_views) if most else 0
+        return views_per_visit(seen, most, self._config.recipe.visit_views) if most else 0
 
     def _may_see(self, block: int) -> dict[int, View]:
         """The views whose frusta meet the block's bounds, by index."""

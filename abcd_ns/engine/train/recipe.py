@@ -20,6 +20,19 @@ class Recipe:
     ownership: Literal["fragments", "means"] = "fragments"
     """What a layer holds: the fragments in a cell (exact) or the Gaussians with their mean in it (as the
     paper)."""
+    window_weight: float = 0.06
+    """Frozen fragments between a block's nearest and farthest ones are sorted in with these, in each tile of
+    4 x 4 pixels (gsplat: 16 x 16). This share of the block's weight, in a picture of it alone, may lie nearer
+    than the nearest that counts, and as much farther than the farthest. 0 counts all: exact and slow."""
+    influence_share: float = 0.995
+    """A block is trained on the fewest views that hold this share of its influence, that is of its weight in
+    the pictures; others hardly show it. Known from the warm-up. And in each view on a crop that holds this
+    share of what it weighs there alone. 1 takes all views and pixels that it may touch."""
+    visit_views: int = 64
+    """Views that a visit uses, for the block that most views see; others use the same share of theirs."""
+    passes: int = 8
+    """Uses of each of these views in a visit, where they are 32 or fewer; in proportion fewer uses where they
+    are more."""
     visit_steps: int = 0
     """Steps of every visit, whatever the views that see its block, as the paper has; 0 shares steps out by
     views."""
@@ -34,6 +47,12 @@ class Recipe:
     paper; frozen blocks are then drawn with the highest."""
     sh_ramp: float = 0.1
     """Share of the run over which the degree rises from 0 to the highest."""
+    heal: bool = True
+    """Shrink oversized Gaussians where blocks are trained within layers. Non-finite values are repaired in
+    any case."""
+    means_lr_decay: float = 0.1
+    """What the means' learning rate falls to over the run, exponentially, as a share. The final decay takes
+    another tenth, which together is 3DGS's hundredth."""
     pixel_loss: Literal["l1", "l2"] = "l1"
     """Mean absolute difference, as 3DGS, or mean squared difference, as the paper with `ssim_lambda` 0."""
     fast_start: bool = True

@@ -115,7 +115,7 @@ class VisitTraining:
         """Set the learning rates, and say what to train on next; listeners are told the views of the steps to
         come, too."""
         run = self.run
-        decay = exponential_decay(run.share, run.config.means_lr_decay) * self._reach
+        decay = exponential_decay(run.share, run.config.recipe.means_lr_decay) * self._reach
         # A first visit, perhaps the only one, has all.
         settles = run.config.recipe.fast_start and (run.active.is_joint or self.live.clocks.visits > 0)
         trained = self.live.clocks.adam_views

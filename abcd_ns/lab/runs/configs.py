@@ -80,7 +80,6 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
         training, steps = pipeline.training, -(-settings.steps // job.blocks)
         training.recipe = dataclasses.replace(training.recipe, visit_steps=steps)
     pipeline.max_seconds = settings.seconds
-    pipeline.training.seed = job.seed
     pipeline.training.density.max_gaussians = settings.max_gaussians
     if not settings.densify:
         pipeline.training.density.strategy = "off"

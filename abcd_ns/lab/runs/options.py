@@ -1,7 +1,6 @@
 """A method's options by their dotted names: found, read from text by their type, and set."""
 
 import dataclasses
-import difflib
 import math
 import types
 import typing
@@ -14,6 +13,7 @@ import msgspec
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Change, Variant
+from abcd_ns.nerfstudio.options import nearest
 
 PREFIX = "pipeline."
 """May stand before a name, as in `ns-train`'s options."""
@@ -118,7 +118,9 @@ def read_value(change: Change, pipeline: Any) -> Any:
         )
     known = option_names(pipeline)
     if change.path not in known:
-        raise UserError(f"There is no option {change.path!r}; {_near(change.path, known)}")
+        near = " or ".join(nearest(change.path, known))
+        hint = f"did you mean {near}?" if near else "docs/reference.md lists them, under --pipeline."
+        raise UserError(f"There is no option {change.path!r}; {hint}")
     try:
         return _read(known[change.path], change.value)
     except ValueError:
@@ -181,17 +183,3 @@ def _words(hint: Any) -> str:
         else:
             words.append(WORDS[alternative])
     return " or ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
-
-
-def _near(path: str, known: dict[str, Any]) -> str:
-    """The names most like `path`, by the whole of it or by its last part."""
-    by_end = {name: name.rpartition(".")[2] for name in known}
-    last = path.rpartition(".")[2]
-    same = [name for name, end in by_end.items() if end == last]
-    ends = difflib.get_close_matches(last, sorted(set(by_end.values())), n=3, cutoff=0.8)
-    alike = [name for end in ends for name, known_end in by_end.items() if known_end == end]
-    whole = difflib.get_close_matches(path, known, n=3, cutoff=0.8)
-    ours = sorted(dict.fromkeys([*same, *whole, *alike]), key=lambda name: name.startswith("model."))[:3]
-    if ours:
-        return f"did you mean {' or '.join(ours)}?"
-    return "`ns-train abcd --help` lists them, under --pipeline."

@@ -59,27 +59,25 @@ class DensityConfig:
     """When and how the number of Gaussians changes."""
 
     strategy: Literal["default", "mcmc", "off"] = "default"
-    """`default`: split what is worth it, and prune. `mcmc`: relocate, and add up to a limit."""
+    """default: split by error, and prune. mcmc: relocate, and add up to a limit (3DGS-MCMC)."""
+    max_gaussians: int = 0
+    """Limit for the whole scene. 0 is none (mcmc: 1,000,000). Of more points, a random choice starts."""
+    price: float = 8.0
+    """Minimum contribution, px: prune a Gaussian whose blend weights in all views of its block sum to less.
+    Applies once growth ends. Strategy mcmc has the final pruning only.
+    0 turns all pruning by contribution off, of floaters too, and the final pruning."""
+    split_pixels: float = 8.0
+    """Split a Gaussian if that removes as much squared error as this many average pixels have.
+    Both count in all views of its block. A refinement splits a tenth of the block at most."""
     refine_start: float = 1 / 60
     """Share of the run before the first refinement (500 of 30,000 steps in splatfacto)."""
     refine_stop: float = 0.5
-    """Share of the run after which none becomes two; a block grows in its first visit all the same,
-    unless that is in the last third. Who fills less than the `price` goes later, too."""
+    """Share of the run after which no Gaussian is split. A block in its first visit grows on until 0.7."""
     refine_every: int = 100
     """Views drawn to train a block between its refinements; as many as show it if these are more, but no more
     than a quarter of those drawn while it grows."""
     cull_alpha_thresh: float = 0.005
     """Opacity under which a Gaussian is pruned (`default` strategy)."""
-    split_pixels: float = 8.0
-    """A Gaussian is split where that would remove as much squared error, in all views of its block together,
-    as so many pixels have in the mean; at most a tenth of a block's in a refinement (`default` strategy)."""
-    price: float = 8.0
-    """Pixels that a Gaussian must fill (sum of alpha T) in all views of its block together, once growth ends;
-    those that fill less go (`default` strategy). 0 keeps everything, haze too, and whatever a complete run
-    could spare (`mcmc` as well)."""
-    max_gaussians: int = 0
-    """Gaussians in the whole scene at most; 0 means no limit (`mcmc`: 1,000,000). Where there are more points
-    to begin with, a random choice of them begins."""
 
     @property
     def limit(self) -> int | None:

@@ -27,6 +27,7 @@ from abcd_ns.engine.train.density.control import DensityConfig
 from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE, unsound
 from abcd_ns.engine.train.health_record import standing
 from abcd_ns.engine.train.planner import NothingSeenError
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.types import PARAM_NAMES, Gaussians, View
 from abcd_ns.lab.stability.lab import (
     BLOCKS,
@@ -180,7 +181,7 @@ def hidden_block(lab: Lab) -> tuple[Coordinator, int]:
         tree=tree,
         warmup=0.0,
         density=STILL,
-        passes=1,
+        recipe=Recipe(passes=1),
     )
     while coordinator.state.sweep < 2:
         lab.finish(coordinator, stage, steps=1)
@@ -255,7 +256,7 @@ def giants(lab: Lab) -> Finding:
     eager = DensityConfig(refine_start=0.0, refine_stop=1.0)
     for name, heal in (("abcd", True), ("abcd, not healing", False)):
         options = {"budget": lab.views_drawn(320), "tree": tree, "warmup": 0.0, "density": eager}
-        trained = lab.train(stage, start=start, heal=heal, **options)
+        trained = lab.train(stage, start=start, recipe=Recipe(heal=heal), **options)
         after = largest_share(trained.gaussians, stage.views)
         gap = ordering_gap(lab, trained, stage.held_out[:4])
         held = [event.visit for event in trained.of(Mended) if event.what == "giants"]

@@ -16,6 +16,7 @@ from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import LEAST_REFINEMENTS, DensityConfig, DensityControl
 from abcd_ns.engine.train.layer_source import LayerSource
 from abcd_ns.engine.train.memory import OutOfRoomError, check_room
+from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.step.live_block import LiveBlock
 from abcd_ns.engine.types import Gaussians
@@ -218,8 +219,7 @@ def train_stale(lab: Lab, stage: Stage, every: int, *, damping: float = 1.0) -> 
         blocks=SWEEP,
         warmup=0.0,
         density=STILL,
-        heal=False,
-        passes=2,
+        recipe=Recipe(heal=False, passes=2),
         kind=partial(stale_coordinator, every=every, damping=damping),
     )
     rising = share_rising(objectives(lab, stage, coordinator))
