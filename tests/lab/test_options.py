@@ -6,8 +6,7 @@ import pytest
 
 from abcd_ns import methods
 from abcd_ns.errors import UserError
-from abcd_ns.lab.job import Change
-from abcd_ns.lab.runs.options import change_options, option_names, parse_variant
+from abcd_ns.lab.runs.options import change_options, option_names, parse_changes
 
 PIPELINE = methods.abcd.config.pipeline
 
@@ -25,8 +24,8 @@ PIPELINE = methods.abcd.config.pipeline
     ],
 )
 def test_a_change_is_read_by_the_type_of_its_option(text, path, value):
-    variant, pipeline = parse_variant(text, PIPELINE), copy.deepcopy(PIPELINE)
-    change_options(pipeline, variant)
+    pipeline = copy.deepcopy(PIPELINE)
+    change_options(pipeline, parse_changes(text, PIPELINE))
     for step in path.split("."):
         pipeline = getattr(pipeline, step)
     assert pipeline == value
@@ -34,10 +33,7 @@ def test_a_change_is_read_by_the_type_of_its_option(text, path, value):
 
 
 def test_several_options_may_change_at_once():
-    variant = parse_variant("partition=grid blocks=27", PIPELINE)
-    assert variant.changes == (Change("partition", "grid"), Change("blocks", "27"))
-    assert variant.name == "partition=grid blocks=27"
-    assert variant.folder == "partition=grid_blocks=27"
+    assert parse_changes("partition=grid blocks=27", PIPELINE) == ("partition=grid", "blocks=27")
 
 
 @pytest.mark.parametrize(
@@ -46,10 +42,10 @@ def test_several_options_may_change_at_once():
         ("training.warmpu=0.1", "no option 'training.warmpu'; did you mean training.warmup?"),
         ("warmup=0.1", "did you mean training.warmup?"),
         ("cull_alpha_thres=0.1", "did you mean training.density.cull_alpha_thresh or"),
-        ("nonsense=1", "`ns-train abcd --help` lists them"),
-        ("training.batch=many", "training.batch must be a whole number"),
-        ("training.warmup=nan", "training.warmup must be a number"),
-        ("training.recipe.layers=maybe", "training.recipe.layers must be true or false"),
+        ("nonsense=1", "see `ns-train abcd --help`"),
+        ("training.batch=many", "training.batch is 'many'; it must be a whole number"),
+        ("training.warmup=nan", "must be a number"),
+        ("training.recipe.layers=maybe", "must be true or false"),
         ("training.recipe.ownership=foo", "must be fragments or means"),
         ("training.ownership=means", "did you mean training.recipe.ownership"),
         ("training.seed=1", "set it with --seeds"),
@@ -60,12 +56,12 @@ def test_several_options_may_change_at_once():
         ("training.warmup", "write NAME=VALUE"),
         ("=3", "write NAME=VALUE"),
         ("", "at least one option"),
-        ("blocks=2 blocks=3", "none of them twice"),
+        ("blocks=2 blocks=3", "changes blocks twice"),
     ],
 )
 def test_a_change_that_does_not_fit_is_refused_in_one_line(text, message):
     with pytest.raises(UserError) as caught:
-        parse_variant(text, PIPELINE)
+        parse_changes(text, PIPELINE)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 

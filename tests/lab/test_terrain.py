@@ -10,18 +10,19 @@ from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.command import Options, compare, make_plan
-from abcd_ns.lab.compare.terrain import AS_ONE, terrain_jobs, too_large
+from abcd_ns.lab.compare.terrain import terrain_jobs
 from abcd_ns.lab.job import TerrainJob, TerrainSettings
-from abcd_ns.lab.results.findings import find_growth
 from abcd_ns.lab.results.records import decode, encode, read_json
 from abcd_ns.lab.results.results import TERRAIN, Arm, Results
 from abcd_ns.lab.results.run import Failure, Footing, Run
-from abcd_ns.lab.results.tables import notes, write_table
+from abcd_ns.lab.results.tables import growth, notes, write_table
+from abcd_ns.lab.runs.runner import why_left_out
 from abcd_ns.lab.runs.terrain import run
 from abcd_ns.lab.world.land import Land, color_of
 from tests.lab.compare.records import made_up, made_up_run, read_results
 from tests.lab.in_process import jobs_in_this_process
 
+AS_ONE = "abcd-monolithic"
 MIB = 2**20
 
 
@@ -117,8 +118,8 @@ def results_of(*arms: Arm) -> Results:
 def test_growth_is_from_the_smallest_to_the_largest():
     arms = [made_up_land(2, 500), made_up_land(4, 900), made_up_land(8, 520), made_up_land(8, 9000, AS_ONE)]
     results = results_of(*arms)
-    assert find_growth(results, "peak_rss_bytes") == pytest.approx(0.04)
-    assert find_growth(results, "peak_device_bytes") is None
+    assert growth(results, "peak_rss_bytes") == pytest.approx(0.04)
+    assert growth(results, "peak_device_bytes") is None
     assert results.findings == ("From 2 to 8 blocks of ABCD, peak RAM grows by 4.0%; allowed: 5%.",)
     on_gpu = results_of(made_up_land(2, 500, device=100), made_up_land(4, 500, device=150))
     assert "GPU memory by 50.0%" in on_gpu.findings[0]
@@ -163,13 +164,13 @@ def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, mon
     tried = []
 
     def made_up_end(job: TerrainJob, *_) -> Run | Failure:
-        tried.append((job.tiles, job.method))
-        if job.method == AS_ONE and job.tiles > 2:
+        tried.append((job.value, job.method))
+        if job.method == AS_ONE and job.value > 2:
             reason = "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
             return Failure(job.method, job.seed, reason, "log.txt")
-        return made_up_land(job.tiles, 500, job.method, device=100).runs[0]
+        return made_up_land(job.value, 500, job.method, device=100).runs[0]
 
-    monkeypatch.setattr("abcd_ns.lab.runs.experiment.finish_job", made_up_end)
+    monkeypatch.setattr("abcd_ns.lab.runs.runner.finish_job", made_up_end)
     both = {"methods": ("abcd", AS_ONE), "tile_gaussians": 10}
     assert compare(options(tmp_path, tiles=(2, 4, 8), **both)) == 0
     assert tried == [(2, "abcd"), (2, AS_ONE), (4, "abcd"), (4, AS_ONE), (8, "abcd")]
@@ -180,8 +181,8 @@ def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, mon
 
 def test_one_block_is_not_tried_where_it_would_be_huge():
     small, large = terrain_jobs(TerrainSettings(10**6, 1), (4, 8), (AS_ONE,), (0,))
-    assert too_large(small) is None
-    assert "more than 4,000,000 Gaussians" in too_large(large).reason
+    assert why_left_out(small) is None
+    assert "more than 4,000,000 Gaussians" in why_left_out(large)
 
 
 def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):

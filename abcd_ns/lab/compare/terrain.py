@@ -1,6 +1,5 @@
 """`abcd compare --tiles`: memory and time as a synthetic terrain grows and its blocks do not."""
 
-import re
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
@@ -8,21 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.job import Change, Plan, TerrainJob, TerrainSettings, Variant
-from abcd_ns.lab.results.results import TERRAIN, LeftOut
-from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.runs.checks import check_ranges
+from abcd_ns.lab.job import Plan, TerrainJob, TerrainSettings
+from abcd_ns.lab.results.results import TERRAIN
+from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.units import bytes_in_words
 
-BY_BLOCKS, AS_ONE = "abcd", "abcd-monolithic"
+METHODS = {"abcd", "abcd-monolithic"}
 OPTIONS = {"tiles", "tile_gaussians", "visits", "methods", "seeds", "out"}
 """Those that a comparison on a terrain has."""
 BYTES_PER_GAUSSIAN = 3 * 59 * 4
 """On disk: parameters and two moments in float32."""
-OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")
-"""How torch and CUDA say it, in the last line of a log."""
-MOST_IN_ONE_BLOCK = 4_000_000
-"""Gaussians; larger terrains are not tried as one block."""
 
 
 def terrain_plan(given: Mapping[str, Any], methods: Sequence[str], seeds: Sequence[int]) -> Plan:
@@ -36,8 +30,8 @@ def terrain_plan(given: Mapping[str, Any], methods: Sequence[str], seeds: Sequen
     """
     if others := given.keys() - OPTIONS:
         raise UserError(f"--{min(others).replace('_', '-')} does not go with --tiles.")
-    if others := set(methods) - {BY_BLOCKS, AS_ONE}:
-        raise UserError(f"--tiles is for {BY_BLOCKS} and {AS_ONE}, not {min(others)}.")
+    if others := set(methods) - METHODS:
+        raise UserError(f"--tiles is for {' and '.join(sorted(METHODS))}, not {min(others)}.")
     tiles, out = sorted(given["tiles"]), Path(given["out"])
     if not tiles or len(set(tiles)) < len(tiles) or any(n < 1 or n & (n - 1) for n in tiles):
         raise UserError(f"--tiles {' '.join(map(str, tiles))}: give different powers of 2, from 1 on.")
@@ -55,22 +49,11 @@ def terrain_jobs(
 ) -> tuple[TerrainJob, ...]:
     """The smallest first, by blocks before as one block, which may need more memory than there is."""
     return tuple(
-        TerrainJob(method, seed, settings, Variant((Change("tiles", str(count)),)))
+        TerrainJob(method, seed, settings, (f"tiles={count}",))
         for count in tiles
         for method in sorted(methods)
         for seed in seeds
     )
-
-
-def too_large(job: TerrainJob, outcome: Run | Failure | None = None) -> LeftOut | None:
-    """Why larger terrains are not tried as one block, if they are not."""
-    if job.method != AS_ONE:
-        return None
-    if job.tiles * job.settings.gaussians > MOST_IN_ONE_BLOCK:
-        return LeftOut(AS_ONE, f"{job.tiles} tiles have more than {MOST_IN_ONE_BLOCK:,} Gaussians")
-    if isinstance(outcome, Failure) and OUT_OF_MEMORY.search(outcome.reason):
-        return LeftOut(AS_ONE, f"as one block, {job.tiles} tiles ran out of GPU memory")
-    return None
 
 
 def _check_disk(out: Path, gaussians: int) -> None:

@@ -26,7 +26,7 @@ from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.job import TerrainJob
 from abcd_ns.lab.results.run import Footing, Run
-from abcd_ns.lab.runs.work import memory_of_run, work
+from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run import STORE
@@ -45,7 +45,7 @@ def run(job: TerrainJob, folder: Path) -> Run:
     rasterizer.warm_up()
     loss.warm_up(device)
     base, began = peak_rss_bytes(), time.perf_counter()
-    land = Land(job.tiles, job.settings.gaussians, seed=job.seed)
+    land = Land(job.value, job.settings.gaussians, seed=job.seed)
     scene = make_scene(job, land, folder / STORE)
     made = time.perf_counter()
     coordinator = _coordinator(job, land, scene, rasterizer, device)
@@ -77,7 +77,7 @@ def run(job: TerrainJob, folder: Path) -> Run:
         psnr=fmean(watch.psnr),
         lpips_reason="nothing is held out",
         ordering_gap_note="nothing is held out",
-        gaussians=job.tiles * job.settings.gaussians,
+        gaussians=job.value * job.settings.gaussians,
         **memory,
         store_bytes=disk_bytes(folder / STORE),
         layer_seconds=sum(visit.layer_seconds for visit in watch.visits),

@@ -4,18 +4,17 @@ import math
 import tempfile
 from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import Parameter
 
 from abcd_ns.engine.events import Event
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
-from abcd_ns.engine.gaussians.param_swap import Optimizers, nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.space.partition import build_kd
@@ -36,15 +35,12 @@ from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring
-from abcd_ns.nerfstudio.metrics import corrected_psnr
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
 PAIR: tuple[Method, ...] = ("abcd", "abcd-monolithic")
 SH_DEGREE = 1
 """Nothing in these worlds shines."""
-STILL = DensityConfig(strategy="off")
-"""The number of Gaussians stays."""
 LIMITED = DensityConfig(max_gaussians=1000)
 """As many Gaussians for every method, and few, for time."""
 BUDGET = 600
@@ -81,8 +77,7 @@ class Stage:
     def only(self, count: int) -> "Stage":
         """With `count` of the training views, evenly spread."""
         total = len(self.views)
-        chosen = [self.views[k * total // count] for k in range(count)]
-        return replace(self, views=chosen)
+        return replace(self, views=[self.views[k * total // count] for k in range(count)])
 
 
 def make_stage(
@@ -107,17 +102,13 @@ class Trained:
     psnr: float
     """Held-out, dB."""
     events: list[Event]
-    counts: list[int] = field(default_factory=list)
+    counts: list[int]
     """Gaussians in the scene after each step."""
 
     @property
     def gaussians(self) -> Gaussians:
         """The whole scene in one list."""
         return merged(self.coordinator)
-
-    def of(self, kind: type) -> list:
-        """The events of one kind."""
-        return [event for event in self.events if isinstance(event, kind)]
 
 
 class Lab:
@@ -129,20 +120,11 @@ class Lab:
         seed: of every training that names none.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        use_native: bool = True,
-        quick: bool = False,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, folder: Path, *, use_native: bool = True, quick: bool = False, seed: int = 0) -> None:
         self.quick, self.seed = quick, seed
-        self.tick: Callable[[], object] = lambda: None
-        """Called after every training step."""
-        self._scores: dict[tuple[str, Method], float] = {}
         self.rasterizer = TorchRasterizer(use_native=use_native)
         self._folder = folder
+        self._scores: dict[tuple[str, Method], float] = {}
 
     def views_drawn(self, usual: int) -> int:
         """The budget of a run, in views."""
@@ -158,24 +140,20 @@ class Lab:
         blocks: int = BLOCKS,
         tree: BlockTree | None = None,
         kind: Callable[[TrainingRun], Coordinator] = Coordinator,
-        optimizers: tuple[dict[str, Parameter], Optimizers] | None = None,
-        **training,
+        **training: Any,
     ) -> Coordinator:
         """A coordinator over a new store.
 
         Args:
             budget: views drawn in the whole run; every method gets as many, in steps of as many as it takes.
             kind: makes it of a run.
-            optimizers: parameters and their optimizers; new ones if left out.
             training: options of TrainingConfig.
         """
-        recipe = Recipe(layers=method != "abcd-ablated")
-        usual = {"recipe": recipe, "sh_degree": start.sh_degree, "seed": self.seed}
-        options = {**usual, **training}
+        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": start.sh_degree}
+        config = TrainingConfig(**{**usual, "seed": self.seed, **training})
         tree = tree or build_kd(start.means, blocks)
         if method == "abcd-monolithic":
             tree = build_kd(start.means, 1)
-        config = TrainingConfig(**options)
         start = thin_out(start, config.density.limit, config.seed)
         store = ParameterStore.create(Path(tempfile.mkdtemp(dir=self._folder)) / "store", {})
         warms = config.warmup > 0 and tree.num_blocks > 1
@@ -183,14 +161,13 @@ class Lab:
         keep = scaffold_size(config, largest, pixels) if warms else None
         config = replace(config, limits=replace(config.limits, scaffold_gaussians=keep or 0))
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
-        params, adam = optimizers or nothing_live(start.sh_degree)
-        scene = StoredScene(tree, store)
         waiting = 0 if keep is None else max(len(start) - keep, 0)
         steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), waiting))
-        return kind(TrainingRun(config, steps, scene, views, self.rasterizer, params, adam))
+        live = nothing_live(start.sh_degree)
+        return kind(TrainingRun(config, steps, StoredScene(tree, store), views, self.rasterizer, *live))
 
     def train(
-        self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options
+        self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options: Any
     ) -> Trained:
         """Train on a stage from its points, or from `start`, and score the held-out views.
 
@@ -204,17 +181,18 @@ class Lab:
         counts = self.finish(coordinator, stage)
         return Trained(coordinator, self.score(coordinator, stage), events, counts)
 
-    def train_limited(self, stage: Stage, method: Method, **options) -> Trained:
+    def train_limited(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train under the conditions of comparisons: on few views and with few Gaussians, as many of both for
         every method.
 
         Args:
             options: of `coordinator`; they go before these.
         """
-        usual = {"budget": self.views_drawn(BUDGET), "density": LIMITED}
-        return self.train(stage, method, **{**usual, **options})
+        return self.train(
+            stage, method, **{"budget": self.views_drawn(BUDGET), "density": LIMITED, **options}
+        )
 
-    def compared(self, stage: Stage, method: Method, name: str | None = None, **options) -> float:
+    def compared(self, stage: Stage, method: Method, name: str | None = None, **options: Any) -> float:
         """Held-out PSNR under the conditions of comparisons, dB.
 
         Args:
@@ -232,7 +210,6 @@ class Lab:
         while not coordinator.finished and (steps is None or len(counts) < steps):
             train_step(coordinator, stage)
             counts.append(coordinator.count())
-            self.tick()
         return counts
 
     @torch.no_grad()
@@ -245,15 +222,6 @@ class Lab:
         """Mean PSNR, or another measure, of merged pictures of the held-out views, dB."""
         drawn = self.pictures(merged(coordinator), stage.held_out)
         return sum(float(measure(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
-
-    def corrected(self, stage: Stage, method: Method, **options) -> float:
-        """As `compared`, each picture warped to its photo's colours before it is scored.
-
-        Args:
-            options: of `coordinator`.
-        """
-        trained = self.train_limited(stage, method, **options)
-        return self.score(trained.coordinator, stage, corrected_psnr)
 
     def error(self, coordinator: Coordinator, stage: Stage) -> float:
         """The full objective, near enough: the mean absolute error over all training photos."""
@@ -301,8 +269,3 @@ def drawn_by_blocks(steps: int, config: TrainingConfig, blocks: int, trained: in
 def merged(coordinator: Coordinator) -> Gaussians:
     """All blocks in one list, in the order of the blocks, on the CPU and without a graph."""
     return coordinator.scene.everything("cpu")
-
-
-def block_at(tree: BlockTree, *place: float) -> int:
-    """The block that holds a place (x, y, z)."""
-    return int(tree.assign(torch.tensor([place])))

@@ -25,7 +25,6 @@ class Scenario:
     """One way in which methods fail."""
 
     id: str
-    """A1 to A22."""
     fails: str
     """What happens elsewhere."""
     done: str
@@ -33,29 +32,13 @@ class Scenario:
     rule: str
     """What passes."""
     run: Callable[[Lab], Finding]
-    cost: int = 1
-    """How long it takes, in trainings of a curve's point; for the time left."""
 
 
-def scenario(
-    id: str, fails: str, done: str, rule: str, cost: int = 1
-) -> Callable[[Callable[[Lab], Finding]], Scenario]:
+def scenario(id: str, fails: str, done: str, rule: str) -> Callable[[Callable[[Lab], Finding]], Scenario]:
     """Makes a scenario of the function that carries it out."""
-    return lambda run: Scenario(id, fails, done, rule, run, cost)
+    return lambda run: Scenario(id, fails, done, rule, run)
 
 
 def db(value: float) -> str:
     """In decibels, with two digits."""
     return f"{value:.2f} dB"
-
-
-def against_one_block(scores: dict[str, float], margin: float = 0.3) -> Finding:
-    """The finding of a scenario that asks for no less than one block reaches, less `margin` dB.
-
-    Args:
-        scores: held-out PSNR by method, "abcd" and "abcd-monolithic" among them.
-    """
-    behind = scores["abcd-monolithic"] - scores["abcd"]
-    numbers = {f"psnr {method}": value for method, value in scores.items()}
-    said = {method: db(value) for method, value in scores.items()}
-    return Finding(behind <= margin, said, {**numbers, "behind one block": behind}, worse=behind > 0)

@@ -97,7 +97,7 @@ def test_the_command_line_goes_before_the_file():
 
 
 def names_of(plan) -> list[tuple[str, str]]:
-    return [(job.method, job.variant.name) for job in plan.jobs]
+    return [(job.method, job.variant) for job in plan.jobs]
 
 
 def test_several_numbers_of_blocks_are_an_arm_each_of_every_method_that_has_any(tmp_path):

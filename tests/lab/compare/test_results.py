@@ -41,7 +41,7 @@ def test_results_come_back_as_they_were_written(tmp_path_factory, psnr, gap, gau
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_no_number_that_json_lacks_is_written(tmp_path, number):
     bad = made_up_run(curve=(CurvePoint(1.0, 1, 20.0), CurvePoint(2.0, 2, number)))
-    with pytest.raises(ValueError, match=r"arms\[0\]\.runs\[1\]\.curve\[1\]\.psnr is (nan|-?inf)"):
+    with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "results.json", encode(made_up_results(made_up_run(), bad)))
     assert list(tmp_path.iterdir()) == []
 

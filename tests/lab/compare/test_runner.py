@@ -12,12 +12,11 @@ from rich.console import Console
 
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
-from abcd_ns.lab.compare.command import Options, carry_out, impossible, make_plan
+from abcd_ns.lab.compare.command import Options, carry_out, make_plan
 from abcd_ns.lab.job import Job, Plan
 from abcd_ns.lab.results.records import encode
 from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.runs.experiment import run_jobs
-from abcd_ns.lab.runs.runner import last_line
+from abcd_ns.lab.runs.runner import last_line, run_jobs, why_left_out
 from tests.lab.compare.records import MACHINE, read_results
 
 
@@ -123,7 +122,7 @@ def test_another_protocol_is_refused_by_name(plan, field, value):
 def test_runs_of_another_machine_are_refused(plan, worker, monkeypatch):
     run(plan)
     other = dataclasses.replace(MACHINE, cores=64)
-    monkeypatch.setattr("abcd_ns.lab.runs.experiment.describe_machine", lambda: other)
+    monkeypatch.setattr("abcd_ns.lab.runs.runner.describe_machine", lambda: other)
     worker.calls()
     with pytest.raises(UserError, match="holds runs with cores 2, not 64"):
         run(plan)
@@ -214,10 +213,10 @@ def test_splatfacto_is_left_out_with_a_reason_where_it_cannot_run(plan, worker, 
     (left,) = read_results(plan.out / "results.json").left_out
     assert (left.method, "CUDA" in left.reason) == ("splatfacto", True)
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    assert impossible(jobs[0]) is None
+    assert why_left_out(jobs[0]) is None
     limited = dataclasses.replace(plan.settings, max_gaussians=9)
-    assert "limit" in impossible(Job("splatfacto", 0, limited)).reason
-    assert impossible(Job("abcd", 0, limited)) is None
+    assert "limit" in why_left_out(Job("splatfacto", 0, limited))
+    assert why_left_out(Job("abcd", 0, limited)) is None
 
 
 @pytest.mark.parametrize(
