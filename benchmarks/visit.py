@@ -32,8 +32,7 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage
-from abcd_ns.lab.stability.scenarios.captures import read_stage
-from benchmarks.runs import StageClock, print_machine
+from benchmarks.runs import StageClock, print_machine, read_stage
 
 STAGES = (
     "plan and attach",

@@ -16,6 +16,12 @@ AS_IT_IS = "default"
 """Name of the variant without changes."""
 
 
+def scene_name(path: str) -> str:
+    """The name of a folder, or of that with a transforms.json."""
+    found = Path(path).resolve()
+    return found.parent.name if found.suffix == ".json" else found.name
+
+
 @dataclass(frozen=True)
 class Settings:
     """What all runs on a scene share; runs that differ in any of these are not comparable."""
@@ -39,8 +45,7 @@ class Settings:
     @property
     def scene(self) -> str:
         """The name of the scene: its folder's."""
-        path = Path(self.data)
-        return path.parent.name if path.suffix == ".json" else path.name
+        return scene_name(self.data)
 
     @property
     def budget(self) -> str:
@@ -132,13 +137,3 @@ class Plan:
     first seed first."""
     command: str
     """The command line that makes the same."""
-
-    @property
-    def methods(self) -> tuple[str, ...]:
-        """In their order."""
-        return tuple(dict.fromkeys(job.method for job in self.jobs))
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """In their order."""
-        return tuple(dict.fromkeys(job.seed for job in self.jobs))

@@ -44,7 +44,7 @@ class Args:
     out: Path | None = None
     """Gets a JSON file a part, and charts; OUT/work is scratch. Default: docs/results/gpu; of a dry run, a
     temporary folder."""
-    parts: tuple[Literal["build", "tests", "compare", "compare-steps", "extent", "visit"], ...] = tuple(PARTS)
+    parts: tuple[Literal["build", "compare", "compare-steps", "extent", "visit"], ...] = tuple(PARTS)
     """Of these, in this order."""
     minutes: float = 40.0
     """For all of them; what a part leaves goes to those after it."""
@@ -89,20 +89,16 @@ def main(args: Args) -> int:
 
 
 def check_kind(parts: Sequence[str], args: Args, out: Path) -> None:
-    """See that a dry run's records, whose numbers mean nothing, and those of a real run do not mix.
+    """See that records of dry runs, whose numbers mean nothing, and of real ones do not mix.
 
     Raises:
         UserError: `out` has records of the other kind, and they are not made anew.
     """
-    kept = [part for part in PARTS if not (args.again and part in parts)]
-    paths = [path for part in kept if (path := out / f"{part}.json").exists()]
-    others = [path.stem for path in paths if read_json(path)["dry_run"] != args.dry_run]
+    kept = [out / f"{part}.json" for part in PARTS if not (args.again and part in parts)]
+    others = [path.stem for path in kept if path.exists() and read_json(path)["dry_run"] != args.dry_run]
     if others:
-        kind = "real runs" if args.dry_run else "dry runs"
-        names = ", ".join(others)
-        raise UserError(
-            f"--out {out} holds records of {kind} ({names}); name another folder, or use --again."
-        )
+        kind = f"{'real' if args.dry_run else 'dry'} runs ({', '.join(others)})"
+        raise UserError(f"--out {out} holds records of {kind}; name another folder, or use --again.")
 
 
 def run_part(

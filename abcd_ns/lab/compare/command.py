@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import shlex
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +15,14 @@ from rich.console import Console
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.pictures import draw_pictures
-from abcd_ns.lab.compare.terrain import terrain_plan
-from abcd_ns.lab.job import METHODS, Job, Method, Plan, Settings
+from abcd_ns.lab.job import METHODS, Job, Method, Plan, Settings, TerrainJob, TerrainSettings, scene_name
 from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
 from abcd_ns.lab.runs.options import LOWEST, Flag, check_numbers, check_ranges, words
 from abcd_ns.lab.runs.runner import run_jobs, say, write_report
+from abcd_ns.units import bytes_in_words
 
 PICTURES = "pictures"
 PRICE = "training.density.price"
@@ -92,6 +93,10 @@ DEFAULTS = Options(
     max_gaussians=0,
     pictures=3,
 )
+TERRAIN_DEFAULTS = Options(methods=("abcd",), seeds=(0,), tile_gaussians=20_000, visits=3)
+TERRAIN_OPTIONS = {*TERRAIN_DEFAULTS.given, "tiles", "out"}
+BYTES_PER_GAUSSIAN = 3 * 59 * 4
+"""On disk: parameters and two moments in float32."""
 
 
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
@@ -156,24 +161,63 @@ def make_plan(options: Options) -> Plan:
     Raises:
         UserError: an option is missing, out of range or contradicts another.
     """
-    if len(options.blocks or ()) > 1 or {"prices", "vary", "tiles"} & options.given.keys():
+    if len(options.blocks or ()) > 1 or {"prices", "vary"} & options.given.keys():
         options = options.over(Options(methods=("abcd",)))
-    given = options.over(DEFAULTS)
+    given = options.over(DEFAULTS if options.tiles is None else TERRAIN_DEFAULTS)
     _check_methods(given)
     check_numbers("--seeds", given.seeds, 0)
     if given.out is None:
         raise UserError("Give the folder for the results with --out FOLDER.")
-    methods = [method for method in METHODS if method in given.methods]
+    given = dataclasses.replace(given, methods=tuple(m for m in METHODS if m in given.methods))
     if given.tiles is not None:
-        return terrain_plan(options.given, methods, given.seeds)
+        return _terrain_plan(given)
     settings, arms = _settings(given), arms_of(given)
     jobs = tuple(
         Job(method, seed, settings, changes)
         for seed in given.seeds
-        for method in methods
+        for method in given.methods
         for changes in dict.fromkeys(_for_method(changes, method, settings) for changes in arms)
     )
-    return Plan("comparison", settings, Path(given.out), jobs, _command(given, methods, settings))
+    return Plan("comparison", settings, Path(given.out), jobs, _command(given))
+
+
+def _terrain_plan(given: Options) -> Plan:
+    """Runs on terrains of so many tiles."""
+    if others := given.given.keys() - TERRAIN_OPTIONS:
+        raise UserError(f"--{min(others).replace('_', '-')} does not go with --tiles.")
+    if others := set(given.methods) - {"abcd", "abcd-monolithic"}:
+        raise UserError(f"--tiles is for abcd and abcd-monolithic, not {min(others)}.")
+    given = dataclasses.replace(given, tiles=tuple(sorted(given.tiles)))
+    if (
+        not given.tiles
+        or len(set(given.tiles)) < len(given.tiles)
+        or any(n < 1 or n & (n - 1) for n in given.tiles)
+    ):
+        raise UserError(f"--tiles {' '.join(map(str, given.tiles))}: give different powers of 2, from 1 on.")
+    check_ranges({"tile_gaussians": given.tile_gaussians, "visits": given.visits})
+    out, gaussians = Path(given.out), given.tiles[-1] * given.tile_gaussians
+    place = next(p for p in (out.resolve(), *out.resolve().parents) if p.exists())
+    needed, free = 2 * gaussians * BYTES_PER_GAUSSIAN, shutil.disk_usage(place).free
+    if needed > free:
+        raise UserError(
+            f"{place} has {bytes_in_words(free)} free, but {gaussians:,} Gaussians may take "
+            f"{bytes_in_words(needed)}; give fewer, or --out on another disk."
+        )
+    settings = TerrainSettings(given.tile_gaussians, given.visits)
+    jobs = terrain_jobs(settings, given.tiles, given.methods, given.seeds)
+    return Plan(TERRAIN, settings, out, jobs, _command(given))
+
+
+def terrain_jobs(
+    settings: TerrainSettings, tiles: Sequence[int], methods: Sequence[str], seeds: Sequence[int]
+) -> tuple[TerrainJob, ...]:
+    """The smallest first, by blocks before as one block, which may need more memory than there is."""
+    return tuple(
+        TerrainJob(method, seed, settings, (f"tiles={count}",))
+        for count in tiles
+        for method in sorted(methods)
+        for seed in seeds
+    )
 
 
 def arms_of(given: Options) -> list[tuple[str, ...]]:
@@ -274,13 +318,13 @@ def _for_method(changes: tuple[str, ...], method: str, settings: Settings) -> tu
     return changes
 
 
-def _command(given: Options, methods: Sequence[str], settings: Settings) -> str:
+def _command(given: Options) -> str:
     """The command line that makes the same, with the names of folders instead of where they are."""
-    line = ["abcd", "compare", "--data", settings.scene, "--methods", *methods, "--seeds", *given.seeds]
-    line += ["--steps", given.steps] if given.seconds is None else ["--seconds", f"{given.seconds:g}"]
-    line += ["--downscale", given.downscale, "--evals", given.evals, "--blocks", *given.blocks]
-    line += ["--prices", *(f"{price:g}" for price in given.prices)] if given.prices else []
-    line += ["--vary", *given.vary] if given.vary else []
-    line += ["--max-gaussians", given.max_gaussians] if given.max_gaussians else []
-    line += ["--no-densify"] if given.no_densify else []
-    return shlex.join(map(str, [*line, "--pictures", given.pictures, "--out", Path(given.out).name]))
+    line = ["abcd", "compare"]
+    for name, value in given.given.items():
+        if name in ("data", "out"):
+            value = scene_name(value)
+        values = [] if value is True else value if isinstance(value, tuple) else [value]
+        words = [f"{word:g}" if isinstance(word, float) else str(word) for word in values]
+        line += [f"--{name.replace('_', '-')}", *words] if value != () else []
+    return shlex.join(line)

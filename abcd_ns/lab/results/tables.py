@@ -238,8 +238,11 @@ def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: 
         shown.add_column(escape(title), justify="right" if i else "left", no_wrap=True)
     for row in body:
         shown.add_row(*map(escape, row))
+    width = console.width
     # Wider than a narrow terminal rather than with numbers cut off.
     needed = Measurement.get(console, console.options.update(width=1000), shown).maximum
-    console.print(shown, width=max(console.width, needed), crop=False)
+    console.width = max(width, needed)
+    console.print(shown)
+    console.width = width
     for remark in remarks:
         console.print(f"- {remark}", highlight=False, markup=False, emoji=False, soft_wrap=True)

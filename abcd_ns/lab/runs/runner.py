@@ -17,7 +17,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import torch
 from rich.console import Console
 
 from abcd_ns.errors import UserError
@@ -82,10 +81,13 @@ def why_left_out(job: Job, outcome: Run | Failure | None = None) -> str | None:
             return f"{job.value} tiles have more than {MOST_IN_ONE_BLOCK:,} Gaussians"
         if isinstance(outcome, Failure) and OUT_OF_MEMORY.search(outcome.reason):
             return f"as one block, {job.value} tiles ran out of GPU memory"
-    if job.method == "splatfacto" and not torch.cuda.is_available():
-        return "it needs a CUDA device, and there is none here"
-    if job.method == "splatfacto" and job.settings.max_gaussians:
-        return "it has no limit on the number of Gaussians, and this protocol sets one"
+    if job.method == "splatfacto":
+        import torch  # takes seconds, for which `--help` has no use
+
+        if not torch.cuda.is_available():
+            return "it needs a CUDA device, and there is none here"
+        if job.settings.max_gaussians:
+            return "it has no limit on the number of Gaussians, and this protocol sets one"
     return None
 
 
@@ -93,20 +95,18 @@ def gather(
     plan: Plan, found: Sequence[tuple[Job, Run | Failure]], machine: Machine, left_out: Mapping[str, str]
 ) -> Results:
     """What came of the plan's jobs, with its findings; `left_out` has reasons by method."""
-    arms: dict[tuple[str, str], Arm] = {}
+    runs: dict[tuple, list[Run]] = {(job.method, job.variant, job.value): [] for job in plan.jobs}
     for job, outcome in found:
         if isinstance(outcome, Run):
-            arm = arms.setdefault((job.method, job.variant), Arm(job.method, job.variant, job.value, ()))
-            arms[job.method, job.variant] = dataclasses.replace(arm, runs=(*arm.runs, outcome))
-    order = dict.fromkeys((job.method, job.variant) for job in plan.jobs)
+            runs[job.method, job.variant, job.value].append(outcome)
     scene = plan.settings if isinstance(plan.settings, Settings) else None
     results = new_results(
         plan.kind,
         plan.command,
         machine,
         settings=scene and dataclasses.replace(scene, data=scene.scene),
-        seeds=plan.seeds,
-        arms=tuple(arms[key] for key in order if key in arms),
+        seeds=tuple(dict.fromkeys(job.seed for job in plan.jobs)),
+        arms=tuple(Arm(*key, tuple(of)) for key, of in runs.items() if of),
         failures=tuple(outcome for _, outcome in found if isinstance(outcome, Failure)),
         left_out=tuple(LeftOut(*pair) for pair in left_out.items()),
     )

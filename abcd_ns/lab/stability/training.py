@@ -9,6 +9,7 @@ from itertools import pairwise
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool
+from torch import Tensor
 
 from abcd_ns.engine.events import Event, Mended, StepTaken, VisitEnded
 from abcd_ns.engine.layers.painter import Painter, PaintSettings

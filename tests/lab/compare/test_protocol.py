@@ -19,14 +19,6 @@ def options(scene: Path, **given) -> Options:
     return Options(**{"data": str(scene), "out": "out", "steps": 10, **given})
 
 
-def test_defaults_make_a_plan(tmp_path):
-    plan = make_plan(options(tmp_path))
-    assert plan.methods == ("abcd-monolithic", "abcd", "abcd-ablated")
-    assert [(job.method, job.seed) for job in plan.jobs] == [(method, 0) for method in plan.methods]
-    assert plan.settings.scene == tmp_path.name
-    assert (plan.settings.steps, plan.settings.seconds, plan.settings.densify) == (10, None, True)
-
-
 def test_every_method_runs_with_every_seed_in_its_own_folder(tmp_path):
     plan = make_plan(options(tmp_path, methods=("abcd", "abcd-monolithic"), seeds=(3, 1)))
     assert [(job.method, job.seed) for job in plan.jobs] == [
@@ -132,12 +124,6 @@ def test_splatfacto_has_none_of_the_options(tmp_path):
     assert [name for method, name in names_of(plan) if method == "splatfacto"] == ["default"]
 
 
-def test_more_seeds_and_arms_may_join_the_same_folder(tmp_path):
-    first, more = (make_plan(options(tmp_path, blocks=blocks)) for blocks in ((1, 2), (8, 1, 2)))
-    assert first.settings == more.settings
-    assert set(first.jobs) < set(more.jobs)
-
-
 @pytest.mark.parametrize(
     ("vary", "message"),
     [
@@ -159,11 +145,7 @@ def test_a_single_number_of_blocks_in_a_file_is_one(tmp_path):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_the_examples_make_plans(path, tmp_path):
     plan = make_plan(Options(data=str(tmp_path), out="out").over(read_options(path)))
-    assert set(plan.methods) <= set(METHODS)
-
-
-def test_there_are_examples():
-    assert "compare-castle" in [path.stem for path in CONFIGS]
+    assert {job.method for job in plan.jobs} <= set(METHODS)
 
 
 @pytest.mark.parametrize(
@@ -185,11 +167,6 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
     assert "\n" not in str(caught.value)
 
 
-def test_an_absent_file_is_refused(tmp_path):
-    with pytest.raises(UserError, match="does not exist"):
-        read_options(tmp_path / "absent.toml")
-
-
 @given(st.integers(1, 50))
 def test_moments_rise_to_the_end_of_the_run(evals):
     settings = Settings("scene", 1, 8, None, 100, evals, 0, True, 3)
@@ -197,9 +174,3 @@ def test_moments_rise_to_the_end_of_the_run(evals):
     assert list(settings.moments) == sorted(set(settings.moments))
     assert settings.moments[0] > 0
     assert settings.moments[-1] == 1
-
-
-def test_the_command_states_what_is_not_default(tmp_path):
-    plan = make_plan(options(tmp_path, max_gaussians=500, no_densify=True, seeds=(1, 2)))
-    for part in ("--steps 10", "--max-gaussians 500", "--no-densify", "--seeds 1 2", "--out out"):
-        assert part in plan.command

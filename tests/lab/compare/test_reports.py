@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.compare.charts import colors_of, draw_charts, mean_curve
 from abcd_ns.lab.compare.command import shown
 from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
@@ -60,11 +57,6 @@ def test_arms_of_one_method_are_called_by_what_is_set_and_have_their_own_shades(
     assert any(text.startswith("8 blocks  ") for text in drawn["speed_accuracy.png"])
 
 
-def test_memory_is_that_of_the_card_too_where_there_is_one(tmp_path, drawn):
-    draw_charts(made_up_results(made_up_run(peak_device_bytes=2 << 30)), tmp_path)
-    assert {"abcd, RAM", "abcd, GPU"} <= set(drawn["memory.png"])
-
-
 def test_no_run_no_chart(tmp_path):
     assert draw_charts(made_up_results(), tmp_path) == []
     assert list(tmp_path.iterdir()) == []
@@ -108,13 +100,6 @@ def test_table_has_a_column_per_method_and_a_row_per_known_measure(tmp_path):
     widths = {line.count("|") for line in lines if line.startswith("|")}
     assert widths == {4}
     assert len([line for line in lines if line.startswith("|")]) == 2 + len(body)
-
-
-def test_many_arms_have_a_row_each():
-    arms = [made_up_arm(f"blocks={n}", n, {0: 24.0}) for n in range(1, 7)]
-    titles, *body = rows(made_up("comparison", *arms))
-    assert {"PSNR, merged (dB)", "Gaussians"} <= set(titles)
-    assert [row[0] for row in body] == [f"abcd blocks={n}" for n in range(1, 7)]
 
 
 def test_changes_have_their_difference_to_the_method_as_it_is_seed_by_seed():
@@ -196,19 +181,6 @@ def test_errors_are_absolute_differences():
     assert error_map(photo, picture) == pytest.approx(expected)
     assert psnr_of(photo + np.uint8(51), photo) == pytest.approx(-20 * np.log10(0.2))
     assert psnr_of(photo, photo) == float("inf")
-
-
-@given(st.integers(1, 200), st.integers(1, 10))
-def test_shown_views_are_evenly_chosen(count, wanted):
-    chosen = evenly(range(count), wanted)
-    assert len(chosen) == len(set(chosen)) == min(count, wanted)
-    assert 0 <= chosen[0] <= chosen[-1] < count
-    gaps = np.diff([-chosen[0] - 1, *chosen, 2 * count - chosen[-1] - 1])  # mirrored at both ends
-    assert gaps.max() - gaps.min() <= 2
-
-
-def test_no_view_is_shown_where_none_is_wanted():
-    assert evenly(range(5), 0) == []
 
 
 @pytest.mark.parametrize("methods", [1, 3])

@@ -8,12 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.lab.compare.command import Options
 from abcd_ns.lab.results.records import RecordError, decode, encode, write_json
 from abcd_ns.lab.results.results import SCHEMA
 from abcd_ns.lab.results.run import CurvePoint, Run
 from abcd_ns.lab.runs.evaluate import mean, ordering_gap
-from abcd_ns.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
 from tests.lab.compare.records import made_up_results, made_up_run, read_results
 
 RUN = ("arms", 0, "runs", 0)
@@ -111,10 +109,6 @@ def test_every_field_of_a_run_is_required():
             decode(Run, {name: value for name, value in data.items() if name != field.name}, "run.json")
 
 
-def test_whole_numbers_are_numbers():
-    assert decode(Options, {"seconds": 60}, "x.toml").seconds == 60.0
-
-
 @given(st.lists(st.floats(1e-12, 1.0), min_size=1, max_size=6))
 def test_ordering_gap_is_the_psnr_of_the_mean_squared_difference(squared):
     gap, note = ordering_gap(squared, blocks=2)
@@ -133,23 +127,3 @@ def test_a_mean_with_a_missing_value_is_missing():
     assert mean([1.0, 2.0]) == 1.5
     assert mean([1.0, None]) is None
     assert mean([]) is None
-
-
-def test_this_machine_and_environment_fit_their_records():
-    for record in (describe_machine(), describe_versions()):
-        assert decode(type(record), encode(record), "") == record
-
-
-def test_peak_memory_grows_with_what_is_held():
-    before = peak_rss_bytes()
-    held = bytearray(before + (64 << 20))  # zeroed pages are not resident until they are written
-    for i in range(0, len(held), 4096):
-        held[i] = 1
-    assert peak_rss_bytes() >= before + (32 << 20)
-
-
-def test_disk_bytes_counts_what_is_there(tmp_path):
-    assert disk_bytes(tmp_path / "absent") == 0
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "data").write_bytes(b"x" * 100_000)
-    assert 100_000 <= disk_bytes(tmp_path) <= 200_000

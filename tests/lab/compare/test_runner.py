@@ -100,13 +100,6 @@ def test_a_comparison_with_a_failure_still_writes_everything(plan, worker):
     assert "PSNR" in stream.getvalue()
 
 
-def test_nothing_but_failures_is_reported_too(plan, worker):
-    worker.behave(abcd="raises", abcd_monolithic="raises")
-    assert carry_out(plan, Console(file=StringIO())) == 1
-    assert len(read_results(plan.out / "results.json").failures) == 2
-    assert not (plan.out / "speed_accuracy.png").exists()
-
-
 @pytest.mark.usefixtures("worker")
 @pytest.mark.parametrize(
     ("field", "value"),
@@ -137,14 +130,6 @@ def test_overwrite_drops_the_runs(plan, worker):
     assert worker.calls() == ["abcd-monolithic", "abcd"]
 
 
-def test_more_seeds_and_methods_may_join(plan, worker):
-    run(plan)
-    worker.calls()
-    more = [dataclasses.replace(job, seed=1) for job in plan.jobs]
-    run(dataclasses.replace(plan, jobs=(*plan.jobs, *more)))
-    assert worker.calls() == ["abcd-monolithic", "abcd"]
-
-
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_folder_of_something_else_is_left_alone(plan, overwrite):
     plan.out.mkdir()
@@ -152,12 +137,6 @@ def test_a_folder_of_something_else_is_left_alone(plan, overwrite):
     with pytest.raises(UserError, match="is not empty and holds no comparison"):
         run(plan, overwrite)
     assert [path.name for path in plan.out.iterdir()] == ["thesis.tex"]
-
-
-def test_a_file_is_no_folder(plan):
-    plan.out.write_text("")
-    with pytest.raises(UserError, match="is a file"):
-        run(plan)
 
 
 def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(plan, tmp_path):
