@@ -10,7 +10,7 @@ from PIL import Image
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.synth.command import Settings, synth
-from abcd_ns.lab.world.court import GRASS, INNER, Site, build_world, court_cameras
+from abcd_ns.lab.world.court import GRASS, Site, build_world, court_cameras
 from abcd_ns.lab.world.solids import Thing, block
 from abcd_ns.lab.world.sunlight import SunlitWorld
 
@@ -99,13 +99,6 @@ def test_points_have_the_colours_of_their_pixels(scene: Path, model: pycolmap.Re
     assert np.mean(near) < 0.4 * np.mean(far)
 
 
-def test_some_points_lie_on_the_dome_and_most_do_not(model: pycolmap.Reconstruction) -> None:
-    radius = np.array([np.linalg.norm(p.xyz) for p in model.points3D.values()])
-    on_dome = np.abs(radius - 60.0) < 0.1
-    assert 0.002 < on_dome.mean() < 0.2
-    assert radius.max() < 60.1
-
-
 def test_cameras_look_into_their_court_from_above_its_walls_and_upright(
     model: pycolmap.Reconstruction,
 ) -> None:
@@ -127,27 +120,6 @@ def test_no_camera_stands_in_anything() -> None:
     starts = torch.stack([view.center for view in views], dim=1).float()
     for direction in torch.tensor([[0.0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
         assert not bool(courts.blocked(starts, direction[:, None], 0.4).any())
-
-
-def test_neighbouring_courts_see_each_other(model: pycolmap.Reconstruction) -> None:
-    """Points inside one court, observed from the other and from its own cameras."""
-    site = Site.plan(2, "grid", 0)
-    shared = 0
-    for point in model.points3D.values():
-        courts = {int(model.images[e.image_id].name[5:8]) for e in point.track.elements}
-        inside = min(np.abs(point.xyz - site.center(k))[:2].max() for k in range(2)) < INNER
-        shared += inside and len(courts) == 2
-    assert shared >= 10
-
-
-def test_pictures_are_of_things_and_not_noise(scene: Path) -> None:
-    """White noise of the same variance has a squared difference between neighbours of twice its variance."""
-    for path in (scene / "images").iterdir():
-        grey = picture(scene, path.name).mean(axis=2)
-        assert 20 < grey.mean() < 235
-        assert grey.std() > 10
-        steps = np.mean(np.diff(grey, axis=0) ** 2) + np.mean(np.diff(grey, axis=1) ** 2)
-        assert steps / 2 < 0.5 * 2 * grey.var()
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

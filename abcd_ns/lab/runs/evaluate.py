@@ -12,9 +12,8 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.render.loss import psnr
-from abcd_ns.engine.types import Gaussians, Layer
+from abcd_ns.engine.types import Layer
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.nerfstudio.metrics import image_metrics
 from abcd_ns.nerfstudio.model import AbcdModel
@@ -49,13 +48,6 @@ def held_out_views(pipeline: VanillaPipeline) -> Iterator[HeldOutView]:
     for row, (camera, batch) in enumerate(pipeline.datamanager.fixed_indices_eval_dataloader):
         photo = model.composite_with_background(model.get_gt_img(batch["image"]), background)
         yield HeldOutView(row, dataset.image_filenames[row].name, camera, photo)
-
-
-def everything(model: SplatfactoModel) -> Gaussians:
-    """All Gaussians of a trained model, in RAM."""
-    if isinstance(model, AbcdModel):
-        return model.merged()
-    return live_gaussians(model.gauss_params).detach().to("cpu")
 
 
 def draw_merged(model: SplatfactoModel, camera: Cameras) -> Picture:

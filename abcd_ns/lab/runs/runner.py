@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.job import Job, Plan, Settings, TerrainJob
@@ -34,9 +34,6 @@ from abcd_ns.machine import (
 )
 
 JOB_FILE, LOG_FILE, RUN_FILE = "job.json", "log.txt", "run.json"
-POLL_SECONDS = 0.2
-SECONDS_BETWEEN_LINES = 30.0
-"""Where the output is no terminal, a line says this often that a run is still going on."""
 OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")
 """How torch and CUDA say it, in the last line of a log."""
 MOST_IN_ONE_BLOCK = 4_000_000
@@ -204,7 +201,8 @@ def finish_job(job: Job, out: Path, console: Console, head: str) -> Run | Failur
     """The job's run, made now if no earlier call did; `head` begins every line about it."""
     outcome, how = finished_run(job, out), "reused, "
     if outcome is None:
-        outcome, how = run_job(job, out, console, head), ""
+        with console.status(f"{escape(head)}; log: {escape(str(job.folder(out) / LOG_FILE))}"):
+            outcome, how = run_job(job, out), ""
     say(console, f"{head}: {how}{_short(outcome)}")
     return outcome
 
@@ -214,32 +212,28 @@ def command_of(job: Job) -> tuple[str, ...]:
     return (sys.executable, "-m", job.worker)
 
 
-def run_job(job: Job, out: Path, console: Console, head: str) -> Run | Failure:
-    """Start the job's process and wait for it."""
+def run_job(job: Job, out: Path) -> Run | Failure:
+    """Start the job's process and wait for it; Ctrl-C ends it, too."""
     folder = job.folder(out)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     write_json(folder / JOB_FILE, encode(job))
     log = folder / LOG_FILE
-    with open(log, "wb") as stream:
-        process = subprocess.Popen(
-            [*command_of(job), str(folder / JOB_FILE)],
-            stdin=subprocess.DEVNULL,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb"},
-        )
-        try:
-            _wait(process, log, console, head)
-        finally:
-            if process.poll() is None:  # Ctrl-C
-                process.terminate()
-                process.wait()
-            for name in job.scratch:
-                shutil.rmtree(folder / name, ignore_errors=True)
-    run = finished_run(job, out) if process.returncode == 0 else None
-    reason = _reason(process.returncode, log)
-    return run or Failure(job.method, job.seed, reason, str(log.relative_to(out)), job.variant)
+    try:
+        with open(log, "wb") as stream:
+            code = subprocess.run(
+                [*command_of(job), str(folder / JOB_FILE)],
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb"},
+                check=False,
+            ).returncode
+    finally:
+        for name in job.scratch:
+            shutil.rmtree(folder / name, ignore_errors=True)
+    run = finished_run(job, out) if code == 0 else None
+    return run or Failure(job.method, job.seed, _reason(code, log), str(log.relative_to(out)), job.variant)
 
 
 def last_line(log: Path) -> str:
@@ -248,19 +242,6 @@ def last_line(log: Path) -> str:
         stream.seek(max(0, log.stat().st_size - 8192))
         lines = stream.read().decode("utf-8", "replace").replace("\r", "\n").splitlines()
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
-
-
-def _wait(process: subprocess.Popen, log: Path, console: Console, head: str) -> None:
-    began = told = time.monotonic()
-    with console.status(head) as status:
-        while process.poll() is None:
-            time.sleep(POLL_SECONDS)
-            now = time.monotonic()
-            text = f"{head}: {now - began:.0f} s  {last_line(log)[:80]}"
-            status.update(text.replace("[", r"\["))
-            if not console.is_terminal and now - told > SECONDS_BETWEEN_LINES:
-                told = now
-                say(console, text)
 
 
 def _reason(code: int, log: Path) -> str:

@@ -18,24 +18,18 @@ from PIL import Image
 from torch import Tensor
 
 from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitEnded
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.formats.sizes import MOST_AT_ONCE, ply_bytes, spz_bytes
 from abcd_ns.lab.job import Job, Settings
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.evaluate import (
-    draw_held_out,
-    everything,
-    mean,
-    mean_psnr,
-    ordering_gap,
-    score,
-    squared_gap,
-)
+from abcd_ns.lab.runs.evaluate import draw_held_out, mean, mean_psnr, ordering_gap, score, squared_gap
 from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.machine import describe_versions, disk_bytes, without_home
 from abcd_ns.nerfstudio.metrics import lpips_missing
+from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
@@ -188,7 +182,9 @@ def file_bytes(training: Training) -> dict[str, int | None]:
     """Of the scene as files; nothing where RAM should not hold it twice."""
     if training.gaussians > MOST_AT_ONCE:
         return {}
-    scene = everything(training.pipeline.model)
+    model = training.pipeline.model
+    ours = isinstance(model, AbcdModel)
+    scene = model.merged() if ours else live_gaussians(model.gauss_params).detach().to("cpu")
     return {"ply_bytes": ply_bytes(scene), "spz_bytes": spz_bytes(scene)}
 
 

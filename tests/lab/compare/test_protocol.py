@@ -137,11 +137,6 @@ def test_changes_that_cannot_be_trained_are_refused(tmp_path, vary, message):
         check_options(make_plan(options(tmp_path, vary=(vary,))).jobs[1])
 
 
-def test_a_single_number_of_blocks_in_a_file_is_one(tmp_path):
-    (tmp_path / "compare.toml").write_text("blocks = 3")
-    assert read_options(tmp_path / "compare.toml").blocks == (3,)
-
-
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_the_examples_make_plans(path, tmp_path):
     plan = make_plan(Options(data=str(tmp_path), out="out").over(read_options(path)))

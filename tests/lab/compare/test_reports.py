@@ -16,7 +16,7 @@ from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_m
 from abcd_ns.lab.job import METHODS, Job, Plan
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.results.style import COLORS, MARKERS
-from abcd_ns.lab.results.tables import MEASURES, cell, notes, print_rows, rows, write_table
+from abcd_ns.lab.results.tables import notes, print_rows, rows, write_table
 from tests.lab.compare.records import made_up, made_up_arm, made_up_results, made_up_run
 
 # The charts
@@ -135,13 +135,6 @@ def test_a_method_with_several_arms_has_its_best_and_worst_and_the_fewest_gaussi
     ):
         assert part in finding
     assert made_up("comparison", arms[0]).findings == ()
-
-
-def test_several_seeds_give_mean_and_deviation():
-    psnr = next(measure for measure in MEASURES if measure.title.startswith("PSNR, composited"))
-    runs = [made_up_run(seed=seed, psnr=value + 0.1) for seed, value in enumerate((20.0, 22.0, 24.0))]
-    assert cell(runs, psnr) == "22.00 ± 2.00"
-    assert cell(runs[:1], psnr) == "20.00"
 
 
 def test_terminal_shows_whole_numbers_however_narrow_it_is():

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -89,6 +90,13 @@ def test_a_file_that_does_not_fit_is_refused_by_field(tmp_path, steps, change, m
         read_results(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+def test_what_the_documents_rest_on_is_still_read():
+    stored = (Path(__file__).resolve().parents[3] / "docs" / "results").rglob("*.json")
+    paths = [path for path in stored if json.loads(path.read_text()).get("schema") == SCHEMA]
+    assert all(read_results(path).command.startswith("abcd ") for path in paths)
+    assert "stability" in {path.parent.name for path in paths}
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "3"])
