@@ -8,8 +8,8 @@ tests/reference/simulated_device.py), and counts. Nothing is downloaded and no G
 A wait is a point where the host can launch nothing before the device is done; copies that block are waits,
 too. A launch is one operation of torch's, or one function of gsplat's, which may be several kernels on CUDA.
 Plain steps neither grow nor prune; a visit's beginning and end are counted apart. Layer copies are those of
-layers that are kept and read back. Peak bytes are of live tensors. There are no seconds of an accelerator here.
-Counts of waits and launches hardly depend on the scene's size; bytes do.
+layers that are kept and read back. Peak bytes are of live tensors. Counts of waits and launches hardly depend on
+the scene's size; bytes do.
 """
 
 import json
@@ -38,7 +38,6 @@ from tests.reference.simulated_device import DEVICE, simulated_device
 
 GROWS = DensityConfig(refine_start=0.0, refine_stop=1.0, refine_every=4, split_pixels=0.0)
 """Refines often, so that steps that do are among those counted."""
-MOST_PLACES = 12
 
 
 @dataclass
@@ -166,9 +165,6 @@ def summary(watch: Watch, visits: int) -> dict[str, Any]:
         "waits_per_step_by_operation": {
             name: round(count / taken, 2) for name, count in steps.waits.most_common() if count
         },
-        "waits_per_step_by_place": {
-            name: round(count / taken, 2) for name, count in steps.places.most_common(MOST_PLACES)
-        },
     }
 
 
@@ -196,7 +192,6 @@ def main(args: Args) -> None:
     print(markdown(rows))
     for each in runs:
         print(f"\nWaits of a step with {each['blocks']}: {each['waits_per_step_by_operation']}")
-        print(f"at: {each['waits_per_step_by_place']}")
     scene_of = {"views": args.views, "width": args.width, "gaussians": args.gaussians, "seed": args.seed}
     result = {"runs": runs, "scene": scene_of, "versions": asdict(describe_versions())}
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from rich.console import Console
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import encode, read_json, write_json
 from abcd_ns.lab.results.results import Arm
-from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part
-from benchmarks.gpu.charts import draw
+from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part, show
 from tests.lab.compare.records import made_up, made_up_run
 from tests.reference.colmap_scene import write_scene
 
@@ -137,7 +137,7 @@ def test_a_comparison_without_a_scene_is_refused(tmp_path):
         main(Args(out=tmp_path / "out", dry_run=True))
 
 
-def test_every_record_is_drawn(tmp_path):
+def test_every_record_is_shown(tmp_path, capsys):
     memory = {"peak_device_bytes": 2 * GIB, "peak_reserved_bytes": 3 * GIB, "peak_device_note": None}
     variants = {"splatfacto": "default", "abcd-monolithic": "default"}
     arms = [*variants.items(), ("abcd", "blocks=1"), ("abcd", "blocks=8")]
@@ -146,12 +146,10 @@ def test_every_record_is_drawn(tmp_path):
         for k, (method, variant) in enumerate(arms)
     ]
     found = {"results": encode(made_up("GPU comparison", *arms))}
-    records = [
-        WHOLE,
-        WHOLE | {"part": "compare", "found": found},
-    ]
-    paths = draw(records, tmp_path)
-    assert [path.name for path in paths] == ["compare-speed_accuracy.png", "compare-memory.png"]
+    show([WHOLE, WHOLE | {"part": "compare", "found": found}], tmp_path, Console())
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"compare-speed_accuracy.png", "compare-memory.png"}
+    assert "splatfacto" in capsys.readouterr().out
 
 
 @pytest.mark.cli

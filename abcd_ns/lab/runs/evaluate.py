@@ -57,13 +57,6 @@ def draw_merged(model: SplatfactoModel, camera: Cameras) -> Picture:
     return model.get_outputs_for_camera(camera)["rgb"]
 
 
-def draw_composited(model: SplatfactoModel, camera: Cameras) -> Picture:
-    """Block by block, through layers; a model without blocks has one way to be drawn only."""
-    if isinstance(model, AbcdModel):
-        return _on_background(model.draw_composited(model.view(camera)), model)
-    return draw_merged(model, camera)
-
-
 def mean_psnr(pipeline: VanillaPipeline) -> float:
     """Mean over the held-out views of the merged pictures' PSNR, dB."""
     with undisturbed(pipeline):
@@ -73,27 +66,24 @@ def mean_psnr(pipeline: VanillaPipeline) -> float:
 
 
 def draw_held_out(pipeline: VanillaPipeline, rows: Collection[int] | None = None) -> Iterator[Drawn]:
-    """Every held-out view, or those at `rows`, drawn both ways, in the order of the rows."""
+    """Every held-out view, or those at `rows`, in the order of the rows: all Gaussians at once, and block by
+    block. For a model without blocks both are the same picture."""
     model = pipeline.model
     with undisturbed(pipeline):
         for view in held_out_views(pipeline):
             if rows is None or view.row in rows:
-                yield Drawn(view, draw_merged(model, view.camera), draw_composited(model, view.camera))
+                merged = composited = draw_merged(model, view.camera)
+                if isinstance(model, AbcdModel):
+                    composited = _on_background(model.draw_composited(model.view(view.camera)), model)
+                yield Drawn(view, merged, composited)
 
 
 def score(drawn: Drawn) -> ViewScore:
     """How close both pictures come to the photo."""
-    photo = drawn.view.photo
-    composited, merged = image_metrics(drawn.composited, photo), image_metrics(drawn.merged, photo)
-    return ViewScore(
-        row=drawn.view.row,
-        name=drawn.view.name,
-        psnr=composited["psnr"],
-        ssim=composited.get("ssim"),
-        lpips=composited.get("lpips"),
-        psnr_merged=merged["psnr"],
-        ssim_merged=merged.get("ssim"),
-    )
+    view = drawn.view
+    composited, merged = (image_metrics(p, view.photo) for p in (drawn.composited, drawn.merged))
+    scores = (composited["psnr"], composited.get("ssim"), composited.get("lpips"))
+    return ViewScore(view.row, view.name, *scores, merged["psnr"], merged.get("ssim"))
 
 
 def squared_gap(drawn: Drawn) -> float:
