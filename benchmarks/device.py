@@ -8,8 +8,7 @@ tests/reference/simulated_device.py), and counts. Nothing is downloaded and no G
 A wait is a point where the host can launch nothing before the device is done; copies that block are waits,
 too. A launch is one operation of torch's, or one function of gsplat's, which may be several kernels on CUDA.
 Plain steps neither grow nor prune; a visit's beginning and end are counted apart. Layer copies are those of
-layers that are kept and read back. Peak bytes are of live tensors. Counts of waits and launches hardly depend on
-the scene's size; bytes do.
+layers that are kept and read back. Peak bytes are of live tensors. Counts hardly depend on the scene's size.
 """
 
 import json
@@ -146,7 +145,7 @@ def run(args: Args, blocks: int, folder: Path) -> dict[str, Any]:
                 watch.take_step(coordinator, photos)
         found = {"blocks": blocks, **summary(watch, max(coordinator.state.visit, 1))}
         found |= {"gaussians": coordinator.count(), "views_in_a_step": coordinator.batch}
-        found |= {"peak_bytes": counts.peak_bytes, "ownership": coordinator.config.recipe.ownership}
+        found["peak_bytes"] = counts.peak_bytes
         coordinator.close()
     return found
 
@@ -190,8 +189,6 @@ def main(args: Args) -> None:
     rows = [["a step", *(f"{each['blocks']} block{'s' * (each['blocks'] > 1)}" for each in runs)]]
     rows += [[title, *(f"{each[key]:,.1f}" for each in runs)] for key, title in COLUMNS.items()]
     print(markdown(rows))
-    for each in runs:
-        print(f"\nWaits of a step with {each['blocks']}: {each['waits_per_step_by_operation']}")
     scene_of = {"views": args.views, "width": args.width, "gaussians": args.gaussians, "seed": args.seed}
     result = {"runs": runs, "scene": scene_of, "versions": asdict(describe_versions())}
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -2,9 +2,8 @@
 
     python -m benchmarks.gpu --data DIR --out OUT
 
-Each part has a share of the time, runs in a process of its own, and is killed with all it started when its
-time is over. OUT gets a JSON file for each part and charts. A part whose file is there and whole is not run
-again; one that failed or was killed is, and goes on from the runs that it had finished.
+Each part has a share of the time and a process of its own, which is killed when its time is over. OUT gets a
+JSON file for each part and charts. A part that is there and whole is not run again.
 """
 
 import os

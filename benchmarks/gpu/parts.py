@@ -99,16 +99,9 @@ def build(_: Task) -> Iterator[Found]:
 def compare(task: Task, by_steps: bool) -> Iterator[Found]:
     """Every method on the scene, under the protocol of `abcd compare`, at equal time or at equal steps."""
     size = task.size
-    given = Options(
-        data=task.data,
-        methods=size.methods,
-        seeds=(task.seed,),
-        evals=6,
-        pictures=0,
-        out=task.work,
-        **({"steps": size.steps} if by_steps else {"seconds": size.seconds}),
-    )
-    plan = make_plan(given)
+    budget = {"steps": size.steps} if by_steps else {"seconds": size.seconds}
+    shared = {"data": task.data, "out": task.work, "seeds": (task.seed,), "evals": 6, "pictures": 0}
+    plan = make_plan(Options(methods=size.methods, **shared, **budget))
     arms = [(job.method, ()) for job in plan.jobs]
     arms += [("abcd", (f"blocks={count}",)) for count in size.blocks]
     jobs = tuple(ScoredJob(method, task.seed, plan.settings, changes) for method, changes in arms)
