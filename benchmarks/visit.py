@@ -2,8 +2,8 @@
 
     python -m benchmarks.visit --data DIR --downscale 4
 
-Stages are summed over the second half of each run, per view drawn in it. On a CUDA device each stage ends when
-the device is done. That makes steps slower: their sum is no training time.
+Stages are summed over the second half of each run, per view drawn in it. On a CUDA device each stage ends
+when the device is done. That makes steps slower: their sum is no training time.
 """
 
 import tempfile

@@ -100,19 +100,15 @@ def _of_arms(arms: Sequence[Arm], labels: Mapping[str, str]) -> str:
 
 
 def _of_growth(results: Results) -> tuple[str, ...]:
-    arms, ram = results.of("abcd"), growth(results, "peak_rss_bytes")
-    if ram is None:
+    """Of ABCD's peak memory, from the smallest terrain to the largest."""
+    arms, said = results.of("abcd"), []
+    for name, field in (("peak RAM grows", "peak_rss_bytes"), ("GPU memory", "peak_device_bytes")):
+        sizes = [getattr(arm.runs[0], field) for arm in arms]
+        said += [f"{name} by {sizes[-1] / sizes[0] - 1:.1%}"] if all(sizes) else []
+    if len(arms) < 2:
         return ()
-    device = growth(results, "peak_device_bytes")
-    more = "" if device is None else f", GPU memory by {device:.1%}"
-    sizes = f"From {arms[0].value} to {arms[-1].value} blocks of ABCD"
-    return (f"{sizes}, peak RAM grows by {ram:.1%}{more}; allowed: {GOAL_GROWTH:.0%}.",)
-
-
-def growth(results: Results, field: str) -> float | None:
-    """A field of ABCD's runs, largest terrain by smallest, less 1; None where fewer than two are known."""
-    sizes = [getattr(arm.runs[0], field) for arm in results.of("abcd")]
-    return sizes[-1] / sizes[0] - 1 if len(sizes) > 1 and sizes[0] and sizes[-1] else None
+    grown = f"From {arms[0].value} to {arms[-1].value} blocks of ABCD, {', '.join(said)}"
+    return (f"{grown}; allowed: {GOAL_GROWTH:.0%}.",)
 
 
 def cell(runs: Sequence[Run], measure: Measure) -> str:

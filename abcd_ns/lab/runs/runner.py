@@ -50,8 +50,7 @@ def run_jobs(plan: Plan, console: Console, overwrite: bool = False) -> Iterator[
         UserError: the folder holds something else, or runs that cannot be compared with these.
     """
     machine, found, left_out = describe_machine(), [], {}
-    shared = {"settings": dataclasses.asdict(plan.settings), "machine": dataclasses.asdict(machine)}
-    claim(plan.out, plan.kind, shared, overwrite)
+    claim(plan.out, plan.kind, {**encode(plan.settings), **encode(machine)}, overwrite)
     for number, job in enumerate(plan.jobs, start=1):
         if job.method in left_out:
             continue
@@ -133,7 +132,7 @@ def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = Fal
 
     Args:
         kind: of the experiment, in words.
-        shared: what all its runs have in common, by part and name: values of JSON's.
+        shared: what all its runs have in common, by name: values of JSON's.
         overwrite: drop the runs that are there.
 
     Raises:
@@ -144,7 +143,13 @@ def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = Fal
         if take_folder(out, marker, kind) and overwrite:
             shutil.rmtree(out / "runs", ignore_errors=True)
         elif marker.exists():
-            _check_same(read_json(marker), shared, out)
+            theirs = read_json(marker)
+            for name, new in shared.items():
+                if (old := theirs.get(name) if isinstance(theirs, dict) else None) != new:
+                    raise UserError(
+                        f"--out {out} holds runs with {name} {old}, not {new}, which cannot be "
+                        "compared; name another folder, or drop them with --overwrite."
+                    )
         write_json(marker, dict(shared))
 
 
@@ -173,17 +178,6 @@ def take_folder(out: Path, marker: Path, kind: str) -> bool:
         raise UserError(f"{out} is not empty and holds no {kind}; name another folder.")
     out.mkdir(parents=True, exist_ok=True)
     return marker.exists()
-
-
-def _check_same(theirs: Any, mine: Mapping[str, Any], out: Path) -> None:
-    for part, values in mine.items():
-        for name, new in values.items():
-            old = theirs.get(part, {}).get(name) if isinstance(theirs, dict) else None
-            if old != new:
-                raise UserError(
-                    f"--out {out} holds runs with {name} {old}, not {new}, which cannot be "
-                    "compared; name another folder, or drop them with --overwrite."
-                )
 
 
 def finished_run(job: Job, out: Path) -> Run | None:

@@ -88,9 +88,12 @@ def make_scene(job: TerrainJob, land: Land, folder: Path) -> StoredScene:
     whole = job.method == "abcd-monolithic"
     tree = build_kd(torch.zeros(0, 3), 1) if whole else land.tree()
     store = ParameterStore.create(folder, {"tree": tree.to_json()})
-    for block, tiles in enumerate([range(land.tiles)] if whole else [[tile] for tile in land.tile_of(tree)]):
-        gaussians = Gaussians.cat([land.make_tile(tile) for tile in tiles])
-        store.commit({block: BlockState.fresh(gaussians).packed()})
+    if whole:
+        everything = Gaussians.cat([land.make_tile(tile) for tile in range(land.tiles)])
+        store.commit({0: BlockState.fresh(everything).packed()})
+        return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
+    for tile, block in enumerate(tree.assign(land.middles).tolist()):
+        store.commit({block: BlockState.fresh(land.make_tile(tile)).packed()})
     return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
 
 

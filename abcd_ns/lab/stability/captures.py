@@ -7,7 +7,6 @@ from statistics import mean
 
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from abcd_ns.engine.gaussians.initialize import random_points
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -35,22 +34,16 @@ MARGIN = 0.3
 """dB that a fault may cost ABCD more than one block."""
 
 
-def random_turn(degrees: float, generator: torch.Generator) -> Tensor:
-    """[3, 3] a rotation by a normally distributed angle about a random axis."""
-    axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
-    angle = math.radians(degrees) * float(torch.randn((), generator=generator))
-    return torch.from_numpy(Rotation.from_rotvec(angle * axis.numpy()).as_matrix())
-
-
 def with_noisy_poses(stage: Stage) -> Stage:
-    """The same photos, under poses that are off; those of the held-out views are right."""
-    generator = torch.Generator().manual_seed(0)
+    """The same photos, under poses that are off, turned about random axes; those held out are right."""
+    draw = {"generator": torch.Generator().manual_seed(0), "dtype": torch.float64}
 
     def move(view: View) -> View:
-        turn = random_turn(TURN_DEGREES, generator)
+        axis = torch.nn.functional.normalize(torch.randn(3, **draw), dim=0)
+        angle = math.radians(TURN_DEGREES) * float(torch.randn((), generator=draw["generator"]))
         matrix = view.viewmat.double().clone()
-        matrix[:3] = turn @ matrix[:3]
-        matrix[:3, 3] += SHIFT * torch.randn(3, generator=generator, dtype=torch.float64)
+        matrix[:3] = torch.from_numpy(Rotation.from_rotvec(angle * axis.numpy()).as_matrix()) @ matrix[:3]
+        matrix[:3, 3] += SHIFT * torch.randn(3, **draw)
         return replace(view, viewmat=matrix.float())
 
     return replace(stage, views=[move(view) for view in stage.views])

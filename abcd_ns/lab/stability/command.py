@@ -54,8 +54,8 @@ def stability(
     check_ranges({"seed": seed}, low=0)
     names = sorted({name.upper() for name in only})
     chosen, console, outcomes = choose(names), Console(), []
-    shared = {"scenarios": {"only": names, "quick": quick, "seed": seed}}
-    claim(out, KIND, shared, overwrite)  # only now: what is refused takes no folder
+    # Only now: what is refused takes no folder.
+    claim(out, KIND, {"only": names, "quick": quick, "seed": seed}, overwrite)
     line = ["abcd", "stability", *(["--only", *names] if names else []), *(["--quick"] if quick else [])]
     command = shlex.join([*line, "--seed", str(seed), "--out", out.resolve().name])
     blank = new_results(KIND, command, describe_machine())
@@ -65,9 +65,8 @@ def stability(
     ):
         lab = Lab(Path(folder), quick=quick, seed=seed)
         for scenario in chosen:
-            outcomes.append(examine(lab, scenario))
+            outcomes.append(examine(lab, scenario, console))
             bar.advance()
-            print_outcome(outcomes[-1], console)
             results = replace(blank, outcomes=tuple(outcomes))
             paths = write_report(replace(results, findings=findings_of(results)), out)
     for text in (*paths, headline(outcomes)):
@@ -86,20 +85,16 @@ def choose(only: Sequence[str]) -> list[Scenario]:
     return [scenario for name, scenario in SCENARIOS.items() if not only or name in only]
 
 
-def examine(lab: Lab, scenario: Scenario) -> Outcome:
-    """Carry out one scenario."""
+def examine(lab: Lab, scenario: Scenario, console: Console) -> Outcome:
+    """Carry out one scenario, and print what it found."""
     torch.manual_seed(0)
     began = time.perf_counter()
     found = scenario.run(lab)
     seconds = round(time.perf_counter() - began, 1)
+    word = "pass" if found.passed else "FAIL"
+    say(console, f"{scenario.id:>4}  {word}  {scenario.fails}  ({seconds:.0f} s)")
+    for method, said in found.said.items():
+        say(console, f"            {method}: {said}")
     asked = (scenario.id, scenario.fails, scenario.done, scenario.rule)
     numbers = {name: float(value) for name, value in found.numbers.items()}
     return Outcome(*asked, found.passed, found.worse, found.said, numbers, seconds)
-
-
-def print_outcome(outcome: Outcome, console: Console) -> None:
-    """A scenario's lines in the terminal."""
-    word = "pass" if outcome.passed else "FAIL"
-    say(console, f"{outcome.id:>4}  {word}  {outcome.fails}  ({outcome.seconds:.0f} s)")
-    for method, said in outcome.said.items():
-        say(console, f"            {method}: {said}")

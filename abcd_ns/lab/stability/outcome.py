@@ -37,8 +37,3 @@ class Scenario:
 def scenario(id: str, fails: str, done: str, rule: str) -> Callable[[Callable[[Lab], Finding]], Scenario]:
     """Makes a scenario of the function that carries it out."""
     return lambda run: Scenario(id, fails, done, rule, run)
-
-
-def db(value: float) -> str:
-    """In decibels, with two digits."""
-    return f"{value:.2f} dB"

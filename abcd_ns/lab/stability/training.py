@@ -1,10 +1,9 @@
 """A3, A5 to A7, A13, A14, A19: giants, growth, old layers, seams, the number of blocks."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
+from statistics import mean
 
 import torch
 import torch.nn.functional as F
@@ -26,7 +25,7 @@ from abcd_ns.engine.train.memory import OutOfRoomError, check_room
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.types import Gaussians, View
 from abcd_ns.lab.stability.lab import BLOCKS, BUDGET, METHODS, PAIR, Lab, Stage, Trained, make_stage
-from abcd_ns.lab.stability.outcome import Finding, db, scenario
+from abcd_ns.lab.stability.outcome import Finding, scenario
 from abcd_ns.lab.world.world import Surfaces, Wall, World, camera, ring
 
 SIGMAS = (1.0, 3.0, 10.0)
@@ -232,17 +231,6 @@ class OldNeighbours:
         return self._seen
 
 
-def stale_coordinator(run: TrainingRun, every: int) -> Coordinator:
-    """Shows blocks to each other as they were up to `every` visits ago; no Gaussian may be added or go."""
-    return Coordinator(run, source=LayerSource(run, around=OldNeighbours(run, every)))
-
-
-def share_rising(errors: Sequence[float]) -> float:
-    """The share of visits that raised the objective."""
-    rises = [after > (1 + RISES_BY) * before for before, after in pairwise(errors)]
-    return sum(rises) / len(rises)
-
-
 @scenario(
     "A13",
     "old layers oscillate and diverge",
@@ -255,12 +243,16 @@ def old_layers(lab: Lab) -> Finding:
     usual = {"budget": lab.views_drawn(BUDGET // 2), "warmup": 0.0, "heal": False, "passes": 2}
     usual["density"] = DensityConfig(strategy="off")
     for name, every in (("abcd", 1), ("once a sweep", BLOCKS)):
-        kind = partial(stale_coordinator, every=every)
-        coordinator = lab.coordinator(stage.start(), stage.views, kind=kind, **usual)
-        rising = share_rising(objectives(lab, stage, coordinator))
+
+        def stale(run: TrainingRun, every: int = every) -> Coordinator:
+            return Coordinator(run, source=LayerSource(run, around=OldNeighbours(run, every)))
+
+        coordinator = lab.coordinator(stage.start(), stage.views, kind=stale, **usual)
+        errors = objectives(lab, stage, coordinator)
+        rising = mean(after > (1 + RISES_BY) * before for before, after in pairwise(errors))
         score = lab.score(coordinator, stage)
         numbers |= {f"rising {name}": rising, f"psnr {name}": score}
-        said[name] = f"{rising:.0%} of visits raised the objective, {db(score)}"
+        said[name] = f"{rising:.0%} of visits raised the objective, {score:.2f} dB"
     return Finding(numbers["rising abcd"] <= VISITS_RISING, said, numbers)
 
 
@@ -336,6 +328,6 @@ def blocks_and_cuts(lab: Lab) -> Finding:
     gap = max(psnrs.values()) - min(psnrs.values())
     behind = psnrs["1 block"] - min(psnrs.values())
     said = {"abcd": ", ".join(f"{name} {value:.2f}" for name, value in psnrs.items()) + " dB"}
-    said["abcd-monolithic"] = db(psnrs["1 block"])
+    said["abcd-monolithic"] = f"{psnrs['1 block']:.2f} dB"
     numbers = {**{f"psnr {name}": value for name, value in psnrs.items()}, "best to worst": gap}
     return Finding(gap <= CLIFF_DB, said, numbers, worse=behind > 0)
