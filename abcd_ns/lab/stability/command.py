@@ -32,19 +32,16 @@ def stability(
     *,
     out: Path,
     only: Annotated[tuple[str, ...], words("A3 A5 ...")] = (),
-    quick: Flag = False,
     seed: Number = 0,
     overwrite: Flag = False,
 ) -> int:
     """Make small scenes that make methods fail, and see what ABCD, its ablation and one block do there.
 
-    All methods draw the same number of views. OUT gets results.json and table.md. Needs no GPU and no data;
-    some 10 minutes on two cores.
+    All methods draw the same number of views. OUT gets results.json and table.md. Needs no GPU and no data.
 
     Args:
         out: Folder for the results; absent, empty, or one of an earlier call.
         only: Scenarios to carry out, by id.
-        quick: A third of the training: to see that everything works. Its rules may fail.
         seed: Of every training.
         overwrite: Replace what OUT holds of other scenarios or seed.
 
@@ -55,15 +52,15 @@ def stability(
     names = sorted({name.upper() for name in only})
     chosen, console, outcomes = choose(names), Console(), []
     # Only now: what is refused takes no folder.
-    claim(out, KIND, {"only": names, "quick": quick, "seed": seed}, overwrite)
-    line = ["abcd", "stability", *(["--only", *names] if names else []), *(["--quick"] if quick else [])]
+    claim(out, KIND, {"only": names, "seed": seed}, overwrite)
+    line = ["abcd", "stability", *(["--only", *names] if names else [])]
     command = shlex.join([*line, "--seed", str(seed), "--out", out.resolve().name])
     blank = new_results(KIND, command, describe_machine())
     with (
         tempfile.TemporaryDirectory(prefix="abcd-stability-") as folder,
         ProgressBar("Scenarios", len(chosen), console) as bar,
     ):
-        lab = Lab(Path(folder), quick=quick, seed=seed)
+        lab = Lab(Path(folder), seed)
         for scenario in chosen:
             outcomes.append(examine(lab, scenario, console))
             bar.advance()

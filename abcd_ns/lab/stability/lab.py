@@ -3,7 +3,6 @@
 import math
 import tempfile
 from bisect import bisect_left
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from abcd_ns.engine.events import Event
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
@@ -31,7 +29,6 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import views_per_step, warm_up_is_over
-from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring
@@ -66,10 +63,6 @@ class Stage:
         """The training loop's photo reader."""
         return self.photos[index][crop.slices]
 
-    def target(self, sample: Sample) -> Target:
-        """What a sample is trained on."""
-        return sample.reduced(self(sample.view.index, sample.source)), None
-
     def start(self) -> Gaussians:
         """The first Gaussians."""
         return gaussians_from_points(self.points.float(), self.colors, sh_degree=SH_DEGREE)
@@ -101,7 +94,6 @@ class Trained:
     coordinator: Coordinator
     psnr: float
     """Held-out, dB."""
-    events: list[Event]
     counts: list[int]
     """Gaussians in the scene after each step."""
 
@@ -115,20 +107,12 @@ class Lab:
     """Where scenarios are carried out: a folder for stores, and a rasterizer.
 
     Args:
-        use_native: see TorchRasterizer; False where last bits must not depend on the machine.
-        quick: a third of the work, to see that everything runs.
         seed: of every training that names none.
     """
 
-    def __init__(self, folder: Path, *, use_native: bool = True, quick: bool = False, seed: int = 0) -> None:
-        self.quick, self.seed = quick, seed
-        self.rasterizer = TorchRasterizer(use_native=use_native)
-        self._folder = folder
+    def __init__(self, folder: Path, seed: int = 0) -> None:
+        self.seed, self._folder, self.rasterizer = seed, folder, TorchRasterizer()
         self._scores: dict[tuple[str, Method], float] = {}
-
-    def views_drawn(self, usual: int) -> int:
-        """The budget of a run, in views."""
-        return usual // 3 if self.quick else usual
 
     def coordinator(
         self,
@@ -139,14 +123,12 @@ class Lab:
         budget: int,
         blocks: int = BLOCKS,
         tree: BlockTree | None = None,
-        kind: Callable[[TrainingRun], Coordinator] = Coordinator,
         **training: Any,
     ) -> Coordinator:
         """A coordinator over a new store.
 
         Args:
             budget: views drawn in the whole run; every method gets as many, in steps of as many as it takes.
-            kind: makes it of a run.
             training: options of TrainingConfig.
         """
         usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": start.sh_degree}
@@ -164,7 +146,9 @@ class Lab:
         waiting = 0 if keep is None else max(len(start) - keep, 0)
         steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), waiting))
         live = nothing_live(start.sh_degree)
-        return kind(TrainingRun(config, steps, StoredScene(tree, store), views, self.rasterizer, *live))
+        return Coordinator(
+            TrainingRun(config, steps, StoredScene(tree, store), views, self.rasterizer, *live)
+        )
 
     def train(
         self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options: Any
@@ -176,10 +160,8 @@ class Lab:
         """
         start = stage.start() if start is None else start
         coordinator = self.coordinator(start, stage.views, method, **options)
-        events: list[Event] = []
-        coordinator.announce.subscribe(events.append)
         counts = self.finish(coordinator, stage)
-        return Trained(coordinator, self.score(coordinator, stage), events, counts)
+        return Trained(coordinator, self.score(coordinator, stage), counts)
 
     def train_limited(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train under the conditions of comparisons: on few views and with few Gaussians, as many of both for
@@ -188,9 +170,7 @@ class Lab:
         Args:
             options: of `coordinator`; they go before these.
         """
-        return self.train(
-            stage, method, **{"budget": self.views_drawn(BUDGET), "density": LIMITED, **options}
-        )
+        return self.train(stage, method, **{"budget": BUDGET, "density": LIMITED, **options})
 
     def compared(self, stage: Stage, method: Method, name: str | None = None, **options: Any) -> float:
         """Held-out PSNR under the conditions of comparisons, dB.
@@ -204,10 +184,10 @@ class Lab:
             self._scores[name, method] = self.train_limited(stage, method).psnr
         return self._scores[name, method]
 
-    def finish(self, coordinator: Coordinator, stage: Stage, steps: int | None = None) -> list[int]:
-        """Train on until the budget is used up, or for `steps`; the number of Gaussians after each step."""
+    def finish(self, coordinator: Coordinator, stage: Stage) -> list[int]:
+        """Train on until the budget is used up; the number of Gaussians after each step."""
         counts: list[int] = []
-        while not coordinator.finished and (steps is None or len(counts) < steps):
+        while not coordinator.finished:
             train_step(coordinator, stage)
             counts.append(coordinator.count())
         return counts
@@ -218,10 +198,10 @@ class Lab:
         degree = gaussians.sh_degree
         return [self.rasterizer(gaussians, view, sh_degree=degree).color.clamp(0, 1) for view in views]
 
-    def score(self, coordinator: Coordinator, stage: Stage, measure: Callable = psnr) -> float:
-        """Mean PSNR, or another measure, of merged pictures of the held-out views, dB."""
+    def score(self, coordinator: Coordinator, stage: Stage) -> float:
+        """Mean PSNR of merged pictures of the held-out views, dB."""
         drawn = self.pictures(merged(coordinator), stage.held_out)
-        return sum(float(measure(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
+        return sum(float(psnr(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
 
     def error(self, coordinator: Coordinator, stage: Stage) -> float:
         """The full objective, near enough: the mean absolute error over all training photos."""

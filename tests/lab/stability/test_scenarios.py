@@ -5,8 +5,6 @@ import pytest
 from abcd_ns.lab.stability.command import SCENARIOS
 from abcd_ns.lab.stability.lab import Lab
 
-QUICK = {"A5"}
-"""A third of the training says as much."""
 FAST = {"A5", "A7"}
 """The others train for long. What they rest on is in engine/train/test_health too."""
 BEHIND = {"A19": "on so small a budget several blocks are 1 to 3 dB behind one"}
@@ -27,6 +25,6 @@ def marks(id: str) -> list:
     ids=lambda scenario: scenario.id,
 )
 def test_scenario(scenario, tmp_path):
-    found = scenario.run(Lab(tmp_path, quick=scenario.id in QUICK))
+    found = scenario.run(Lab(tmp_path))
     assert found.passed, (scenario.rule, found.said, found.numbers)
     assert "abcd" in found.said
