@@ -6,7 +6,7 @@ import pytest
 
 from abcd_ns import methods
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.options import change_options, option_names, parse_changes
+from abcd_ns.lab.runs.options import change_options, parse_changes
 
 PIPELINE = methods.abcd.config.pipeline
 
@@ -30,10 +30,6 @@ def test_a_change_is_read_by_the_type_of_its_option(text, path, value):
         pipeline = getattr(pipeline, step)
     assert pipeline == value
     assert type(pipeline) is type(value)
-
-
-def test_several_options_may_change_at_once():
-    assert parse_changes("partition=grid blocks=27", PIPELINE) == ("partition=grid", "blocks=27")
 
 
 @pytest.mark.parametrize(
@@ -64,9 +60,3 @@ def test_a_change_that_does_not_fit_is_refused_in_one_line(text, message):
         parse_changes(text, PIPELINE)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_every_option_of_training_can_be_named():
-    names = option_names(PIPELINE)
-    assert {"blocks", "training.warmup", "training.density.refine_stop", "training.background"} <= set(names)
-    assert not any(part.startswith("_") for name in names for part in name.split("."))

@@ -10,7 +10,7 @@ from PIL import Image
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.synth.command import Settings, synth
-from abcd_ns.lab.world.court import GRASS, Site, build_world, court_cameras
+from abcd_ns.lab.world.court import GRASS, Site, build_world
 from abcd_ns.lab.world.solids import Thing, block
 from abcd_ns.lab.world.sunlight import SunlitWorld
 
@@ -113,15 +113,6 @@ def test_cameras_look_into_their_court_from_above_its_walls_and_upright(
         assert turn[2] @ to_middle > 0.9
 
 
-def test_no_camera_stands_in_anything() -> None:
-    site = Site.plan(4, "grid", 0)
-    courts = build_world(site)
-    views = [view for court in range(4) for view in court_cameras(site, court, 12, (48, 36))]
-    starts = torch.stack([view.center for view in views], dim=1).float()
-    for direction in torch.tensor([[0.0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
-        assert not bool(courts.blocked(starts, direction[:, None], 0.4).any())
-
-
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_finished_scene_is_left_alone(
     scene: Path, capsys: pytest.CaptureFixture[str], overwrite: bool
@@ -174,16 +165,6 @@ def test_settings_out_of_range_name_their_flag(tmp_path: Path, name: str, value:
         synth(tmp_path / "out", Settings(**{**TINY, name: value}))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("courts", "grid", "row"), [(1, (1, 1), (1, 1)), (5, (3, 2), (5, 1)), (64, (8, 8), (64, 1))]
-)
-def test_layouts(courts: int, grid: tuple[int, int], row: tuple[int, int]) -> None:
-    for layout, shape in (("grid", grid), ("row", row)):
-        site = Site.plan(courts, layout, seed=0)
-        assert len(set(site.cells)) == courts
-        assert tuple(np.max(site.cells, axis=0) + 1) == shape
 
 
 def test_gates_can_be_walked_through() -> None:

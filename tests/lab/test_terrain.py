@@ -137,7 +137,10 @@ def test_what_cannot_be_measured_is_refused(tmp_path, given, expected):
 
 
 def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, monkeypatch):
-    """No GPU here: the processes' ends are made up."""
+    """No GPU here: the processes' ends are made up. Nor is it tried where it would be huge."""
+    small, large = terrain_jobs(TerrainSettings(10**6, 1), (4, 8), (AS_ONE,), (0,))
+    assert why_left_out(small) is None
+    assert "more than 4,000,000 Gaussians" in why_left_out(large)
     tried = []
 
     def made_up_end(job: TerrainJob, *_) -> Run | Failure:
@@ -154,12 +157,6 @@ def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, mon
     found = read_results(tmp_path / "results.json")
     assert (found.failures, len(found.arms)) == ((), 4)
     assert "as one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
-
-
-def test_one_block_is_not_tried_where_it_would_be_huge():
-    small, large = terrain_jobs(TerrainSettings(10**6, 1), (4, 8), (AS_ONE,), (0,))
-    assert why_left_out(small) is None
-    assert "more than 4,000,000 Gaussians" in why_left_out(large)
 
 
 def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from abcd_ns.lab.compare.charts import colors_of, draw_charts, mean_curve
+from abcd_ns.lab.compare.charts import draw_charts, mean_curve
 from abcd_ns.lab.compare.command import shown
 from abcd_ns.lab.compare.pictures import draw_comparison, draw_pictures, error_map, psnr_of
 from abcd_ns.lab.job import METHODS, Job, Plan
@@ -45,16 +45,6 @@ def test_charts_show_every_method_in_its_own_colour_with_units(tmp_path, drawn):
     with Image.open(tmp_path / "speed_accuracy.png") as image:
         colours = {pixel for _, pixel in image.convert("RGB").getcolors(1 << 24)}
     assert all(tuple(bytes.fromhex(COLORS[method][1:])) in colours for method in METHODS)
-
-
-def test_arms_of_one_method_are_called_by_what_is_set_and_have_their_own_shades(tmp_path, drawn):
-    arms = [made_up_arm(f"blocks={n}", n, {0: 25.0 - n, 1: 24.0 - n}, gaussians=n) for n in (1, 8)]
-    arms.append(made_up_arm("training.density.price=4", None, {0: 21.0}))
-    results = made_up("comparison", *arms, seeds=(0, 1))
-    assert list(results.labels.values()) == ["1 block", "8 blocks", "price=4"]
-    assert len(set(colors_of(results.arms).values())) == 3
-    draw_charts(results, tmp_path)
-    assert any(text.startswith("8 blocks  ") for text in drawn["speed_accuracy.png"])
 
 
 def test_no_run_no_chart(tmp_path):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from abcd_ns.lab.results.records import RecordError, decode, encode, write_json
 from abcd_ns.lab.results.results import SCHEMA
 from abcd_ns.lab.results.run import CurvePoint, Run
-from abcd_ns.lab.runs.evaluate import mean, ordering_gap
+from abcd_ns.lab.runs.evaluate import ordering_gap
 from tests.lab.compare.records import made_up_results, made_up_run, read_results
 
 RUN = ("arms", 0, "runs", 0)
@@ -129,9 +129,3 @@ def test_no_ordering_gap_has_a_reason(squared, blocks):
     gap, note = ordering_gap(squared, blocks)
     assert gap is None
     assert note
-
-
-def test_a_mean_with_a_missing_value_is_missing():
-    assert mean([1.0, 2.0]) == 1.5
-    assert mean([1.0, None]) is None
-    assert mean([]) is None
