@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from abcd_ns.engine.gaussians.initialize import random_points
 from abcd_ns.engine.types import View
-from abcd_ns.lab.stability.lab import METHODS, PAIR, Lab, Stage, make_stage
-from abcd_ns.lab.stability.outcome import Finding, scenario
+from abcd_ns.lab.stability.lab import METHODS, PAIR, Finding, Lab, Stage, make_stage, scenario
 from abcd_ns.lab.world.world import TABLE, Ball, Surfaces
 
 FEW = 3

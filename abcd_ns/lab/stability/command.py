@@ -17,8 +17,7 @@ from abcd_ns.lab.results.tables import findings_of, headline
 from abcd_ns.lab.runs.options import Flag, Number, check_ranges, words
 from abcd_ns.lab.runs.runner import claim, new_results, say, write_report
 from abcd_ns.lab.stability import captures, training
-from abcd_ns.lab.stability.lab import Lab
-from abcd_ns.lab.stability.outcome import Scenario
+from abcd_ns.lab.stability.lab import Lab, Scenario
 from abcd_ns.machine import describe_machine
 from abcd_ns.progress_bar import ProgressBar
 

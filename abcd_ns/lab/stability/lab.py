@@ -1,9 +1,10 @@
-"""Trains small scenes with the bare engine, the same way for every method."""
+"""What a scenario is; small scenes trained with the bare engine, the same way for every method."""
 
 import math
 import tempfile
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -249,3 +250,36 @@ def drawn_by_blocks(steps: int, config: TrainingConfig, blocks: int, trained: in
 def merged(coordinator: Coordinator) -> Gaussians:
     """All blocks in one list, in the order of the blocks, on the CPU and without a graph."""
     return coordinator.scene.everything("cpu")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a scenario found out."""
+
+    passed: bool
+    """By ABCD, under the scenario's rule."""
+    said: dict[str, str]
+    """By method, what it did, in a few words."""
+    numbers: dict[str, float] = field(default_factory=dict)
+    """What the rule was applied to, by name; finite."""
+    worse: bool = False
+    """Whether ABCD did worse than one block, whatever the rule says."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One way in which methods fail."""
+
+    id: str
+    fails: str
+    """What happens elsewhere."""
+    done: str
+    """What is done here to make it happen."""
+    rule: str
+    """What passes."""
+    run: Callable[[Lab], Finding]
+
+
+def scenario(id: str, fails: str, done: str, rule: str) -> Callable[[Callable[[Lab], Finding]], Scenario]:
+    """Makes a scenario of the function that carries it out."""
+    return lambda run: Scenario(id, fails, done, rule, run)

@@ -18,8 +18,7 @@ from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import LEAST_REFINEMENTS, DensityConfig, DensityControl
 from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.lab.stability.lab import BLOCKS, BUDGET, METHODS, PAIR, Lab, Stage, make_stage
-from abcd_ns.lab.stability.outcome import Finding, scenario
+from abcd_ns.lab.stability.lab import BLOCKS, BUDGET, METHODS, PAIR, Finding, Lab, Stage, make_stage, scenario
 from abcd_ns.lab.world.world import Surfaces, Wall, World, camera, ring
 
 SIGMAS = (1.0, 3.0, 10.0)

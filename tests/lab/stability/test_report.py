@@ -11,7 +11,7 @@ from abcd_ns.lab.results.tables import headline
 from abcd_ns.lab.runs.runner import write_report
 from abcd_ns.lab.stability import command
 from abcd_ns.lab.stability.command import KIND, SCENARIOS, choose
-from abcd_ns.lab.stability.outcome import Finding, Scenario
+from abcd_ns.lab.stability.lab import Finding, Scenario
 from tests.lab.compare.records import made_up, read_results
 
 GOOD = Outcome(
