@@ -47,7 +47,7 @@ def options(out, **given) -> Options:
 def test_the_command_that_is_kept_can_be_given_again(tmp_path):
     plan = make_plan(options(tmp_path / "my land; x", tiles=(4, 2), tile_gaussians=300, visits=1))
     words = ["abcd", "compare", "--out", "my land; x", "--methods", "abcd", "--seeds", "0"]
-    words += ["--tiles", "2", "4", "--tile-gaussians", "300", "--visits", "1"]
+    words += ["--tiles", "4", "2", "--tile-gaussians", "300", "--visits", "1"]
     assert shlex.split(plan.command) == words
 
 

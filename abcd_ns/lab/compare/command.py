@@ -20,7 +20,7 @@ from abcd_ns.lab.results.records import decode, read_toml
 from abcd_ns.lab.results.results import TERRAIN, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.lab.results.tables import notes, print_rows, rows
-from abcd_ns.lab.runs.options import LOWEST, Flag, check_numbers, check_ranges, words
+from abcd_ns.lab.runs.options import LOWEST, Flag, check_numbers, check_ranges, parse_changes, words
 from abcd_ns.lab.runs.runner import run_jobs, say, write_report
 from abcd_ns.units import bytes_in_words
 
@@ -187,15 +187,11 @@ def _terrain_plan(given: Options) -> Plan:
         raise UserError(f"--{min(others).replace('_', '-')} does not go with --tiles.")
     if others := set(given.methods) - {"abcd", "abcd-monolithic"}:
         raise UserError(f"--tiles is for abcd and abcd-monolithic, not {min(others)}.")
-    given = dataclasses.replace(given, tiles=tuple(sorted(given.tiles)))
-    if (
-        not given.tiles
-        or len(set(given.tiles)) < len(given.tiles)
-        or any(n < 1 or n & (n - 1) for n in given.tiles)
-    ):
-        raise UserError(f"--tiles {' '.join(map(str, given.tiles))}: give different powers of 2, from 1 on.")
+    tiles = sorted(given.tiles)
+    if not tiles or tiles != sorted(set(tiles)) or any(n < 1 or n & (n - 1) for n in tiles):
+        raise UserError(f"--tiles {' '.join(map(str, tiles))}: give different powers of 2, from 1 on.")
     check_ranges({"tile_gaussians": given.tile_gaussians, "visits": given.visits})
-    out, gaussians = Path(given.out), given.tiles[-1] * given.tile_gaussians
+    out, gaussians = Path(given.out), tiles[-1] * given.tile_gaussians
     place = next(p for p in (out.resolve(), *out.resolve().parents) if p.exists())
     needed, free = 2 * gaussians * BYTES_PER_GAUSSIAN, shutil.disk_usage(place).free
     if needed > free:
@@ -204,7 +200,7 @@ def _terrain_plan(given: Options) -> Plan:
             f"{bytes_in_words(needed)}; give fewer, or --out on another disk."
         )
     settings = TerrainSettings(given.tile_gaussians, given.visits)
-    jobs = terrain_jobs(settings, given.tiles, given.methods, given.seeds)
+    jobs = terrain_jobs(settings, tiles, given.methods, given.seeds)
     return Plan(TERRAIN, settings, out, jobs, _command(given))
 
 
@@ -235,7 +231,6 @@ def arms_of(given: Options) -> list[tuple[str, ...]]:
     if given.vary:
         # Here and not above: `--help` has no use for nerfstudio.
         from abcd_ns.lab.runs.configs import registered
-        from abcd_ns.lab.runs.options import parse_changes
 
         changes += [parse_changes(text, registered("abcd").pipeline) for text in given.vary]
     sizes = [(f"blocks={n}",) for n in sorted(given.blocks)] if len(given.blocks) > 1 else [()]
@@ -322,6 +317,6 @@ def _command(given: Options) -> str:
         if name in ("data", "out"):
             value = scene_name(value)
         values = [] if value is True else value if isinstance(value, tuple) else [value]
-        words = [f"{word:g}" if isinstance(word, float) else str(word) for word in values]
-        line += [f"--{name.replace('_', '-')}", *words] if value != () else []
+        texts = [f"{one:g}" if isinstance(one, float) else str(one) for one in values]
+        line += [f"--{name.replace('_', '-')}", *texts] if value != () else []
     return shlex.join(line)
