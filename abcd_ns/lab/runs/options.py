@@ -82,7 +82,7 @@ def parse_changes(text: str, pipeline: Any) -> tuple[str, ...]:
     Raises:
         UserError: a name or value does not fit, or an option may not be varied.
     """
-    found = {}
+    found, known = {}, option_names(pipeline)
     for word in text.split():
         name, equals, value = word.partition("=")
         path = name.removeprefix("--").removeprefix(PREFIX).replace("-", "_")
@@ -92,7 +92,7 @@ def parse_changes(text: str, pipeline: Any) -> tuple[str, ...]:
             raise UserError(f"{path} cannot be varied: {FIXED[path]}.")
         if path in found:
             raise UserError(f"--vary {text!r} changes {path} twice.")
-        read_value(path, value, pipeline)
+        read_value(path, value, known)
         found[path] = value
     if not found:
         raise UserError(f"--vary {text!r}: change at least one option.")
@@ -101,8 +101,9 @@ def parse_changes(text: str, pipeline: Any) -> tuple[str, ...]:
 
 def change_options(pipeline: Any, changes: Sequence[str]) -> None:
     """Set what each `path=value` of `parse_changes` says, in place."""
+    known = option_names(pipeline)
     for path, _, value in (change.partition("=") for change in changes):
-        _set(pipeline, path, read_value(path, value, pipeline))
+        _set(pipeline, path, read_value(path, value, known))
 
 
 def set_options(config: Any, values: Mapping[str, bool | int | float | str | None], where: str) -> None:
@@ -121,7 +122,7 @@ def set_options(config: Any, values: Mapping[str, bool | int | float | str | Non
         if path not in known:
             continue
         try:
-            _set(config, path, read_value(path, str(value), config))
+            _set(config, path, read_value(path, str(value), known))
         except UserError as error:
             raise UserError(f"{where}: {error}") from None
 
@@ -144,13 +145,12 @@ def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def read_value(path: str, text: str, config: Any) -> Any:
-    """The value that a word gives an option, by the option's type.
+def read_value(path: str, text: str, known: Mapping[str, Any]) -> Any:
+    """The value that a word gives an option, by the option's type in `option_names`.
 
     Raises:
         UserError: there is no such option, or the value is not of its type.
     """
-    known = option_names(config)
     if path not in known:
         raise UserError(f"There is no option {path!r}; {_near(path, known)}")
     hint = known[path]
