@@ -2,9 +2,8 @@
 
     python -m benchmarks.visit --data DIR --downscale 4
 
-The runs follow each other, by the engine alone. Stages are summed over the second half of each run and
-divided by the views that were drawn to train in it. On a CUDA device each stage ends when the
-device has done its work, which makes steps slower than they are: their sum is no training time.
+Stages are summed over the second half of each run, per view drawn in it. On a CUDA device each stage ends
+when the device is done. That makes steps slower: their sum is no training time.
 """
 
 import tempfile
@@ -32,8 +31,7 @@ from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.training_loop import PhotoReader
 from abcd_ns.lab.results.tables import markdown
 from abcd_ns.lab.stability.lab import Stage
-from abcd_ns.lab.stability.scenarios.captures import read_stage
-from benchmarks.runs import StageClock, print_machine
+from benchmarks.runs import StageClock, print_machine, read_stage
 
 STAGES = (
     "plan and attach",

@@ -2,9 +2,8 @@
 
     python -m benchmarks.gpu --data DIR --out OUT
 
-Each part has a share of the time, runs in a process of its own, and is killed with all it started when its
-time is over. OUT gets a JSON file for each part and charts. A part whose file is there and whole is not run
-again; one that failed or was killed is, and goes on from the runs that it had finished.
+Each part has a share of the time and a process of its own, which is killed when its time is over. OUT gets a
+JSON file for each part and charts. A part that is there and whole is not run again.
 """
 
 import os
@@ -26,9 +25,11 @@ import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.results.records import encode, read_json, write_json
+from abcd_ns.lab.compare.charts import draw_charts
+from abcd_ns.lab.results.records import decode, encode, read_json, write_json
+from abcd_ns.lab.results.results import Results
+from abcd_ns.lab.results.tables import notes, print_rows, rows
 from abcd_ns.lab.runs.runner import last_line
-from benchmarks.gpu.charts import draw, show
 from benchmarks.gpu.parts import NEED_DATA, PARTS, ROOT, Task
 
 OUT = Path("docs/results/gpu")
@@ -44,14 +45,12 @@ class Args:
     out: Path | None = None
     """Gets a JSON file a part, and charts; OUT/work is scratch. Default: docs/results/gpu; of a dry run, a
     temporary folder."""
-    parts: tuple[Literal["build", "tests", "compare", "compare-steps", "extent", "visit"], ...] = tuple(PARTS)
+    parts: tuple[Literal["build", "compare", "compare-steps", "extent", "visit"], ...] = tuple(PARTS)
     """Of these, in this order."""
     minutes: float = 40.0
     """For all of them; what a part leaves goes to those after it."""
     again: bool = False
     """Run these parts whether or not their files are there, from nothing."""
-    draw: bool = False
-    """Only draw the charts and print the tables of what is there."""
     dry_run: bool = False
     """Try the machinery where there is no CUDA device: tiny, on the CPU. Its numbers mean nothing."""
     seed: int = 0
@@ -60,15 +59,14 @@ class Args:
 
 def main(args: Args) -> int:
     """Run what is missing; 1 if a part failed, 2 without a CUDA device."""
-    if not (torch.cuda.is_available() or args.dry_run or args.draw):
+    if not (torch.cuda.is_available() or args.dry_run):
         print("There is no CUDA device here; --dry-run tries the machinery without one.")
         return 2
     out = args.out or (Path(tempfile.mkdtemp(prefix="gpu-dry-run-")) if args.dry_run else OUT)
-    parts = [] if args.draw else [part for part in PARTS if part in args.parts]
+    parts = [part for part in PARTS if part in args.parts]
     if args.data is None and NEED_DATA & set(parts):
         raise UserError(f"Give the scene with --data DIR, or --parts without {', '.join(sorted(NEED_DATA))}.")
-    if parts:
-        check_kind(parts, args, out)
+    check_kind(parts, args, out)
     ends = time.monotonic() + 60 * args.minutes
     for number, part in enumerate(parts):
         path = out / f"{part}.json"
@@ -82,27 +80,21 @@ def main(args: Args) -> int:
             flush=True,
         )
     records = [read_json(out / f"{part}.json") for part in PARTS if (out / f"{part}.json").exists()]
-    for drawn in draw(records, out):
-        print(drawn)
-    show(records, Console())
+    show(records, out, Console())
     return int(any(record["error"] for record in records if record["part"] in parts))
 
 
 def check_kind(parts: Sequence[str], args: Args, out: Path) -> None:
-    """See that a dry run's records, whose numbers mean nothing, and those of a real run do not mix.
+    """See that records of dry runs, whose numbers mean nothing, and of real ones do not mix.
 
     Raises:
         UserError: `out` has records of the other kind, and they are not made anew.
     """
-    kept = [part for part in PARTS if not (args.again and part in parts)]
-    paths = [path for part in kept if (path := out / f"{part}.json").exists()]
-    others = [path.stem for path in paths if read_json(path)["dry_run"] != args.dry_run]
+    kept = [out / f"{part}.json" for part in PARTS if not (args.again and part in parts)]
+    others = [path.stem for path in kept if path.exists() and read_json(path)["dry_run"] != args.dry_run]
     if others:
-        kind = "real runs" if args.dry_run else "dry runs"
-        names = ", ".join(others)
-        raise UserError(
-            f"--out {out} holds records of {kind} ({names}); name another folder, or use --again."
-        )
+        kind = f"{'real' if args.dry_run else 'dry'} runs ({', '.join(others)})"
+        raise UserError(f"--out {out} holds records of {kind}; name another folder, or use --again.")
 
 
 def run_part(
@@ -151,6 +143,38 @@ def run_bounded(command: Sequence[str], seconds: float, log: Path) -> str | None
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
     return None if code == 0 else last_line(log) or f"exit code {code}"
+
+
+def show(records: Sequence[dict[str, Any]], out: Path, console: Console) -> None:
+    """Draw the charts of experiments; print a table for each part, below it what went wrong."""
+    for record in records:
+        table, remarks = _rows(record["part"], record["found"])
+        if (results := _results(record["found"])) is not None:
+            remarks += map(str, draw_charts(results, out, f"{record['part']}-"))
+        trouble = [f"{record['part']}: {record['error']}"] if record["error"] else []
+        dry = ["a dry run: these numbers mean nothing"] if record["dry_run"] else []
+        print_rows(table, [*dry, *remarks, *trouble], console)
+
+
+def _rows(part: str, found: dict[str, Any]) -> tuple[list[list[str]], list[str]]:
+    """A part's table, titles first, and notes."""
+    if not found:
+        return [[part]], []
+    if (results := _results(found)) is not None:
+        return rows(results), [*results.findings, *notes(results)]
+    if part == "visit":
+        columns = found["by_blocks"]
+        titles = ["visit, ms a view", *(f"{column['blocks']} blocks" for column in columns)]
+        stages = columns[0]["ms_per_view"] if columns else {}
+        body = [[stage, *(f"{column['ms_per_view'][stage]:.2f}" for column in columns)] for stage in stages]
+        return [titles, *body], []
+    flat = {**found["hardware"], **{name: value for name, value in found.items() if name != "hardware"}}
+    return [["build", ""], *([name, str(value)] for name, value in flat.items())], []
+
+
+def _results(found: dict[str, Any]) -> Results | None:
+    """Of a part that is an experiment."""
+    return decode(Results, found["results"], "results") if found.get("results") else None
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ A part is a generator: each record it yields holds all that it has found so far 
 that a part that is killed leaves what it had.
 """
 
-import subprocess
 import sys
 import tempfile
 import time
@@ -13,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import torch
 from rich.console import Console
@@ -21,17 +19,16 @@ from rich.console import Console
 from abcd_ns.cli.doctor.hardware import look_at_hardware
 from abcd_ns.cli.report.run_folder import CHECKPOINTS
 from abcd_ns.engine.render import make_rasterizer, self_check
-from abcd_ns.lab.compare.command import Options, impossible, make_plan
-from abcd_ns.lab.compare.terrain import terrain_jobs
-from abcd_ns.lab.job import AS_IT_IS, Change, Job, Plan, TerrainSettings, Variant
+from abcd_ns.lab.compare.command import Options, make_plan, terrain_jobs
+from abcd_ns.lab.job import Job, Plan, TerrainSettings
 from abcd_ns.lab.results.records import decode, encode, read_json, write_json
 from abcd_ns.lab.results.results import TERRAIN
-from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.stability.scenarios.captures import read_stage
+from abcd_ns.lab.runs.runner import run_jobs
 from abcd_ns.machine import describe_machine, describe_versions
 from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.units import MIB
 from benchmarks import visit
+from benchmarks.runs import read_stage
 
 ROOT = Path(__file__).resolve().parents[2]
 Found = dict[str, Any]
@@ -99,44 +96,17 @@ def build(_: Task) -> Iterator[Found]:
     yield found | {"self_check_2dgs": self_check(surfels, device)}
 
 
-def tests(task: Task) -> Iterator[Found]:
-    """`pytest -m gpu`, counted."""
-    report = Path(task.work) / "junit.xml"
-    words = ["-m", "pytest", "-m", "gpu", "-p", "no:cacheprovider", f"--junitxml={report}", "tests/gpu"]
-    subprocess.run([sys.executable, *words], cwd=ROOT, check=False)
-    yield count_tests(report)
-
-
-def count_tests(report: Path) -> Found:
-    """Numbers of tests by their end in a junit file of pytest's; why some failed, were skipped."""
-    cases = list(ElementTree.parse(report).getroot().iter("testcase"))
-    ends = {"failed": ("failure", "error"), "skipped": ("skipped",)}
-    found: Found = {}
-    for end, tags in ends.items():
-        those = {case.get("name"): node for case in cases for tag in tags for node in case.findall(tag)}
-        found[end] = len(those)
-        found[f"why_{end}"] = {n: (node.get("message") or "").split("\n")[0] for n, node in those.items()}
-    return {"passed": len(cases) - found["failed"] - found["skipped"], **found}
-
-
 def compare(task: Task, by_steps: bool) -> Iterator[Found]:
     """Every method on the scene, under the protocol of `abcd compare`, at equal time or at equal steps."""
     size = task.size
-    given = Options(
-        data=task.data,
-        methods=size.methods,
-        seeds=(task.seed,),
-        evals=6,
-        pictures=0,
-        out=task.work,
-        **({"steps": size.steps} if by_steps else {"seconds": size.seconds}),
-    )
-    plan = make_plan(given)
-    arms = [(method, AS_IT_IS) for method in plan.methods]
-    arms += [("abcd", Variant((Change("blocks", str(count)),))) for count in size.blocks]
-    jobs = tuple(ScoredJob(method, task.seed, plan.settings, variant) for method, variant in arms)
+    budget = {"steps": size.steps} if by_steps else {"seconds": size.seconds}
+    shared = {"data": task.data, "out": task.work, "seeds": (task.seed,), "evals": 6, "pictures": 0}
+    plan = make_plan(Options(methods=size.methods, **shared, **budget))
+    arms = [(job.method, ()) for job in plan.jobs]
+    arms += [("abcd", (f"blocks={count}",)) for count in size.blocks]
+    jobs = tuple(ScoredJob(method, task.seed, plan.settings, changes) for method, changes in arms)
     plan = replace(plan, kind="GPU comparison", jobs=jobs)
-    for results in experiment.run_jobs(plan, Console(), leave_out=impossible):
+    for results in run_jobs(plan, Console()):
         yield {"results": encode(results)}
 
 
@@ -146,7 +116,7 @@ def extent(task: Task) -> Iterator[Found]:
     settings = TerrainSettings(size.gaussians, 3, device_limit_bytes=size.device_limit_mb * MIB)
     jobs = terrain_jobs(settings, size.tiles, ("abcd", "abcd-monolithic"), (task.seed,))
     plan = Plan(TERRAIN, settings, Path(task.work), jobs, "python -m benchmarks.gpu --parts extent")
-    for results in experiment.run_jobs(plan, Console(), leave_out=impossible):
+    for results in run_jobs(plan, Console()):
         yield {"results": encode(results), "device_limit_bytes": size.device_limit_mb * MIB}
 
 
@@ -171,7 +141,6 @@ def visits(task: Task) -> Iterator[Found]:
 
 PARTS: dict[str, tuple[float, Callable[[Task], Iterator[Found]]]] = {
     "build": (4, build),
-    "tests": (4, tests),
     "compare": (11, partial(compare, by_steps=False)),
     "compare-steps": (10, partial(compare, by_steps=True)),
     "extent": (7, extent),

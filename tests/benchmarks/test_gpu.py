@@ -1,20 +1,17 @@
 """`python -m benchmarks.gpu` as far as it goes without a GPU: bounds, what is kept of a part, charts."""
 
-import os
 import sys
 import time
 from pathlib import Path
 
 import pytest
 import torch
+from rich.console import Console
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import encode, read_json, write_json
 from abcd_ns.lab.results.results import Arm
-from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part
-from benchmarks.gpu.charts import draw
-from benchmarks.gpu.parts import count_tests
-from benchmarks.visit import STAGES
+from benchmarks.gpu.__main__ import Args, main, run_bounded, run_part, show
 from tests.lab.compare.records import made_up, made_up_run
 from tests.reference.colmap_scene import write_scene
 
@@ -91,10 +88,10 @@ def test_a_part_that_is_there_is_not_run_again_unless_it_failed(tmp_path, monkey
         return WHOLE
 
     monkeypatch.setattr("benchmarks.gpu.__main__.run_part", note)
-    args = {"out": tmp_path, "dry_run": True, "minutes": 8}
+    args = {"out": tmp_path, "dry_run": True, "minutes": 11}
     write_json(tmp_path / "build.json", WHOLE | {"error": "killed"})
-    assert main(Args(parts=("tests", "build"), **args)) == 0
-    assert ran == [("build", 240), ("tests", 480)]  # equal shares; what one leaves goes to the next
+    assert main(Args(parts=("extent", "build"), **args)) == 0
+    assert ran == [("build", 240), ("extent", 660)]  # 4 and 7 shares; what one leaves goes to the next
     assert main(Args(parts=("build",), **args)) == 0
     assert len(ran) == 2
     assert "is there; --again" in capsys.readouterr().out
@@ -116,7 +113,7 @@ def test_records_of_dry_and_real_runs_do_not_mix(tmp_path, monkeypatch, dry):
     monkeypatch.setattr("benchmarks.gpu.__main__.run_part", note)
     path = tmp_path / "build.json"
     write_json(path, WHOLE | {"dry_run": not dry})
-    for part in ("build", "tests"):
+    for part in ("build", "extent"):
         with pytest.raises(
             UserError, match=r"holds records of (dry|real) runs \(build\); name another folder"
         ):
@@ -124,8 +121,8 @@ def test_records_of_dry_and_real_runs_do_not_mix(tmp_path, monkeypatch, dry):
     assert not ran
     assert main(Args(out=tmp_path, parts=("build",), dry_run=dry, again=True)) == 0
     assert (ran, read_json(path)["dry_run"]) == (["build"], dry)
-    assert main(Args(out=tmp_path, parts=("build", "tests"), dry_run=dry)) == 0
-    assert ran == ["build", "tests"]
+    assert main(Args(out=tmp_path, parts=("build", "extent"), dry_run=dry)) == 0
+    assert ran == ["build", "extent"]
 
 
 def test_without_a_cuda_device_it_says_so(monkeypatch, capsys, tmp_path):
@@ -140,18 +137,7 @@ def test_a_comparison_without_a_scene_is_refused(tmp_path):
         main(Args(out=tmp_path / "out", dry_run=True))
 
 
-def test_tests_are_counted_by_their_end(tmp_path):
-    (tmp_path / "junit.xml").write_text(
-        "<testsuites><testsuite><testcase name='a'/><testcase name='b'/>"
-        "<testcase name='c'><failure message='too far&#10;more'/></testcase>"
-        "<testcase name='d'><skipped message='no device'/></testcase></testsuite></testsuites>"
-    )
-    found = count_tests(tmp_path / "junit.xml")
-    assert (found["passed"], found["failed"], found["skipped"]) == (2, 1, 1)
-    assert found["why_failed"] == {"c": "too far"}
-
-
-def test_every_record_is_drawn(tmp_path):
+def test_every_record_is_shown(tmp_path, capsys):
     memory = {"peak_device_bytes": 2 * GIB, "peak_reserved_bytes": 3 * GIB, "peak_device_note": None}
     variants = {"splatfacto": "default", "abcd-monolithic": "default"}
     arms = [*variants.items(), ("abcd", "blocks=1"), ("abcd", "blocks=8")]
@@ -160,14 +146,10 @@ def test_every_record_is_drawn(tmp_path):
         for k, (method, variant) in enumerate(arms)
     ]
     found = {"results": encode(made_up("GPU comparison", *arms))}
-    stages = {"views": 9, "ms_per_view": dict.fromkeys(STAGES, 1.5), "profile": []}
-    records = [
-        WHOLE,
-        WHOLE | {"part": "compare", "found": found},
-        WHOLE | {"part": "visit", "found": {"scene": "made-up", "by_blocks": [{"blocks": 1, **stages}]}},
-    ]
-    paths = draw(records, tmp_path)
-    assert [path.name for path in paths] == ["compare-speed_accuracy.png", "compare-memory.png", "visit.png"]
+    show([WHOLE, WHOLE | {"part": "compare", "found": found}], tmp_path, Console())
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"compare-speed_accuracy.png", "compare-memory.png"}
+    assert "splatfacto" in capsys.readouterr().out
 
 
 @pytest.mark.cli
@@ -181,9 +163,8 @@ def test_a_dry_run_goes_through(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_all_parts_of_a_dry_run_go_through(tmp_path, capsys):
-    out, ours = tmp_path / "out", os.environ.get("ABCD_TEST_DEVICE")
+    out = tmp_path / "out"
     assert main(Args(data=write_scene(tmp_path / "scene"), out=out, dry_run=True)) == 0
-    assert ours or read_json(out / "tests.json")["found"]["skipped"] > 0
     for part in ("compare", "compare-steps"):
         found = read_json(out / f"{part}.json")["found"]["results"]
         assert [(arm["method"], arm["variant"]) for arm in found["arms"]] == [("abcd", "blocks=2")]

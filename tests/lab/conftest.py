@@ -35,7 +35,6 @@ def drawn(monkeypatch) -> dict[str, list[str]]:
 def worker(tmp_path, monkeypatch) -> FakeWorker:
     """Does the jobs of experiments."""
     fake = FakeWorker(tmp_path / "worker")
-    monkeypatch.setattr(runner, "POLL_SECONDS", 0.01)
     monkeypatch.setattr(runner, "command_of", lambda job: fake.command)  # noqa: ARG005
-    monkeypatch.setattr("abcd_ns.lab.runs.experiment.describe_machine", lambda: MACHINE)
+    monkeypatch.setattr("abcd_ns.lab.runs.runner.describe_machine", lambda: MACHINE)
     return fake

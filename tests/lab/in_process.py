@@ -10,30 +10,26 @@ import pytest
 from abcd_ns.lab.runs import runner
 
 
-class Done:
-    """As `subprocess.Popen` of a process that has ended; what goes wrong in it is raised here."""
-
-    def __init__(self, command: list[str], stdout, **_) -> None:
-        *_, module, job = command  # python -m MODULE JOB
-        with open(stdout.name, "a") as log, redirect_stdout(log), redirect_stderr(log):
-            try:
-                with pytest.MonkeyPatch.context() as patch:
-                    patch.setattr("sys.argv", [module, job])
-                    runpy.run_module(module, run_name="__main__")
-                self.returncode = 0
-            except SystemExit as end:
-                self.returncode = end.code or 0
-
-    def poll(self) -> int:
-        return self.returncode
+def run_here(command: list[str], stdout, **_) -> SimpleNamespace:
+    """As `subprocess.run`; what goes wrong is raised here."""
+    *_, module, job = command  # python -m MODULE JOB
+    code = 0
+    with open(stdout.name, "a") as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("sys.argv", [module, job])
+                runpy.run_module(module, run_name="__main__")
+        except SystemExit as end:
+            code = end.code or 0
+    return SimpleNamespace(returncode=code)
 
 
 def jobs_in_this_process(patch, first_is_real: bool = False) -> None:
     """Have `runner` do its jobs here, all or all but the first."""
-    kinds = iter([subprocess.Popen] * first_is_real)
+    kinds = iter([subprocess.run] * first_is_real)
+    known = {"DEVNULL": subprocess.DEVNULL, "STDOUT": subprocess.STDOUT}
 
     def start(command: list[str], **options):
-        return next(kinds, Done)(command, **options)
+        return next(kinds, run_here)(command, **options)
 
-    known = {"DEVNULL": subprocess.DEVNULL, "STDOUT": subprocess.STDOUT}
-    patch.setattr(runner, "subprocess", SimpleNamespace(Popen=start, **known))
+    patch.setattr(runner, "subprocess", SimpleNamespace(run=start, **known))

@@ -26,11 +26,6 @@ def test_a_row_has_a_cell_for_each_column_whatever_they_are_called(names):
     assert len(text.splitlines()) == 3
 
 
-def test_bars_and_dollars_stand_in_a_cell_as_they_are():
-    (cells,) = (token.content for token in MARKDOWN.parse(markdown([["", "x"], ["a|b", "$|$"]]))[-5:-4])
-    assert cells == "$|$"
-
-
 @example(["[/]", "[red]", "a\\"])
 @given(st.lists(NAMES.filter(str.isprintable), min_size=1, max_size=3))
 def test_a_table_in_the_terminal_shows_names_as_they_are(names):

@@ -9,19 +9,19 @@ import torch
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_charts
-from abcd_ns.lab.compare.command import Options, compare, make_plan
-from abcd_ns.lab.compare.terrain import AS_ONE, terrain_jobs, too_large
+from abcd_ns.lab.compare.command import Options, compare, make_plan, terrain_jobs
 from abcd_ns.lab.job import TerrainJob, TerrainSettings
-from abcd_ns.lab.results.findings import find_growth
 from abcd_ns.lab.results.records import decode, encode, read_json
 from abcd_ns.lab.results.results import TERRAIN, Arm, Results
 from abcd_ns.lab.results.run import Failure, Footing, Run
 from abcd_ns.lab.results.tables import notes, write_table
+from abcd_ns.lab.runs.runner import why_left_out
 from abcd_ns.lab.runs.terrain import run
 from abcd_ns.lab.world.land import Land, color_of
 from tests.lab.compare.records import made_up, made_up_run, read_results
 from tests.lab.in_process import jobs_in_this_process
 
+AS_ONE = "abcd-monolithic"
 MIB = 2**20
 
 
@@ -29,8 +29,9 @@ MIB = 2**20
 def test_each_block_of_the_land_is_one_tile(tiles):
     land = Land(tiles, 50)
     tree = land.tree()
-    assert sorted(land.tile_of(tree)) == list(range(tiles))
-    for block, tile in enumerate(land.tile_of(tree)):
+    blocks = tree.assign(land.middles).tolist()
+    assert sorted(blocks) == list(range(tiles))
+    for tile, block in enumerate(blocks):
         means = land.make_tile(tile).means
         assert bool((tree.assign(means) == block).all())
         x, y = land.corner(tile)
@@ -45,19 +46,9 @@ def options(out, **given) -> Options:
 
 def test_the_command_that_is_kept_can_be_given_again(tmp_path):
     plan = make_plan(options(tmp_path / "my land; x", tiles=(4, 2), tile_gaussians=300, visits=1))
-    words = ["abcd", "compare", "--tiles", "2", "4", "--methods", "abcd", "--seeds", "0"]
-    words += ["--tile-gaussians", "300", "--visits", "1", "--out", "my land; x"]
+    words = ["abcd", "compare", "--out", "my land; x", "--methods", "abcd", "--seeds", "0"]
+    words += ["--tiles", "4", "2", "--tile-gaussians", "300", "--visits", "1"]
     assert shlex.split(plan.command) == words
-
-
-def test_only_powers_of_two_part_in_equal_halves():
-    with pytest.raises(ValueError, match="power of 2"):
-        Land(6, 10)
-
-
-def test_a_tile_does_not_depend_on_how_large_the_land_is():
-    assert torch.equal(Land(2, 20).make_tile(1).means, Land(8, 20).make_tile(1).means)
-    assert not torch.equal(Land(2, 20).make_tile(0).means + 1, Land(2, 20).make_tile(1).means)
 
 
 def test_a_photo_shows_the_lands_colour_where_the_ray_meets_it():
@@ -74,17 +65,6 @@ def test_a_photo_shows_the_lands_colour_where_the_ray_meets_it():
             assert torch.allclose(photo[v, u], expected, atol=1e-3)
         crop = Crop(16, 32, 48, 16)
         assert torch.equal(land.crop(view, crop), photo[crop.slices])
-
-
-def test_cameras_see_their_own_tile():
-    land = Land(2, 10)
-    for view in land.cameras():
-        x, y = land.corner(view.index // land.views)
-        at = view.viewmat[:3, :3] @ torch.tensor([x + 0.5, y + 0.5, 0.0]) + view.viewmat[:3, 3]
-        pixel = view.K @ (at / at[2])
-        assert 0 < at[2] < 2
-        assert 0 < pixel[0] < view.width
-        assert 0 < pixel[1] < view.height
 
 
 @pytest.mark.parametrize("method", ["abcd", AS_ONE])
@@ -117,8 +97,6 @@ def results_of(*arms: Arm) -> Results:
 def test_growth_is_from_the_smallest_to_the_largest():
     arms = [made_up_land(2, 500), made_up_land(4, 900), made_up_land(8, 520), made_up_land(8, 9000, AS_ONE)]
     results = results_of(*arms)
-    assert find_growth(results, "peak_rss_bytes") == pytest.approx(0.04)
-    assert find_growth(results, "peak_device_bytes") is None
     assert results.findings == ("From 2 to 8 blocks of ABCD, peak RAM grows by 4.0%; allowed: 5%.",)
     on_gpu = results_of(made_up_land(2, 500, device=100), made_up_land(4, 500, device=150))
     assert "GPU memory by 50.0%" in on_gpu.findings[0]
@@ -159,29 +137,26 @@ def test_what_cannot_be_measured_is_refused(tmp_path, given, expected):
 
 
 def test_one_block_is_not_tried_where_it_was_too_large_for_the_gpu(tmp_path, monkeypatch):
-    """No GPU here: the processes' ends are made up."""
+    """No GPU here: the processes' ends are made up. Nor is it tried where it would be huge."""
+    small, large = terrain_jobs(TerrainSettings(10**6, 1), (4, 8), (AS_ONE,), (0,))
+    assert why_left_out(small) is None
+    assert "more than 4,000,000 Gaussians" in why_left_out(large)
     tried = []
 
     def made_up_end(job: TerrainJob, *_) -> Run | Failure:
-        tried.append((job.tiles, job.method))
-        if job.method == AS_ONE and job.tiles > 2:
+        tried.append((job.value, job.method))
+        if job.method == AS_ONE and job.value > 2:
             reason = "torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 2.00 GiB."
             return Failure(job.method, job.seed, reason, "log.txt")
-        return made_up_land(job.tiles, 500, job.method, device=100).runs[0]
+        return made_up_land(job.value, 500, job.method, device=100).runs[0]
 
-    monkeypatch.setattr("abcd_ns.lab.runs.experiment.finish_job", made_up_end)
+    monkeypatch.setattr("abcd_ns.lab.runs.runner.finish_job", made_up_end)
     both = {"methods": ("abcd", AS_ONE), "tile_gaussians": 10}
     assert compare(options(tmp_path, tiles=(2, 4, 8), **both)) == 0
     assert tried == [(2, "abcd"), (2, AS_ONE), (4, "abcd"), (4, AS_ONE), (8, "abcd")]
     found = read_results(tmp_path / "results.json")
     assert (found.failures, len(found.arms)) == ((), 4)
     assert "as one block, 4 tiles ran out of GPU memory." in (tmp_path / "table.md").read_text()
-
-
-def test_one_block_is_not_tried_where_it_would_be_huge():
-    small, large = terrain_jobs(TerrainSettings(10**6, 1), (4, 8), (AS_ONE,), (0,))
-    assert too_large(small) is None
-    assert "more than 4,000,000 Gaussians" in too_large(large).reason
 
 
 def test_the_command_measures_writes_and_reuses(tmp_path, capsys, monkeypatch):

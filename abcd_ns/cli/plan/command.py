@@ -32,7 +32,7 @@ from abcd_ns.engine.train.memory import levels_of
 from abcd_ns.engine.train.schedule import views_per_step
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.checks import Number, check_ranges
+from abcd_ns.lab.runs.options import Number, check_ranges
 from abcd_ns.nerfstudio.datamanager import AbcdDataManagerConfig
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
 from abcd_ns.nerfstudio.views import training_views

@@ -15,7 +15,7 @@ from abcd_ns.cli.run_path import find_run
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
-from abcd_ns.lab.runs.checks import check_ranges
+from abcd_ns.lab.runs.options import check_ranges
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 

@@ -3,29 +3,29 @@
 import dataclasses
 import math
 import shlex
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import tyro
 from rich.console import Console
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.compare.charts import draw_charts
 from abcd_ns.lab.compare.pictures import draw_pictures
-from abcd_ns.lab.compare.terrain import terrain_plan, too_large
-from abcd_ns.lab.job import METHODS, Change, Job, Method, Plan, Settings, Variant
+from abcd_ns.lab.job import METHODS, Job, Method, Plan, Settings, TerrainJob, TerrainSettings, scene_name
 from abcd_ns.lab.results.records import decode, read_toml
-from abcd_ns.lab.results.results import TERRAIN, LeftOut, Results
-from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.runs import experiment
-from abcd_ns.lab.runs.checks import LOWEST, Flag, check_numbers, check_ranges, words
+from abcd_ns.lab.results.results import TERRAIN, Results
+from abcd_ns.lab.results.run import Run
+from abcd_ns.lab.results.tables import notes, print_rows, rows
+from abcd_ns.lab.runs.options import LOWEST, Flag, check_numbers, check_ranges, parse_changes, words
+from abcd_ns.lab.runs.runner import run_jobs, say, write_report
+from abcd_ns.units import bytes_in_words
 
 PICTURES = "pictures"
 PRICE = "training.density.price"
-BLOCKS = "blocks"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +93,10 @@ DEFAULTS = Options(
     max_gaussians=0,
     pictures=3,
 )
+TERRAIN_DEFAULTS = Options(methods=("abcd",), seeds=(0,), tile_gaussians=20_000, visits=3)
+TERRAIN_OPTIONS = {*TERRAIN_DEFAULTS.given, "tiles", "out"}
+BYTES_PER_GAUSSIAN = 3 * 59 * 4
+"""On disk: parameters and two moments in float32."""
 
 
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
@@ -146,8 +150,8 @@ def read_options(path: Path) -> Options:
         UserError: the file is absent, is no TOML, or has a key or value that does not fit.
     """
     values = read_toml(path, f"--config {path} does not exist.")
-    if isinstance(values.get(BLOCKS), int):
-        values[BLOCKS] = [values[BLOCKS]]
+    if isinstance(values.get("blocks"), int):
+        values["blocks"] = [values["blocks"]]
     return decode(Options, values, str(path))
 
 
@@ -157,28 +161,64 @@ def make_plan(options: Options) -> Plan:
     Raises:
         UserError: an option is missing, out of range or contradicts another.
     """
-    if len(options.blocks or ()) > 1 or {"prices", "vary", "tiles"} & options.given.keys():
+    if len(options.blocks or ()) > 1 or {"prices", "vary"} & options.given.keys():
         options = options.over(Options(methods=("abcd",)))
-    given = options.over(DEFAULTS)
+    given = options.over(DEFAULTS if options.tiles is None else TERRAIN_DEFAULTS)
     _check_methods(given)
     check_numbers("--seeds", given.seeds, 0)
     if given.out is None:
         raise UserError("Give the folder for the results with --out FOLDER.")
-    methods = [method for method in METHODS if method in given.methods]
+    given = dataclasses.replace(given, methods=tuple(m for m in METHODS if m in given.methods))
     if given.tiles is not None:
-        return terrain_plan(options.given, methods, given.seeds)
-    settings, varied = _settings(given), variants(given)
+        return _terrain_plan(given)
+    settings, arms = _settings(given), arms_of(given)
     jobs = tuple(
-        Job(method, seed, settings, variant)
+        Job(method, seed, settings, changes)
         for seed in given.seeds
-        for method in methods
-        for variant in dict.fromkeys(_for_method(variant, method, settings) for variant in varied)
+        for method in given.methods
+        for changes in dict.fromkeys(_for_method(changes, method, settings) for changes in arms)
     )
-    return Plan("comparison", settings, Path(given.out), jobs, _command(given, methods, settings))
+    return Plan("comparison", settings, Path(given.out), jobs, _command(given))
 
 
-def variants(given: Options) -> list[Variant]:
-    """Every number of blocks, if there are several, with every change: none, each price, each of --vary.
+def _terrain_plan(given: Options) -> Plan:
+    """Runs on terrains of so many tiles."""
+    if others := given.given.keys() - TERRAIN_OPTIONS:
+        raise UserError(f"--{min(others).replace('_', '-')} does not go with --tiles.")
+    if others := set(given.methods) - {"abcd", "abcd-monolithic"}:
+        raise UserError(f"--tiles is for abcd and abcd-monolithic, not {min(others)}.")
+    tiles = sorted(given.tiles)
+    if not tiles or tiles != sorted(set(tiles)) or any(n < 1 or n & (n - 1) for n in tiles):
+        raise UserError(f"--tiles {' '.join(map(str, tiles))}: give different powers of 2, from 1 on.")
+    check_ranges({"tile_gaussians": given.tile_gaussians, "visits": given.visits})
+    out, gaussians = Path(given.out), tiles[-1] * given.tile_gaussians
+    place = next(p for p in (out.resolve(), *out.resolve().parents) if p.exists())
+    needed, free = 2 * gaussians * BYTES_PER_GAUSSIAN, shutil.disk_usage(place).free
+    if needed > free:
+        raise UserError(
+            f"{place} has {bytes_in_words(free)} free, but {gaussians:,} Gaussians may take "
+            f"{bytes_in_words(needed)}; give fewer, or --out on another disk."
+        )
+    settings = TerrainSettings(given.tile_gaussians, given.visits)
+    jobs = terrain_jobs(settings, tiles, given.methods, given.seeds)
+    return Plan(TERRAIN, settings, out, jobs, _command(given))
+
+
+def terrain_jobs(
+    settings: TerrainSettings, tiles: Sequence[int], methods: Sequence[str], seeds: Sequence[int]
+) -> tuple[TerrainJob, ...]:
+    """The smallest first, by blocks before as one block, which may need more memory than there is."""
+    return tuple(
+        TerrainJob(method, seed, settings, (f"tiles={count}",))
+        for count in tiles
+        for method in sorted(methods)
+        for seed in seeds
+    )
+
+
+def arms_of(given: Options) -> list[tuple[str, ...]]:
+    """What each arm changes: every number of blocks, if there are several, with nothing, each price, each of
+    --vary.
 
     Raises:
         UserError: an option does not exist, or a value does not fit.
@@ -187,44 +227,31 @@ def variants(given: Options) -> list[Variant]:
     for price in given.prices:
         if not 0 <= price < math.inf:
             raise UserError(f"--prices {price:g}: a price is 0 or more, in pixels.")
-    changes = [(Change(PRICE, f"{price:g}"),) for price in given.prices]
+    changes = [(f"{PRICE}={price:g}",) for price in given.prices]
     if given.vary:
         # Here and not above: `--help` has no use for nerfstudio.
         from abcd_ns.lab.runs.configs import registered
-        from abcd_ns.lab.runs.options import parse_variant
 
-        pipeline = registered("abcd").pipeline
-        changes += [parse_variant(text, pipeline).changes for text in given.vary]
-    if (twice := [change for change in changes if changes.count(change) > 1]) or (
-        len(given.blocks) > 1 and (twice := [c for c in changes if any(one.path == BLOCKS for one in c)])
-    ):
-        raise UserError(f"{Variant(twice[0]).name!r} is given twice.")
-    sizes = [(Change(BLOCKS, str(number)),) for number in sorted(given.blocks)]
-    sizes = sizes if len(sizes) > 1 else [()]
-    return [Variant((*size, *change)) for size in sizes for change in [(), *changes]]
+        changes += [parse_changes(text, registered("abcd").pipeline) for text in given.vary]
+    sizes = [(f"blocks={n}",) for n in sorted(given.blocks)] if len(given.blocks) > 1 else [()]
+    of_blocks = [one for one in changes if len(sizes) > 1 and any(c.startswith("blocks=") for c in one)]
+    if twice := [one for one in changes if changes.count(one) > 1] + of_blocks:
+        raise UserError(f"{' '.join(twice[0])!r} is given twice.")
+    return [(*size, *change) for size in sizes for change in [(), *changes]]
 
 
 def carry_out(plan: Plan, console: Console, overwrite: bool = False) -> int:
     """Do all runs of the plan and write what came of them; exit code 1 if a run failed."""
-
-    def draw(results: Results, out: Path) -> list[Path]:
-        pictures = [] if plan.kind == TERRAIN else draw_pictures(shown(results, plan), out / PICTURES)
-        return [*draw_charts(results, out), *pictures]
-
-    return experiment.carry_out(plan, console, draw, overwrite, impossible)
-
-
-def impossible(job: Job, outcome: Run | Failure | None = None) -> LeftOut | None:
-    """Why the job's method cannot run on this machine or under this protocol, if it cannot."""
-    if not isinstance(job.settings, Settings):
-        return too_large(job, outcome)
-    if job.method != "splatfacto":
-        return None
-    if not torch.cuda.is_available():
-        return LeftOut(job.method, "it needs a CUDA device, and there is none here")
-    if job.settings.max_gaussians:
-        return LeftOut(job.method, "it has no limit on the number of Gaussians, and this protocol sets one")
-    return None
+    for results in run_jobs(plan, console, overwrite):
+        paths = write_report(results, plan.out)  # each time: a long one may be interrupted
+    paths += draw_charts(results, plan.out)
+    if plan.kind != TERRAIN:
+        paths += draw_pictures(shown(results, plan), plan.out / PICTURES)
+    if results.arms:
+        print_rows(rows(results), [*results.findings, *notes(results)], console)
+    for path in paths:
+        say(console, path)
+    return 1 if results.failures else 0
 
 
 def shown(results: Results, plan: Plan) -> list[tuple[Run, Path]]:
@@ -232,15 +259,12 @@ def shown(results: Results, plan: Plan) -> list[tuple[Run, Path]]:
     arms = [results.of(method)[0] for method in results.methods]
     seeds = [{run.seed for run in arm.runs} for arm in arms]
     shared = [seed for seed in results.seeds if all(seed in each for each in seeds)]
-    folders = {(job.method, job.variant.name, job.seed): job.folder(plan.out) for job in plan.jobs}
+    folders = {(job.method, job.variant, job.seed): job.folder(plan.out) for job in plan.jobs}
     runs = [(arm, next(run for run in arm.runs if not shared or run.seed == shared[0])) for arm in arms]
     return [(run, folders[arm.method, arm.variant, run.seed] / PICTURES) for arm, run in runs]
 
 
 def _check_methods(given: Options) -> None:
-    for method in given.methods:
-        if method not in METHODS:
-            raise UserError(f"There is no method {method!r} to compare; there are {', '.join(METHODS)}.")
     if not given.methods or len(set(given.methods)) < len(given.methods):
         raise UserError("Give at least one of --methods, and each once.")
     if "abcd-paper" in given.methods and given.steps is None:
@@ -277,22 +301,22 @@ def _settings(given: Options) -> Settings:
     )
 
 
-def _for_method(variant: Variant, method: str, settings: Settings) -> Variant:
-    """What of a variant applies to a method: one block is one block, and splatfacto has its own options."""
+def _for_method(changes: tuple[str, ...], method: str, settings: Settings) -> tuple[str, ...]:
+    """What of an arm applies to a method: one block is one block, and splatfacto has its own options."""
     if method == "splatfacto":
-        return Variant()
+        return ()
     if method == "abcd-monolithic" and not settings.blocks:
-        return Variant(tuple(change for change in variant.changes if change.path != BLOCKS))
-    return variant
+        return tuple(change for change in changes if not change.startswith("blocks="))
+    return changes
 
 
-def _command(given: Options, methods: Sequence[str], settings: Settings) -> str:
+def _command(given: Options) -> str:
     """The command line that makes the same, with the names of folders instead of where they are."""
-    line = ["abcd", "compare", "--data", settings.scene, "--methods", *methods, "--seeds", *given.seeds]
-    line += ["--steps", given.steps] if given.seconds is None else ["--seconds", f"{given.seconds:g}"]
-    line += ["--downscale", given.downscale, "--evals", given.evals, "--blocks", *given.blocks]
-    line += ["--prices", *(f"{price:g}" for price in given.prices)] if given.prices else []
-    line += ["--vary", *given.vary] if given.vary else []
-    line += ["--max-gaussians", given.max_gaussians] if given.max_gaussians else []
-    line += ["--no-densify"] if given.no_densify else []
-    return shlex.join(map(str, [*line, "--pictures", given.pictures, "--out", Path(given.out).name]))
+    line = ["abcd", "compare"]
+    for name, value in given.given.items():
+        if name in ("data", "out"):
+            value = scene_name(value)
+        values = [] if value is True else value if isinstance(value, tuple) else [value]
+        texts = [f"{one:g}" if isinstance(one, float) else str(one) for one in values]
+        line += [f"--{name.replace('_', '-')}", *texts] if value != () else []
+    return shlex.join(line)

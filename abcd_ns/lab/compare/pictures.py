@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
@@ -43,32 +42,34 @@ def psnr_of(picture: PictureArray, photo: PictureArray) -> float:
 def draw_comparison(photo: PictureArray, pictures: dict[str, PictureArray], title: str, path: Path) -> None:
     """Write one figure: photo and pictures above, errors below, on one scale with its legend.
 
-    With a single picture all stand in one row.
-
     Args:
         pictures: by the name to print above each, of the photo's size.
     """
     height, width = photo.shape[:2]
-    single = len(pictures) == 1
-    rows, columns = (1, 3) if single else (2, 1 + len(pictures))
-    size = (COLUMN_INCHES * columns, rows * (COLUMN_INCHES * height / width + 0.25) + 0.25)
-    figure = Figure(figsize=(size[0] + 0.8 * single, size[1]), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False)
+    columns = 1 + len(pictures)
+    size = (COLUMN_INCHES * columns, 2 * (COLUMN_INCHES * height / width + 0.25) + 0.25)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(2, columns)
     figure.suptitle(title, fontsize=9)
     _show(grid[0, 0], photo, "photo")
     for column, (name, picture) in enumerate(pictures.items(), start=1):
         _show(grid[0, column], picture, f"{name}  {psnr_of(picture, photo):.2f} dB")
-        below = grid[0, 2] if single else grid[1, column]
-        error = _show_error(below, error_map(picture, photo), name)
-    if single:
-        _add_scale(figure.colorbar(error, ax=grid[0, 2], extend="max", fraction=0.05, pad=0.02))
-    else:
-        grid[1, 0].axis("off")
-        inset = grid[1, 0].inset_axes((0.08, 0.52, 0.84, 0.09))
-        bar = figure.colorbar(error, cax=inset, orientation="horizontal", extend="max")
-        _add_scale(bar, "\n(mean of R, G, B; share of full scale)")
+        map_of_errors = error_map(picture, photo)
+        below = f"error of {name}, mean {map_of_errors.mean():.1%}"
+        error = _show(grid[1, column], map_of_errors, below, cmap=ERROR_COLORS, vmin=0, vmax=1 / ERROR_GAIN)
+    grid[1, 0].axis("off")
+    inset = grid[1, 0].inset_axes((0.08, 0.52, 0.84, 0.09))
+    label = f"|picture - photo| x {ERROR_GAIN}\n(mean of R, G, B; share of full scale)"
+    bar = figure.colorbar(error, cax=inset, orientation="horizontal", extend="max", label=label)
+    bar.ax.xaxis.set_major_formatter(lambda share, _: f"{share:.0%}")
     # No less than a dot per pixel, so that nothing that is shown is lost.
     figure.savefig(path, dpi=min(max(200.0, 1.1 * width / COLUMN_INCHES), 400.0))
+
+
+def _show(axes: Axes, picture: NDArray, title: str, **look: object) -> AxesImage:
+    axes.set(title=title, xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    return axes.imshow(picture, interpolation="nearest", **look)
 
 
 def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
@@ -80,37 +81,15 @@ def draw_pictures(runs: Sequence[tuple[Run, Path]], out: Path) -> list[Path]:
     if not runs:
         return []
     first, folder = runs[0]
-    if out.exists():
-        shutil.rmtree(out)  # of an earlier comparison, with other views
+    shutil.rmtree(out, ignore_errors=True)  # of an earlier comparison, with other views
     out.mkdir()
     paths = []
+    seeds = ", ".join(map(str, sorted({run.seed for run, _ in runs})))
     for found in sorted(folder.glob("photo-*.png")):
         row = int(found.stem.removeprefix("photo-"))
         pictures = {run.method: read_picture(path / f"merged-{row:04d}.png") for run, path in runs}
         name = next(view.name for view in first.views if view.row == row)
         paths.append(out / f"view-{row:04d}.png")
-        seeds = ", ".join(map(str, sorted({run.seed for run, _ in runs})))
         title = f"{first.scene}, held-out view {name}, merged, seed {seeds}"
         draw_comparison(read_picture(found), pictures, title, paths[-1])
     return paths
-
-
-def _show(axes: Axes, picture: NDArray, title: str) -> AxesImage:
-    axes.set_title(title)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[:].set_visible(False)
-    return axes.imshow(picture, interpolation="nearest")
-
-
-def _show_error(axes: Axes, error: NDArray[np.float32], name: str) -> AxesImage:
-    image = _show(axes, error, f"error of {name}, mean {100 * float(error.mean()):.1f}%")
-    image.set_cmap(ERROR_COLORS)
-    image.set_clim(0, 1 / ERROR_GAIN)
-    return image
-
-
-def _add_scale(bar: Colorbar, more: str = "") -> None:
-    ticks = np.linspace(0, 1 / ERROR_GAIN, 6)
-    bar.set_ticks(ticks, labels=[f"{100 * tick:g}%" for tick in ticks])
-    bar.set_label(f"|picture - photo| x {ERROR_GAIN}{more}")

@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Any
 
 from abcd_ns.lab.job import Settings
 from abcd_ns.lab.results.run import Failure, Run
@@ -73,29 +74,6 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Line:
-    """One method's values."""
-
-    name: str
-    """The method, and after a comma how it differs."""
-    x: tuple[float, ...]
-    psnr: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Held-out PSNR against one thing."""
-
-    name: str
-    title: str
-    x_label: str
-    lines: tuple[Line, ...]
-    note: str = ""
-    level: float | None = None
-    """One block, where it does not depend on x; dB."""
-
-
-@dataclass(frozen=True)
 class Results:
     """The whole of results.json."""
 
@@ -114,7 +92,8 @@ class Results:
     arms: tuple[Arm, ...] = ()
     """Those with a run."""
     outcomes: tuple[Outcome, ...] = ()
-    curves: tuple[Curve, ...] = ()
+    curves: tuple[dict[str, Any], ...] = ()
+    """Of older stability reports: held-out PSNR against one thing each."""
     failures: tuple[Failure, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     findings: tuple[str, ...] = ()

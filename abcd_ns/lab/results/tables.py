@@ -1,7 +1,7 @@
-"""Results as tables: what is measured, in which words and with how many digits."""
+"""Results in words: what they say, a sentence each, and as tables, with how many digits."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -13,8 +13,8 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
-from abcd_ns.lab.job import HELD_OUT_EVERY
-from abcd_ns.lab.results.results import Arm, Curve, Outcome, Results
+from abcd_ns.lab.job import AS_IT_IS, HELD_OUT_EVERY
+from abcd_ns.lab.results.results import TERRAIN, Arm, Outcome, Results
 from abcd_ns.lab.results.run import Run
 from abcd_ns.machine import Machine
 from abcd_ns.units import GIB, MIB
@@ -22,6 +22,12 @@ from abcd_ns.units import GIB, MIB
 TABLE_FILE = "table.md"
 NOTHING = "-"
 """Stands where there is no value."""
+NEAR_DB = 0.2
+"""How far below the best fewer Gaussians may be and still count as enough."""
+GOAL_GROWTH = 0.05
+"""Growth of peak memory that is allowed from the smallest terrain to the largest."""
+MOST_COLUMNS = 5
+"""Arms that stand beside each other; more stand below each other."""
 Rows = list[list[str]]
 """Of a table, its titles first."""
 
@@ -62,13 +68,53 @@ MEASURES = (
     Measure("of a visit, layers (s)", "memory.layer_seconds", 1),
 )
 """Of an arm."""
-MOST_COLUMNS = 5
-"""Arms that stand beside each other; more stand below each other."""
+
+
+def findings_of(results: Results) -> tuple[str, ...]:
+    """Best and worst arm of each method, or the growth of memory, or the scenarios that pass."""
+    if results.outcomes:
+        return (headline(results.outcomes),)
+    if results.kind == TERRAIN:
+        return _of_growth(results)
+    several = (arms for arms in map(results.of, results.methods) if len(arms) > 1)
+    return tuple(_of_arms(arms, results.labels) for arms in several)
+
+
+def headline(outcomes: Sequence[Outcome]) -> str:
+    """One sentence about all scenarios."""
+    failed = ", ".join(outcome.id for outcome in outcomes if not outcome.passed)
+    worse = ", ".join(outcome.id for outcome in outcomes if outcome.worse)
+    text = f"{sum(outcome.passed for outcome in outcomes)} of {len(outcomes)} scenarios pass"
+    text += f"; these fail: {failed}" if failed else ""
+    return text + (f"; one block does better, by however little, in {worse}." if worse else ".")
+
+
+def _of_arms(arms: Sequence[Arm], labels: Mapping[str, str]) -> str:
+    best, worst = (pick(arms, key=lambda arm: arm.psnr) for pick in (max, min))
+    fewest = min((arm for arm in arms if best.psnr - arm.psnr <= NEAR_DB), key=lambda arm: arm.gaussians)
+    return (
+        f"Best: {labels[best.name]}, {best.psnr:.2f} dB. Worst: {labels[worst.name]}, {worst.psnr:.2f} dB. "
+        f"Gap: {best.psnr - worst.psnr:.2f} dB. Fewest Gaussians within {NEAR_DB:g} dB of the best: "
+        f"{fewest.gaussians:,.0f} ({labels[fewest.name]}, {fewest.psnr:.2f} dB)."
+    )
+
+
+def _of_growth(results: Results) -> tuple[str, ...]:
+    """Of ABCD's peak memory, from the smallest terrain to the largest."""
+    arms, said = results.of("abcd"), []
+    for name, field in (("peak RAM grows", "peak_rss_bytes"), ("GPU memory", "peak_device_bytes")):
+        sizes = [getattr(arm.runs[0], field) for arm in arms]
+        said += [f"{name} by {sizes[-1] / sizes[0] - 1:.1%}"] if all(sizes) else []
+    if len(arms) < 2:
+        return ()
+    grown = f"From {arms[0].value} to {arms[-1].value} blocks of ABCD, {', '.join(said)}"
+    return (f"{grown}; allowed: {GOAL_GROWTH:.0%}.",)
 
 
 def cell(runs: Sequence[Run], measure: Measure) -> str:
     """The measure of an arm's runs: a number, or mean and standard deviation over the seeds (n - 1)."""
-    values = [_value(run, measure.field) for run in runs]
+    parts = measure.field.split(".")
+    values = [reduce(lambda record, name: getattr(record, name, None), parts, run) for run in runs]
     if not values or any(value is None for value in values):
         return NOTHING
     return mean_of([value / measure.unit for value in values], f",.{measure.digits}f")
@@ -84,42 +130,47 @@ def rows(results: Results) -> Rows:
     """A column for each arm, or a row where there are many. What nobody knows is left out."""
     table = [["", *(arm.name for arm in results.arms)]]
     for measure in MEASURES:
+        if measure.field == "psnr" and results.settings is None:
+            continue  # of crops that were trained on
         table.append([measure.title, *(cell(arm.runs, measure) for arm in results.arms)])
         if measure.field == "psnr_merged":
             table.append(["difference (dB)", *(_difference(arm, results) for arm in results.arms)])
-    if results.settings is None:
-        table = [row for row in table if row[0] != MEASURES[0].title]  # of crops that were trained on
     table = [row for row in table if set(row[1:]) != {NOTHING}]
-    return (
-        table if len(results.arms) <= MOST_COLUMNS else [list(column) for column in zip(*table, strict=True)]
-    )
+    many = len(results.arms) > MOST_COLUMNS
+    return [list(column) for column in zip(*table, strict=True)] if many else table
+
+
+def _difference(arm: Arm, results: Results) -> str:
+    """Of merged PSNR to the arm without changes, over the seeds that both have."""
+    base = results.baseline(arm)
+    theirs = {run.seed: run.psnr_merged for run in base.runs} if base and results.settings else {}
+    pairs = [run.psnr_merged - theirs[run.seed] for run in arm.runs if run.seed in theirs]
+    return mean_of(pairs, "+.2f") if pairs else NOTHING
 
 
 def notes(results: Results) -> list[str]:
     """What a reader of the table has to know, a sentence each."""
-    found = [] if results.settings is None else [_protocol(results)]
-    found.append(about_machine(results.machine))
+    found = [about_machine(results.machine)]
+    if results.settings is not None:
+        found = [_protocol(results), *found]
+        found.append("Evaluation, saving and compiling are left out of the training time.")
+        for run in results.runs:
+            found += [f"LPIPS is missing: {run.lpips_reason}."] if run.lpips_reason else []
+            found += [f"peak GPU memory is missing: {run.peak_device_note}."] if run.peak_device_note else []
+            if run.ordering_gap_note:
+                found.append(f"{run.method}: no ordering gap ({run.ordering_gap_note}).")
     if footings := [run.memory for run in results.runs if run.memory is not None]:
         base = min(footing.base_rss_bytes for footing in footings) / MIB
         found.append(f"Of the RAM, {base:,.0f} MiB are Python, torch and kernels, before any scene.")
-    if results.settings is not None:
-        found.append("Evaluation, saving and compiling are left out of the training time.")
     if len(results.seeds) > 1:
         found.append("Numbers are means over the seeds ± their standard deviation.")
     if any(results.baseline(arm) for arm in results.arms):
         found.append("Differences are those of merged PSNR to the method as it is, taken seed by seed.")
         found += ["One seed: a few tenths of a dB may be chance."] if len(results.seeds) == 1 else []
-    reasons = {}
-    for run in results.runs if results.settings is not None else ():
-        told = {"LPIPS": run.lpips_reason, "peak GPU memory": run.peak_device_note}
-        reasons |= {name: reason for name, reason in told.items() if reason}
-        if run.ordering_gap_note:
-            found.append(f"{run.method}: no ordering gap ({run.ordering_gap_note}).")
-    found += [f"{name} is missing: {reason}." for name, reason in reasons.items()]
     found += results.notes
     found += [f"{left.method} is left out: {left.reason}." for left in results.left_out]
     for failure in results.failures:
-        what = "" if failure.variant == "default" else f" {failure.variant},"
+        what = "" if failure.variant == AS_IT_IS else f" {failure.variant},"
         found.append(f"{failure.method},{what} seed {failure.seed} failed ({failure.log}): {failure.reason}")
     return list(dict.fromkeys([*found, f"Command: `{results.command}`, {results.date[:10]}."]))
 
@@ -141,7 +192,7 @@ def about_machine(machine: Machine) -> str:
     """One sentence about what the runs ran on."""
     return (
         f"{machine.cpu}, {machine.cores} cores, {machine.torch_threads} torch threads, "
-        f"{machine.ram_bytes / 2**30:.0f} GiB RAM, {machine.gpu or 'no GPU'}, {machine.os}."
+        f"{machine.ram_bytes / GIB:.0f} GiB RAM, {machine.gpu or 'no GPU'}, {machine.os}."
     )
 
 
@@ -150,10 +201,17 @@ def write_table(results: Results, path: Path) -> None:
     parts = [*results.findings]
     parts += [markdown(rows(results))] if results.arms else []
     parts += [markdown(_of_outcomes(results.outcomes), align="---")] if results.outcomes else []
-    for curve in results.curves:
-        parts += [markdown(_of_curve(curve)), *([f"{curve.note}."] if curve.note else [])]
     parts.append("\n".join(f"- {note}" for note in notes(results)))
     path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _of_outcomes(outcomes: Sequence[Outcome]) -> Rows:
+    table = [["", "fails elsewhere", "done here", "what each method did", ""]]
+    for found in outcomes:
+        said = "<br>".join(f"{method}: {words}" for method, words in found.said.items())
+        verdict = ("pass" if found.passed else "**fail**") + (", one block is better" if found.worse else "")
+        table.append([found.id, found.fails, f"{found.done}<br>*pass:* {found.rule}", said, verdict])
+    return table
 
 
 def markdown(table: Sequence[Sequence[str]], align: str = "---:") -> str:
@@ -166,11 +224,6 @@ def markdown(table: Sequence[Sequence[str]], align: str = "---:") -> str:
 def _in_cell(text: str) -> str:
     """Bars end a cell, also after a backslash that is escaped itself, and new lines a row."""
     return re.sub(r"(\\*)\|", r"\1\1\\|", " ".join(text.splitlines()))
-
-
-def print_table(results: Results, console: Console) -> None:
-    """The same in the terminal."""
-    print_rows(rows(results), [*results.findings, *notes(results)], console)
 
 
 def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: Console) -> None:
@@ -189,32 +242,3 @@ def print_rows(table: Sequence[Sequence[str]], remarks: Sequence[str], console: 
     console.width = width
     for remark in remarks:
         console.print(f"- {remark}", highlight=False, markup=False, emoji=False, soft_wrap=True)
-
-
-def _difference(arm: Arm, results: Results) -> str:
-    """Of merged PSNR to the arm without changes, over the seeds that both have."""
-    base = results.baseline(arm)
-    theirs = {run.seed: run.psnr_merged for run in base.runs} if base and results.settings else {}
-    pairs = [run.psnr_merged - theirs[run.seed] for run in arm.runs if run.seed in theirs]
-    return mean_of(pairs, "+.2f") if pairs else NOTHING
-
-
-def _value(run: Run, field: str) -> float | None:
-    """A field, after a dot of a part that a run may lack."""
-    return reduce(lambda record, name: getattr(record, name, None), field.split("."), run)
-
-
-def _of_outcomes(outcomes: Sequence[Outcome]) -> Rows:
-    table = [["", "fails elsewhere", "done here", "what each method did", ""]]
-    for found in outcomes:
-        said = "<br>".join(f"{method}: {words}" for method, words in found.said.items())
-        verdict = ("pass" if found.passed else "**fail**") + (", one block is better" if found.worse else "")
-        table.append([found.id, found.fails, f"{found.done}<br>*pass:* {found.rule}", said, verdict])
-    return table
-
-
-def _of_curve(curve: Curve) -> Rows:
-    values = curve.lines[0].x
-    table = [[f"{curve.title}: held-out PSNR (dB) by {curve.x_label}", *(f"{x:g}" for x in values)]]
-    table += [[line.name, *(f"{value:.2f}" for value in line.psnr)] for line in curve.lines]
-    return table if curve.level is None else [*table, ["one block", *[f"{curve.level:.2f}"] * len(values)]]

@@ -1,4 +1,4 @@
 """Training runs, each in a process of its own, under one protocol.
 
-`experiment` carries out a plan, `runner` starts its jobs, `worker` or `terrain` is what runs in the process.
+`runner` does a plan; `worker` or `terrain` is what runs in a job's process.
 """

@@ -50,17 +50,17 @@ def check_scene(job: Job) -> None:
 
 
 def check_options(job: Job) -> None:
-    """Whether the options of the job's variant exist and go together.
+    """Check that the options that the job changes go together.
 
     Raises:
         UserError: they do not.
     """
-    if not job.variant.changes:
+    if not job.changes:
         return
     pipeline = _abcd(job).pipeline
     mirror(pipeline.training, pipeline.model)
     if not 1 <= pipeline.blocks <= MAX_BLOCKS:
-        raise UserError(f"{job.variant.name}: blocks must be 1 to {MAX_BLOCKS}, not {pipeline.blocks}.")
+        raise UserError(f"{job.variant}: blocks must be 1 to {MAX_BLOCKS}, not {pipeline.blocks}.")
 
 
 def registered(method: str) -> AbcdTrainerConfig | None:
@@ -83,7 +83,7 @@ def _abcd(job: Job) -> AbcdTrainerConfig:
     pipeline.training.density.max_gaussians = settings.max_gaussians
     if not settings.densify:
         pipeline.training.density.strategy = "off"
-    change_options(pipeline, job.variant)
+    change_options(pipeline, job.changes)
     return config
 
 

@@ -12,9 +12,8 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
-from abcd_ns.engine.gaussians.param_swap import live_gaussians
 from abcd_ns.engine.render.loss import psnr
-from abcd_ns.engine.types import Gaussians, Layer
+from abcd_ns.engine.types import Layer
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.nerfstudio.metrics import counted, image_metrics
 from abcd_ns.nerfstudio.model import AbcdModel
@@ -53,25 +52,11 @@ def held_out_views(pipeline: VanillaPipeline) -> Iterator[HeldOutView]:
         yield HeldOutView(row, dataset.image_filenames[row].name, camera, photo, batch.get("mask"))
 
 
-def everything(model: SplatfactoModel) -> Gaussians:
-    """All Gaussians of a trained model, in RAM."""
-    if isinstance(model, AbcdModel):
-        return model.merged()
-    return live_gaussians(model.gauss_params).detach().to("cpu")
-
-
 def draw_merged(model: SplatfactoModel, camera: Cameras) -> Picture:
     """All Gaussians at once, as any viewer draws them."""
     if isinstance(model, AbcdModel):
         return _on_background(model.draw_merged(model.view(camera)).layer, model)
     return model.get_outputs_for_camera(camera)["rgb"]
-
-
-def draw_composited(model: SplatfactoModel, camera: Cameras) -> Picture:
-    """Block by block, through layers; a model without blocks has one way to be drawn only."""
-    if isinstance(model, AbcdModel):
-        return _on_background(model.draw_composited(model.view(camera)), model)
-    return draw_merged(model, camera)
 
 
 def mean_psnr(pipeline: VanillaPipeline) -> float:
@@ -83,27 +68,26 @@ def mean_psnr(pipeline: VanillaPipeline) -> float:
 
 
 def draw_held_out(pipeline: VanillaPipeline, rows: Collection[int] | None = None) -> Iterator[Drawn]:
-    """Every held-out view, or those at `rows`, drawn both ways, in the order of the rows."""
+    """Every held-out view, or those at `rows`, in the order of the rows: all Gaussians at once, and block by
+    block. For a model without blocks both are the same picture."""
     model = pipeline.model
     with undisturbed(pipeline):
         for view in held_out_views(pipeline):
             if rows is None or view.row in rows:
-                yield Drawn(view, draw_merged(model, view.camera), draw_composited(model, view.camera))
+                merged = composited = draw_merged(model, view.camera)
+                if isinstance(model, AbcdModel):
+                    composited = _on_background(model.draw_composited(model.view(view.camera)), model)
+                yield Drawn(view, merged, composited)
 
 
 def score(drawn: Drawn) -> ViewScore:
     """How close both pictures come to the photo."""
-    photo, mask = drawn.view.photo, drawn.view.mask
-    composited, merged = (image_metrics(p, photo, mask=mask) for p in (drawn.composited, drawn.merged))
-    return ViewScore(
-        row=drawn.view.row,
-        name=drawn.view.name,
-        psnr=composited["psnr"],
-        ssim=composited.get("ssim"),
-        lpips=composited.get("lpips"),
-        psnr_merged=merged["psnr"],
-        ssim_merged=merged.get("ssim"),
+    view = drawn.view
+    composited, merged = (
+        image_metrics(picture, view.photo, mask=view.mask) for picture in (drawn.composited, drawn.merged)
     )
+    scores = (composited["psnr"], composited.get("ssim"), composited.get("lpips"))
+    return ViewScore(view.row, view.name, *scores, merged["psnr"], merged.get("ssim"))
 
 
 def squared_gap(drawn: Drawn) -> float:

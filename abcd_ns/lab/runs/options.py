@@ -1,67 +1,109 @@
-"""A method's options by their dotted names: found, read from text by their type, and set."""
+"""Options: those of commands, checked; and a method's own, by their dotted names, read from text and set."""
 
 import dataclasses
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Annotated, Any, Literal, Union
 
 import msgspec
+import tyro
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.job import Change, Variant
 from abcd_ns.nerfstudio.options import nearest
 
+LOWEST = {"downscale": 1, "steps": 1, "evals": 1, "max_gaussians": 0, "pictures": 0}
+"""The least that a number may be, by option; 1 for those that are not here."""
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+"""A switch."""
+Number = Annotated[int, tyro.conf.arg(metavar="N")]
 PREFIX = "pipeline."
-"""May stand before a name, as in `ns-train`'s options."""
-SET_BY_THE_PROTOCOL = {
-    "max_seconds": "--seconds",
-    "training.seed": "--seeds",
-    "datamanager.data": "--data",
-    "datamanager.dataparser.data": "--data",
-    "datamanager.dataparser.downscale_factor": "--downscale",
+"""May stand before a method's option, as in `ns-train`."""
+_SCORED = "it would change the photos that scores are taken from"
+FIXED = {
+    "max_seconds": "set it with --seconds",
+    "training.seed": "set it with --seeds",
+    "datamanager.data": "set it with --data",
+    "datamanager.dataparser.data": "set it with --data",
+    "datamanager.dataparser.downscale_factor": "set it with --downscale",
+    "datamanager.dataparser.eval_mode": _SCORED,
+    "datamanager.dataparser.eval_interval": _SCORED,
+    "datamanager.camera_res_scale_factor": _SCORED,
 }
-"""Options that all runs of a folder share, and what sets them."""
-HELD_OUT = {
-    "datamanager.dataparser.eval_mode",
-    "datamanager.dataparser.eval_interval",
-    "datamanager.camera_res_scale_factor",
+"""Options that all runs of a folder share, and why."""
+WORDS = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    Path: "a path",
+    type(None): "none",
 }
-"""Options that decide which photos scores are taken from, and of what size."""
-SCALARS = (bool, int, float, str, Path)
-WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
+"""Types of options that can be written as one word, beside Literal, and what may be written."""
 
 
-def parse_variant(text: str, pipeline: Any) -> Variant:
+def words(metavar: str, *aliases: str) -> Any:
+    """How --help shows an option without a default of its own."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="", aliases=aliases or None)
+
+
+def check_ranges(given: Mapping[str, int | None], low: int = 1) -> None:
+    """Check that every number is as large as it must be; None is passed over.
+
+    Args:
+        low: the least that those may be that `LOWEST` does not name.
+
+    Raises:
+        UserError: one is not.
+    """
+    for name, value in given.items():
+        least = LOWEST.get(name, low)
+        if value is not None and value < least:
+            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {least}.")
+
+
+def check_numbers(option: str, numbers: Sequence[int], low: int) -> None:
+    """Check that a list has different numbers from `low` up.
+
+    Raises:
+        UserError: it has not.
+    """
+    if not numbers or len(set(numbers)) < len(numbers) or min(numbers) < low:
+        text = " ".join([option, *map(str, numbers)])
+        raise UserError(f"{text}: give different numbers from {low} up.")
+
+
+def parse_changes(text: str, pipeline: Any) -> tuple[str, ...]:
     """One or several changes, `name=value name=value`, each checked against the options of `pipeline`.
 
     Raises:
-        UserError: a name or value does not fit.
+        UserError: a name or value does not fit, or an option may not be varied.
     """
-    changes = []
+    found, known = {}, option_names(pipeline)
     for word in text.split():
         name, equals, value = word.partition("=")
+        path = name.removeprefix("--").removeprefix(PREFIX).replace("-", "_")
         if not equals or not name:
             raise UserError(f"--vary {word!r} is no change of an option; write NAME=VALUE.")
-        change = Change(name.removeprefix("--").removeprefix(PREFIX).replace("-", "_"), value)
-        read_value(change, pipeline)
-        changes.append(change)
-    if len({change.path for change in changes}) < max(len(changes), 1):
-        raise UserError(f"--vary {text!r}: change at least one option, and none of them twice.")
-    return Variant(tuple(changes))
+        if path in FIXED:
+            raise UserError(f"{path} cannot be varied: {FIXED[path]}.")
+        if path in found:
+            raise UserError(f"--vary {text!r} changes {path} twice.")
+        read_value(path, value, known)
+        found[path] = value
+    if not found:
+        raise UserError(f"--vary {text!r}: change at least one option.")
+    return tuple(f"{path}={value}" for path, value in found.items())
 
 
-def change_options(pipeline: Any, variant: Variant) -> None:
-    """Set what the variant changes, in place.
-
-    Raises:
-        UserError: a name or value does not fit.
-    """
-    for change in variant.changes:
-        _set(pipeline, change.path, read_value(change, pipeline))
+def change_options(pipeline: Any, changes: Sequence[str]) -> None:
+    """Set what each `path=value` of `parse_changes` says, in place."""
+    known = option_names(pipeline)
+    for path, _, value in (change.partition("=") for change in changes):
+        _set(pipeline, path, read_value(path, value, known))
 
 
 def set_options(config: Any, values: Mapping[str, bool | int | float | str | None], where: str) -> None:
@@ -80,9 +122,9 @@ def set_options(config: Any, values: Mapping[str, bool | int | float | str | Non
         if path not in known:
             continue
         try:
-            _set(config, path, _read(known[path], str(value)))
-        except ValueError:
-            raise UserError(f"{where}: {path} is {value!r}; it must be {_words(known[path])}.") from None
+            _set(config, path, read_value(path, str(value), known))
+        except UserError as error:
+            raise UserError(f"{where}: {error}") from None
 
 
 def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -98,34 +140,33 @@ def option_names(config: Any, prefix: str = "") -> dict[str, Any]:
             continue
         if dataclasses.is_dataclass(value):
             found |= option_names(value, f"{name}.")
-        elif _is_a_word(hints[field.name]):
+        elif all(a in WORDS or typing.get_origin(a) is Literal for a in _alternatives(hints[field.name])):
             found[name] = hints[field.name]
     return found
 
 
-def read_value(change: Change, pipeline: Any) -> Any:
-    """The value of a change, by the type of its option.
+def read_value(path: str, text: str, known: Mapping[str, Any]) -> Any:
+    """The value that a word gives an option, by the option's type in `option_names`.
 
     Raises:
-        UserError: there is no such option, it is the protocol's, or the value is not of its type.
+        UserError: there is no such option, or the value is not of its type.
     """
-    if change.path in SET_BY_THE_PROTOCOL:
-        flag = SET_BY_THE_PROTOCOL[change.path]
-        raise UserError(f"{change.path} cannot be varied: it is the same in all runs; set it with {flag}.")
-    if change.path in HELD_OUT:
-        raise UserError(
-            f"{change.path} cannot be varied: it would change the photos that scores are taken from."
-        )
-    known = option_names(pipeline)
-    if change.path not in known:
-        near = " or ".join(nearest(change.path, known))
-        hint = f"did you mean {near}?" if near else "docs/reference.md lists them, under --pipeline."
-        raise UserError(f"There is no option {change.path!r}; {hint}")
+    if path not in known:
+        near = " or ".join(nearest(path, known))
+        said = f"did you mean {near}?" if near else "docs/reference.md lists them, under --pipeline."
+        raise UserError(f"There is no option {path!r}; {said}")
+    hint = known[path]
+    if text.lower() == "none" and type(None) in _alternatives(hint):
+        return None
     try:
-        return _read(known[change.path], change.value)
+        value = msgspec.convert(text, hint, strict=False, dec_hook=lambda kind, word: kind(word))
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(text)
     except ValueError:
-        words = _words(known[change.path])
-        raise UserError(f"{change} does not fit: {change.path} must be {words}.") from None
+        kinds = _alternatives(hint)
+        may = [w for kind in kinds for w in ([WORDS[kind]] if kind in WORDS else typing.get_args(kind))]
+        raise UserError(f"{path} is {text!r}; it must be {' or '.join(map(str, may))}.") from None
+    return value
 
 
 def _set(config: Any, path: str, value: Any) -> None:
@@ -154,32 +195,3 @@ def _alternatives(hint: Any) -> tuple[Any, ...]:
     return (hint,)
 
 
-def _is_a_word(hint: Any) -> bool:
-    alternatives = [a for a in _alternatives(hint) if a is not type(None)]
-    return bool(alternatives) and all(a in SCALARS or typing.get_origin(a) is Literal for a in alternatives)
-
-
-def _read(hint: Any, text: str) -> Any:
-    """The value that a word says, by the option's type.
-
-    Raises:
-        ValueError: it says none.
-    """
-    if text.lower() == "none" and type(None) in _alternatives(hint):
-        return None
-    value = msgspec.convert(text, hint, strict=False, dec_hook=lambda kind, word: kind(word))
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{text} is no setting of anything here")
-    return value
-
-
-def _words(hint: Any) -> str:
-    words = []
-    for alternative in _alternatives(hint):
-        if alternative is type(None):
-            words.append("none")
-        elif typing.get_origin(alternative) is Literal:
-            words += map(str, typing.get_args(alternative))
-        else:
-            words.append(WORDS[alternative])
-    return " or ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)

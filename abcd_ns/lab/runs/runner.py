@@ -1,28 +1,130 @@
-"""Runs jobs one after the other, each in a process of its own, and keeps what earlier calls finished."""
+"""Does a plan: each job in a process of its own, what earlier calls finished reused, results after each.
 
+At the end is what such a process does: read its job, do it, write its run beside it.
+"""
+
+import dataclasses
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from abcd_ns.errors import UserError
-from abcd_ns.lab.job import Job
+from abcd_ns.lab.job import Job, Plan, Settings, TerrainJob
 from abcd_ns.lab.results.records import RecordError, decode, encode, read_json, write_json
+from abcd_ns.lab.results.results import RESULTS_FILE, SCHEMA, Arm, LeftOut, Results
 from abcd_ns.lab.results.run import Failure, Run
-from abcd_ns.lab.runs.work import RUN_FILE
+from abcd_ns.lab.results.tables import TABLE_FILE, findings_of, write_table
+from abcd_ns.machine import (
+    Machine,
+    describe_machine,
+    describe_versions,
+    peak_device_bytes,
+    peak_rss_bytes,
+)
 
-JOB_FILE, LOG_FILE = "job.json", "log.txt"
-POLL_SECONDS = 0.2
-SECONDS_BETWEEN_LINES = 30.0
-"""Where the output is no terminal, a line says this often that a run is still going on."""
+JOB_FILE, LOG_FILE, RUN_FILE = "job.json", "log.txt", "run.json"
+OUT_OF_MEMORY = re.compile(r"CUDA (error: )?out of memory")
+"""How torch and CUDA say it, in the last line of a log."""
+MOST_IN_ONE_BLOCK = 4_000_000
+"""Gaussians; larger terrains are not tried as one block."""
+
+
+def run_jobs(plan: Plan, console: Console, overwrite: bool = False) -> Iterator[Results]:
+    """Do the plan's jobs, one by one; after each, all that was found so far.
+
+    Args:
+        overwrite: drop the runs that its folder holds.
+
+    Raises:
+        UserError: the folder holds something else, or runs that cannot be compared with these.
+    """
+    machine, found, left_out = describe_machine(), [], {}
+    claim(plan.out, plan.kind, {**encode(plan.settings), **encode(machine)}, overwrite)
+    for number, job in enumerate(plan.jobs, start=1):
+        if job.method in left_out:
+            continue
+        outcome, reason = None, why_left_out(job)
+        if reason is None:
+            outcome = finish_job(job, plan.out, console, f"[{number}/{len(plan.jobs)}] {job.name}")
+            reason = why_left_out(job, outcome)
+        if reason is None:
+            found.append((job, outcome))
+        else:
+            left_out[job.method] = reason
+            say(console, f"{job.method} is left out: {reason}.")
+        yield gather(plan, found, machine, left_out)
+
+
+def why_left_out(job: Job, outcome: Run | Failure | None = None) -> str | None:
+    """Why the job's method cannot run on this machine or under this protocol, if it cannot.
+
+    Args:
+        outcome: what came of the job, if it was tried.
+    """
+    if isinstance(job, TerrainJob) and job.method == "abcd-monolithic":
+        if job.value * job.settings.gaussians > MOST_IN_ONE_BLOCK:
+            return f"{job.value} tiles have more than {MOST_IN_ONE_BLOCK:,} Gaussians"
+        if isinstance(outcome, Failure) and OUT_OF_MEMORY.search(outcome.reason):
+            return f"as one block, {job.value} tiles ran out of GPU memory"
+    if job.method == "splatfacto":
+        import torch  # takes seconds, for which `--help` has no use
+
+        if not torch.cuda.is_available():
+            return "it needs a CUDA device, and there is none here"
+        if job.settings.max_gaussians:
+            return "it has no limit on the number of Gaussians, and this protocol sets one"
+    return None
+
+
+def gather(
+    plan: Plan, found: Sequence[tuple[Job, Run | Failure]], machine: Machine, left_out: Mapping[str, str]
+) -> Results:
+    """What came of the plan's jobs, with its findings; `left_out` has reasons by method."""
+    runs: dict[tuple, list[Run]] = {(job.method, job.variant, job.value): [] for job in plan.jobs}
+    for job, outcome in found:
+        if isinstance(outcome, Run):
+            runs[job.method, job.variant, job.value].append(outcome)
+    scene = plan.settings if isinstance(plan.settings, Settings) else None
+    results = new_results(
+        plan.kind,
+        plan.command,
+        machine,
+        settings=scene and dataclasses.replace(scene, data=scene.scene),
+        seeds=tuple(dict.fromkeys(job.seed for job in plan.jobs)),
+        arms=tuple(Arm(*key, tuple(of)) for key, of in runs.items() if of),
+        failures=tuple(outcome for _, outcome in found if isinstance(outcome, Failure)),
+        left_out=tuple(LeftOut(*pair) for pair in left_out.items()),
+    )
+    return dataclasses.replace(results, findings=findings_of(results))
+
+
+def new_results(kind: str, command: str, machine: Machine, **fields: Any) -> Results:
+    """Results of today, by the packages that are installed; `fields` are more of theirs."""
+    date = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return Results(SCHEMA, kind, date, command, machine, describe_versions(), **fields)
+
+
+def write_report(results: Results, out: Path) -> list[Path]:
+    """Write results.json and the table; returns their paths."""
+    write_json(out / RESULTS_FILE, encode(results))
+    write_table(results, out / TABLE_FILE)
+    return [out / RESULTS_FILE, out / TABLE_FILE]
+
+
+def say(console: Console, text: object) -> None:
+    """Print a line as it is, whatever names stand in it."""
+    console.print(str(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = False) -> None:
@@ -30,7 +132,7 @@ def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = Fal
 
     Args:
         kind: of the experiment, in words.
-        shared: what all its runs have in common, by part and name: values of JSON's.
+        shared: what all its runs have in common, by name: values of JSON's.
         overwrite: drop the runs that are there.
 
     Raises:
@@ -41,7 +143,13 @@ def claim(out: Path, kind: str, shared: Mapping[str, Any], overwrite: bool = Fal
         if take_folder(out, marker, kind) and overwrite:
             shutil.rmtree(out / "runs", ignore_errors=True)
         elif marker.exists():
-            _check_same(read_json(marker), shared, out)
+            theirs = read_json(marker)
+            for name, new in shared.items():
+                if (old := theirs.get(name) if isinstance(theirs, dict) else None) != new:
+                    raise UserError(
+                        f"--out {out} holds runs with {name} {old}, not {new}, which cannot be "
+                        "compared; name another folder, or drop them with --overwrite."
+                    )
         write_json(marker, dict(shared))
 
 
@@ -72,17 +180,6 @@ def take_folder(out: Path, marker: Path, kind: str) -> bool:
     return marker.exists()
 
 
-def _check_same(theirs: Any, mine: Mapping[str, Any], out: Path) -> None:
-    for part, values in mine.items():
-        for name, new in values.items():
-            old = theirs.get(part, {}).get(name) if isinstance(theirs, dict) else None
-            if old != new:
-                raise UserError(
-                    f"--out {out} holds runs with {name} {old}, not {new}, which cannot be "
-                    "compared; name another folder, or drop them with --overwrite."
-                )
-
-
 def finished_run(job: Job, out: Path) -> Run | None:
     """The run of the very same job that an earlier call finished, if any."""
     folder = job.folder(out)
@@ -98,10 +195,9 @@ def finish_job(job: Job, out: Path, console: Console, head: str) -> Run | Failur
     """The job's run, made now if no earlier call did; `head` begins every line about it."""
     outcome, how = finished_run(job, out), "reused, "
     if outcome is None:
-        outcome, how = run_job(job, out, console, head), ""
-    console.print(
-        f"{head}: {how}{_short(outcome)}", markup=False, emoji=False, highlight=False, soft_wrap=True
-    )
+        with console.status(f"{escape(head)}; log: {escape(str(job.folder(out) / LOG_FILE))}"):
+            outcome, how = run_job(job, out), ""
+    say(console, f"{head}: {how}{_short(outcome)}")
     return outcome
 
 
@@ -110,32 +206,28 @@ def command_of(job: Job) -> tuple[str, ...]:
     return (sys.executable, "-m", job.worker)
 
 
-def run_job(job: Job, out: Path, console: Console, head: str) -> Run | Failure:
-    """Start the job's process and wait for it."""
+def run_job(job: Job, out: Path) -> Run | Failure:
+    """Start the job's process and wait for it; Ctrl-C ends it, too."""
     folder = job.folder(out)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     write_json(folder / JOB_FILE, encode(job))
     log = folder / LOG_FILE
-    with open(log, "wb") as stream:
-        process = subprocess.Popen(
-            [*command_of(job), str(folder / JOB_FILE)],
-            stdin=subprocess.DEVNULL,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb"},
-        )
-        try:
-            _wait(process, log, console, head)
-        finally:
-            if process.poll() is None:  # Ctrl-C
-                process.terminate()
-                process.wait()
-            for name in job.scratch:
-                shutil.rmtree(folder / name, ignore_errors=True)
-    run = finished_run(job, out) if process.returncode == 0 else None
-    reason = _reason(process.returncode, log)
-    return run or Failure(job.method, job.seed, reason, str(log.relative_to(out)), job.variant.name)
+    try:
+        with open(log, "wb") as stream:
+            code = subprocess.run(
+                [*command_of(job), str(folder / JOB_FILE)],
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb"},
+                check=False,
+            ).returncode
+    finally:
+        for name in job.scratch:
+            shutil.rmtree(folder / name, ignore_errors=True)
+    run = finished_run(job, out) if code == 0 else None
+    return run or Failure(job.method, job.seed, _reason(code, log), str(log.relative_to(out)), job.variant)
 
 
 def last_line(log: Path) -> str:
@@ -144,19 +236,6 @@ def last_line(log: Path) -> str:
         stream.seek(max(0, log.stat().st_size - 8192))
         lines = stream.read().decode("utf-8", "replace").replace("\r", "\n").splitlines()
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
-
-
-def _wait(process: subprocess.Popen, log: Path, console: Console, head: str) -> None:
-    began = told = time.monotonic()
-    with console.status(head) as status:
-        while process.poll() is None:
-            time.sleep(POLL_SECONDS)
-            now = time.monotonic()
-            text = f"{head}: {now - began:.0f} s  {last_line(log)[:80]}"
-            status.update(text.replace("[", r"\["))
-            if not console.is_terminal and now - told > SECONDS_BETWEEN_LINES:
-                told = now
-                console.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def _reason(code: int, log: Path) -> str:
@@ -173,3 +252,31 @@ def _short(outcome: Run | Failure) -> str:
     gpu = "" if outcome.peak_device_bytes is None else f", {outcome.peak_device_bytes / 2**30:.2f} GiB of GPU"
     done = f"{outcome.gaussians:,} Gaussians, {outcome.steps:,} steps in {outcome.train_seconds:.0f} s"
     return f"{score}{done}, {outcome.peak_rss_bytes / 2**30:.2f} GiB of RAM{gpu}"
+
+
+def work(kind: type[Job], do: Callable[..., Run]) -> int:
+    """In a job's process, whose only argument is the job's file: do it; 0, or 2 for an error of the user's.
+
+    Args:
+        do: given the job and its folder.
+    """
+    (path,) = map(Path, sys.argv[1:])
+    job = decode(kind, read_json(path), str(path))
+    try:
+        found = do(job, path.resolve().parent)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    write_json(path.with_name(RUN_FILE), encode(found))
+    return 0
+
+
+def memory_of_run() -> dict[str, int | str | None]:
+    """The most that this process has held, by the names of a run's fields."""
+    allocated, reserved = peak_device_bytes()
+    return {
+        "peak_rss_bytes": peak_rss_bytes(),
+        "peak_device_bytes": allocated,
+        "peak_device_note": "no CUDA device" if allocated is None else None,
+        "peak_reserved_bytes": reserved,
+    }

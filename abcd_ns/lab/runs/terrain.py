@@ -12,7 +12,7 @@ import torch
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
 from abcd_ns.engine.gaussians.block_state import BlockState
 from abcd_ns.engine.gaussians.param_swap import nothing_live
-from abcd_ns.engine.render import loss, make_rasterizer
+from abcd_ns.engine.render import Rasterizer, loss, make_rasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
@@ -26,7 +26,7 @@ from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians
 from abcd_ns.lab.job import TerrainJob
 from abcd_ns.lab.results.run import Footing, Run
-from abcd_ns.lab.runs.work import memory_of_run, work
+from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.lab.world.land import Land
 from abcd_ns.machine import describe_versions, disk_bytes, peak_rss_bytes
 from abcd_ns.nerfstudio.run import STORE
@@ -45,26 +45,15 @@ def run(job: TerrainJob, folder: Path) -> Run:
     rasterizer.warm_up()
     loss.warm_up(device)
     base, began = peak_rss_bytes(), time.perf_counter()
-    land = Land(job.tiles, job.settings.gaussians, seed=job.seed)
+    land = Land(job.value, job.settings.gaussians, seed=job.seed)
     scene = make_scene(job, land, folder / STORE)
     made = time.perf_counter()
     coordinator = _coordinator(job, land, scene, rasterizer, device)
-    watch = _Watch(coordinator)
-    cameras = {view.index: view for view in land.cameras()}
-    # The visit to a single block lasts as long as the run.
-    wanted = WHOLE_STEPS if scene.tree.num_blocks == 1 else None
-    while len(watch.visits) < job.settings.visits if wanted is None else coordinator.state.step < wanted:
-        train_step(coordinator, lambda view, crop: land.crop(cameras[view], crop))
+    steps, visits = _train(coordinator, land, job.settings.visits)
     memory = memory_of_run()
     coordinator.close()
-    visits = watch.visits[1:] or watch.visits  # the first one's time holds the planning of the sweep
-    footing = Footing(
-        base_rss_bytes=base,
-        make_seconds=made - began,
-        plan_seconds=watch.first_step - made,
-        visit_seconds=fmean(v.seconds for v in visits) if visits else None,
-        layer_seconds=fmean(v.layer_seconds for v in visits) if visits else None,
-    )
+    last = [e.psnr for _, e in steps if e.visit == steps[-1][1].visit and math.isfinite(e.psnr)]
+    usual = visits[1:] or visits  # the first one's time holds the planning of the sweep
     return Run(
         method=job.method,
         scene="terrain",
@@ -74,17 +63,23 @@ def run(job: TerrainJob, folder: Path) -> Run:
         train_seconds=time.perf_counter() - made,
         total_seconds=time.time() - psutil.Process().create_time(),
         **dict.fromkeys(("ssim", "lpips", "psnr_merged", "ssim_merged", "ordering_gap_db")),
-        psnr=fmean(watch.psnr),
+        psnr=fmean(last),
         lpips_reason="nothing is held out",
         ordering_gap_note="nothing is held out",
-        gaussians=job.tiles * job.settings.gaussians,
+        gaussians=job.value * job.settings.gaussians,
         **memory,
         store_bytes=disk_bytes(folder / STORE),
-        layer_seconds=sum(visit.layer_seconds for visit in watch.visits),
+        layer_seconds=sum(visit.layer_seconds for visit in visits),
         curve=(),
         views=(),
         versions=describe_versions(),
-        memory=footing,
+        memory=Footing(
+            base_rss_bytes=base,
+            make_seconds=made - began,
+            plan_seconds=steps[0][0] - made,
+            visit_seconds=fmean(visit.seconds for visit in usual) if usual else None,
+            layer_seconds=fmean(visit.layer_seconds for visit in usual) if usual else None,
+        ),
     )
 
 
@@ -96,14 +91,15 @@ def make_scene(job: TerrainJob, land: Land, folder: Path) -> StoredScene:
     if whole:
         everything = Gaussians.cat([land.make_tile(tile) for tile in range(land.tiles)])
         store.commit({0: BlockState.fresh(everything).packed()})
-    else:
-        for block, tile in enumerate(land.tile_of(tree)):
-            store.commit({block: BlockState.fresh(land.make_tile(tile)).packed()})
-            print(f"tile {block + 1}/{land.tiles}", flush=True)
+        return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
+    for tile, block in enumerate(tree.assign(land.middles).tolist()):
+        store.commit({block: BlockState.fresh(land.make_tile(tile)).packed()})
     return StoredScene(tree, store, ram_bytes=job.settings.ram_budget_bytes)
 
 
-def _coordinator(job: TerrainJob, land: Land, scene: StoredScene, rasterizer, device) -> Coordinator:
+def _coordinator(
+    job: TerrainJob, land: Land, scene: StoredScene, rasterizer: Rasterizer, device: torch.device
+) -> Coordinator:
     config = TrainingConfig(
         recipe=Recipe(sh_ramp=0.0),
         # As large blocks have it. Small ones may draw more at once, for speed, which small lands do not have.
@@ -113,39 +109,30 @@ def _coordinator(job: TerrainJob, land: Land, scene: StoredScene, rasterizer, de
         background="black",
         density=DensityConfig(strategy="off"),  # or blocks would not be equal
     )
-    run = TrainingRun(
-        config,
-        Budget(steps=10**9),
-        scene,
-        land.cameras(),
-        rasterizer,
-        *nothing_live(3, device),
-        device=device,
-    )
-    return Coordinator(run)
+    live, budget = nothing_live(3, device), Budget(steps=10**9)
+    return Coordinator(TrainingRun(config, budget, scene, land.cameras(), rasterizer, *live, device=device))
 
 
-class _Watch:
-    """Takes note of visits, and of the first step."""
+def _train(
+    coordinator: Coordinator, land: Land, wanted: int
+) -> tuple[list[tuple[float, StepTaken]], list[VisitEnded]]:
+    """Train `wanted` visits; the steps, with the time of each, and the visits that ended."""
+    steps: list[tuple[float, StepTaken]] = []
+    visits: list[VisitEnded] = []
 
-    def __init__(self, coordinator: Coordinator) -> None:
-        self.visits: list[VisitEnded] = []
-        self.psnr: list[float] = []
-        self.first_step = 0.0
-        self._visit = 0
-        coordinator.announce.subscribe(self)
+    def listen(event: Event) -> None:
+        if isinstance(event, StepTaken):
+            steps.append((time.perf_counter(), event))
+        if isinstance(event, VisitEnded):
+            visits.append(event)
 
-    def __call__(self, event: Event) -> None:
-        match event:
-            case StepTaken():
-                self.first_step = self.first_step or time.perf_counter()
-                if event.visit != self._visit:
-                    self._visit, self.psnr = event.visit, []
-                if math.isfinite(event.psnr):  # told a step late, so not of a visit's first
-                    self.psnr.append(event.psnr)
-            case VisitEnded():
-                self.visits.append(event)
-                print(f"visit {len(self.visits)}: {event.seconds:.1f} s", flush=True)
+    coordinator.announce.subscribe(listen)
+    cameras = {view.index: view for view in land.cameras()}
+    # The visit to a single block lasts as long as the run.
+    whole = coordinator.scene.tree.num_blocks == 1
+    while coordinator.state.step < WHOLE_STEPS if whole else len(visits) < wanted:
+        train_step(coordinator, lambda view, crop: land.crop(cameras[view], crop))
+    return steps, visits
 
 
 if __name__ == "__main__":

@@ -12,19 +12,24 @@ from pathlib import Path
 import numpy as np
 import psutil
 import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
 from PIL import Image
 from torch import Tensor
 
+from abcd_ns.engine.events import Event, HeldOutScored, StepTaken, VisitEnded
+from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.formats.sizes import MOST_AT_ONCE, ply_bytes, spz_bytes
-from abcd_ns.lab.job import Job
+from abcd_ns.lab.job import Job, Settings
 from abcd_ns.lab.results.run import CurvePoint, Run, ViewScore
 from abcd_ns.lab.runs.configs import trainer_config
-from abcd_ns.lab.runs.evaluate import draw_held_out, everything, mean, ordering_gap, score, squared_gap
-from abcd_ns.lab.runs.training import Training
-from abcd_ns.lab.runs.work import memory_of_run, work
+from abcd_ns.lab.runs.evaluate import draw_held_out, mean, mean_psnr, ordering_gap, score, squared_gap
+from abcd_ns.lab.runs.runner import memory_of_run, work
 from abcd_ns.machine import describe_versions, disk_bytes, without_home
 from abcd_ns.nerfstudio.metrics import lpips_missing
+from abcd_ns.nerfstudio.model import AbcdModel
 from abcd_ns.nerfstudio.run import STORE
 from abcd_ns.nerfstudio.trainer import AbcdTrainerConfig
 
@@ -71,15 +76,7 @@ def run(job: Job, folder: Path) -> Run:
     )
 
 
-def file_bytes(training: Training) -> dict[str, int | None]:
-    """Of the scene as files; nothing where RAM should not hold it twice."""
-    if training.gaussians > MOST_AT_ONCE:
-        return {}
-    scene = everything(training.pipeline.model)
-    return {"ply_bytes": ply_bytes(scene), "spz_bytes": spz_bytes(scene)}
-
-
-def set_up(job: Job, out: Path) -> Training:
+def set_up(job: Job, out: Path) -> "Training":
     """All that comes before the first step.
 
     Args:
@@ -94,6 +91,101 @@ def set_up(job: Job, out: Path) -> Training:
     config.save_config()
     trainer.setup()
     return Training(trainer, job.settings)
+
+
+class Training:
+    """A trainer that is set up, whose held-out views are scored at the settings' moments of the run.
+
+    The run's stopwatch is paused meanwhile. The end is left to whoever ends the run.
+    """
+
+    def __init__(self, trainer: Trainer, settings: Settings) -> None:
+        self.trainer, self.pipeline = trainer, trainer.pipeline
+        self.coordinator = getattr(trainer.pipeline, "coordinator", None)
+        """None for splatfacto, whose steps and time are counted here."""
+        self.points: list[CurvePoint] = []
+        self.layer_seconds = self.seconds_of_looks = 0.0
+        self._moments = [moment for moment in settings.moments if moment < 1]
+        if self.coordinator is not None:
+            self.stopwatch = self.coordinator.stopwatch
+            self.coordinator.announce.subscribe(self._listen)
+            return
+        self.stopwatch, self._steps = Stopwatch(), 0
+        self._budget = Budget(settings.steps, settings.seconds)
+        where = TrainingCallbackLocation
+        trainer.callbacks += [
+            TrainingCallback([where.BEFORE_TRAIN_ITERATION], lambda step: self.stopwatch.start()),  # noqa: ARG005
+            TrainingCallback([where.AFTER_TRAIN_ITERATION], self._end_step),
+        ]
+
+    def _listen(self, event: Event) -> None:
+        if isinstance(event, VisitEnded):
+            self.layer_seconds += event.layer_seconds
+        if isinstance(event, (StepTaken, VisitEnded)):
+            self._look()
+
+    def _end_step(self, step: int) -> None:
+        self._steps = step + 1  # the trainer's own count is one higher once it has been stopped
+        self._look()
+        if self.progress >= 1:
+            self.stopwatch.pause()
+            self.trainer.stop_training = True
+
+    def _look(self) -> None:
+        """After every step: score, if the next moment has come."""
+        progress = self.progress
+        if progress >= 1 or not self._moments or progress < self._moments[0]:
+            return
+        self._moments = [moment for moment in self._moments if moment > progress]
+        (self.coordinator or self.stopwatch).pause()
+        began, seconds, steps = time.perf_counter(), self.stopwatch.seconds, self.steps
+        found = mean_psnr(self.pipeline)
+        self.points.append(CurvePoint(seconds, steps, found, self.gaussians))
+        self.seconds_of_looks += time.perf_counter() - began
+        if self.coordinator is None:
+            self.stopwatch.start()
+        else:
+            self.coordinator.announce(HeldOutScored(found, None))
+            self.coordinator.resume()
+
+    @property
+    def progress(self) -> float:
+        """The share of the run that is done."""
+        if self.coordinator is None:
+            return self._budget.progress(self.steps, self.stopwatch.seconds)
+        return self.coordinator.progress
+
+    @property
+    def steps(self) -> int:
+        """Optimisation steps taken."""
+        return self._steps if self.coordinator is None else self.coordinator.state.step
+
+    @property
+    def blocks(self) -> int:
+        """1 where the method knows of none."""
+        return 1 if self.coordinator is None else self.coordinator.scene.tree.num_blocks
+
+    @property
+    def gaussians(self) -> int:
+        """In the whole scene."""
+        return self.pipeline.model.num_points if self.coordinator is None else self.coordinator.count()
+
+    @property
+    def parameters(self) -> int:
+        """Of how many numbers those are."""
+        if self.coordinator is not None:
+            return self.coordinator.scene.parameters()
+        return sum(values.numel() for values in self.pipeline.model.gauss_params.values())
+
+
+def file_bytes(training: Training) -> dict[str, int | None]:
+    """Of the scene as files; nothing where RAM should not hold it twice."""
+    if training.gaussians > MOST_AT_ONCE:
+        return {}
+    model = training.pipeline.model
+    ours = isinstance(model, AbcdModel)
+    scene = model.merged() if ours else live_gaussians(model.gauss_params).detach().to("cpu")
+    return {"ply_bytes": ply_bytes(scene), "spz_bytes": spz_bytes(scene)}
 
 
 def score_held_out(training: Training, job: Job, pictures: Path) -> tuple[list[ViewScore], list[float]]:

@@ -1,4 +1,4 @@
-"""Trains small scenes with the bare engine, the same way for every method."""
+"""What a scenario is; small scenes trained with the bare engine, the same way for every method."""
 
 import math
 import tempfile
@@ -6,16 +6,14 @@ from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import Parameter
 
-from abcd_ns.engine.events import Event
 from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
-from abcd_ns.engine.gaussians.param_swap import Optimizers, nothing_live
+from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
 from abcd_ns.engine.space.partition import build_kd
@@ -32,19 +30,15 @@ from abcd_ns.engine.train.recipe import Recipe
 from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import views_per_step, warm_up_is_over
-from abcd_ns.engine.train.step.batch import Sample, Target
 from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring
-from abcd_ns.nerfstudio.metrics import corrected_psnr
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
 METHODS: tuple[Method, ...] = ("abcd", "abcd-ablated", "abcd-monolithic")
 PAIR: tuple[Method, ...] = ("abcd", "abcd-monolithic")
 SH_DEGREE = 1
 """Nothing in these worlds shines."""
-STILL = DensityConfig(strategy="off")
-"""The number of Gaussians stays."""
 LIMITED = DensityConfig(max_gaussians=1000)
 """As many Gaussians for every method, and few, for time."""
 BUDGET = 600
@@ -70,10 +64,6 @@ class Stage:
         """The training loop's photo reader."""
         return self.photos[index][crop.slices]
 
-    def target(self, sample: Sample) -> Target:
-        """What a sample is trained on."""
-        return sample.reduced(self(sample.view.index, sample.source)), None
-
     def start(self) -> Gaussians:
         """The first Gaussians."""
         return gaussians_from_points(self.points.float(), self.colors, sh_degree=SH_DEGREE)
@@ -81,8 +71,7 @@ class Stage:
     def only(self, count: int) -> "Stage":
         """With `count` of the training views, evenly spread."""
         total = len(self.views)
-        chosen = [self.views[k * total // count] for k in range(count)]
-        return replace(self, views=chosen)
+        return replace(self, views=[self.views[k * total // count] for k in range(count)])
 
 
 def make_stage(
@@ -106,8 +95,7 @@ class Trained:
     coordinator: Coordinator
     psnr: float
     """Held-out, dB."""
-    events: list[Event]
-    counts: list[int] = field(default_factory=list)
+    counts: list[int]
     """Gaussians in the scene after each step."""
 
     @property
@@ -115,38 +103,17 @@ class Trained:
         """The whole scene in one list."""
         return merged(self.coordinator)
 
-    def of(self, kind: type) -> list:
-        """The events of one kind."""
-        return [event for event in self.events if isinstance(event, kind)]
-
 
 class Lab:
     """Where scenarios are carried out: a folder for stores, and a rasterizer.
 
     Args:
-        use_native: see TorchRasterizer; False where last bits must not depend on the machine.
-        quick: a third of the work, to see that everything runs.
         seed: of every training that names none.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        use_native: bool = True,
-        quick: bool = False,
-        seed: int = 0,
-    ) -> None:
-        self.quick, self.seed = quick, seed
-        self.tick: Callable[[], object] = lambda: None
-        """Called after every training step."""
+    def __init__(self, folder: Path, seed: int = 0) -> None:
+        self.seed, self._folder, self.rasterizer = seed, folder, TorchRasterizer()
         self._scores: dict[tuple[str, Method], float] = {}
-        self.rasterizer = TorchRasterizer(use_native=use_native)
-        self._folder = folder
-
-    def views_drawn(self, usual: int) -> int:
-        """The budget of a run, in views."""
-        return usual // 3 if self.quick else usual
 
     def coordinator(
         self,
@@ -157,25 +124,19 @@ class Lab:
         budget: int,
         blocks: int = BLOCKS,
         tree: BlockTree | None = None,
-        kind: Callable[[TrainingRun], Coordinator] = Coordinator,
-        optimizers: tuple[dict[str, Parameter], Optimizers] | None = None,
-        **training,
+        **training: Any,
     ) -> Coordinator:
         """A coordinator over a new store.
 
         Args:
             budget: views drawn in the whole run; every method gets as many, in steps of as many as it takes.
-            kind: makes it of a run.
-            optimizers: parameters and their optimizers; new ones if left out.
             training: options of TrainingConfig.
         """
-        recipe = Recipe(layers=method != "abcd-ablated")
-        usual = {"recipe": recipe, "sh_degree": start.sh_degree, "seed": self.seed}
-        options = {**usual, **training}
+        usual = {"recipe": Recipe(layers=method != "abcd-ablated"), "sh_degree": start.sh_degree}
+        config = TrainingConfig(**{**usual, "seed": self.seed, **training})
         tree = tree or build_kd(start.means, blocks)
         if method == "abcd-monolithic":
             tree = build_kd(start.means, 1)
-        config = TrainingConfig(**options)
         start = thin_out(start, config.density.limit, config.seed)
         store = ParameterStore.create(Path(tempfile.mkdtemp(dir=self._folder)) / "store", {})
         warms = config.warmup > 0 and tree.num_blocks > 1
@@ -183,14 +144,15 @@ class Lab:
         keep = scaffold_size(config, largest, pixels) if warms else None
         config = replace(config, limits=replace(config.limits, scaffold_gaussians=keep or 0))
         store.commit(blocks_at_rest(tree, start, keep, config.seed))
-        params, adam = optimizers or nothing_live(start.sh_degree)
-        scene = StoredScene(tree, store)
         waiting = 0 if keep is None else max(len(start) - keep, 0)
         steps = Budget(steps=steps_for(budget, config, tree.num_blocks, len(views), waiting))
-        return kind(TrainingRun(config, steps, scene, views, self.rasterizer, params, adam))
+        live = nothing_live(start.sh_degree)
+        return Coordinator(
+            TrainingRun(config, steps, StoredScene(tree, store), views, self.rasterizer, *live)
+        )
 
     def train(
-        self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options
+        self, stage: Stage, method: Method = "abcd", *, start: Gaussians | None = None, **options: Any
     ) -> Trained:
         """Train on a stage from its points, or from `start`, and score the held-out views.
 
@@ -199,22 +161,19 @@ class Lab:
         """
         start = stage.start() if start is None else start
         coordinator = self.coordinator(start, stage.views, method, **options)
-        events: list[Event] = []
-        coordinator.announce.subscribe(events.append)
         counts = self.finish(coordinator, stage)
-        return Trained(coordinator, self.score(coordinator, stage), events, counts)
+        return Trained(coordinator, self.score(coordinator, stage), counts)
 
-    def train_limited(self, stage: Stage, method: Method, **options) -> Trained:
+    def train_limited(self, stage: Stage, method: Method, **options: Any) -> Trained:
         """Train under the conditions of comparisons: on few views and with few Gaussians, as many of both for
         every method.
 
         Args:
             options: of `coordinator`; they go before these.
         """
-        usual = {"budget": self.views_drawn(BUDGET), "density": LIMITED}
-        return self.train(stage, method, **{**usual, **options})
+        return self.train(stage, method, **{"budget": BUDGET, "density": LIMITED, **options})
 
-    def compared(self, stage: Stage, method: Method, name: str | None = None, **options) -> float:
+    def compared(self, stage: Stage, method: Method, name: str | None = None, **options: Any) -> float:
         """Held-out PSNR under the conditions of comparisons, dB.
 
         Args:
@@ -226,13 +185,12 @@ class Lab:
             self._scores[name, method] = self.train_limited(stage, method).psnr
         return self._scores[name, method]
 
-    def finish(self, coordinator: Coordinator, stage: Stage, steps: int | None = None) -> list[int]:
-        """Train on until the budget is used up, or for `steps`; the number of Gaussians after each step."""
+    def finish(self, coordinator: Coordinator, stage: Stage) -> list[int]:
+        """Train on until the budget is used up; the number of Gaussians after each step."""
         counts: list[int] = []
-        while not coordinator.finished and (steps is None or len(counts) < steps):
+        while not coordinator.finished:
             train_step(coordinator, stage)
             counts.append(coordinator.count())
-            self.tick()
         return counts
 
     @torch.no_grad()
@@ -241,19 +199,10 @@ class Lab:
         degree = gaussians.sh_degree
         return [self.rasterizer(gaussians, view, sh_degree=degree).color.clamp(0, 1) for view in views]
 
-    def score(self, coordinator: Coordinator, stage: Stage, measure: Callable = psnr) -> float:
-        """Mean PSNR, or another measure, of merged pictures of the held-out views, dB."""
+    def score(self, coordinator: Coordinator, stage: Stage) -> float:
+        """Mean PSNR of merged pictures of the held-out views, dB."""
         drawn = self.pictures(merged(coordinator), stage.held_out)
-        return sum(float(measure(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
-
-    def corrected(self, stage: Stage, method: Method, **options) -> float:
-        """As `compared`, each picture warped to its photo's colours before it is scored.
-
-        Args:
-            options: of `coordinator`.
-        """
-        trained = self.train_limited(stage, method, **options)
-        return self.score(trained.coordinator, stage, corrected_psnr)
+        return sum(float(psnr(a, b)) for a, b in zip(drawn, stage.truth, strict=True)) / len(drawn)
 
     def error(self, coordinator: Coordinator, stage: Stage) -> float:
         """The full objective, near enough: the mean absolute error over all training photos."""
@@ -303,6 +252,34 @@ def merged(coordinator: Coordinator) -> Gaussians:
     return coordinator.scene.everything("cpu")
 
 
-def block_at(tree: BlockTree, *place: float) -> int:
-    """The block that holds a place (x, y, z)."""
-    return int(tree.assign(torch.tensor([place])))
+@dataclass(frozen=True)
+class Finding:
+    """What a scenario found out."""
+
+    passed: bool
+    """By ABCD, under the scenario's rule."""
+    said: dict[str, str]
+    """By method, what it did, in a few words."""
+    numbers: dict[str, float] = field(default_factory=dict)
+    """What the rule was applied to, by name; finite."""
+    worse: bool = False
+    """Whether ABCD did worse than one block, whatever the rule says."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One way in which methods fail."""
+
+    id: str
+    fails: str
+    """What happens elsewhere."""
+    done: str
+    """What is done here to make it happen."""
+    rule: str
+    """What passes."""
+    run: Callable[[Lab], Finding]
+
+
+def scenario(id: str, fails: str, done: str, rule: str) -> Callable[[Callable[[Lab], Finding]], Scenario]:
+    """Makes a scenario of the function that carries it out."""
+    return lambda run: Scenario(id, fails, done, rule, run)

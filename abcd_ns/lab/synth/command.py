@@ -13,11 +13,10 @@ import torch
 import tyro
 from PIL import Image
 from rich.console import Console
-from rich.text import Text
 
 from abcd_ns.errors import UserError
 from abcd_ns.lab.results.records import read_json, write_json
-from abcd_ns.lab.runs.runner import take_folder, taking
+from abcd_ns.lab.runs.runner import say, take_folder, taking
 from abcd_ns.lab.synth.colmap_writer import write_model
 from abcd_ns.lab.synth.sparse_points import SparsePoints, court_points
 from abcd_ns.lab.world.court import Layout, Site, build_world, court_cameras
@@ -98,17 +97,27 @@ def synth(
         UserError: a setting is out of range, or `out` holds something else or cannot be written.
     """
     settings.check()
-    console = Console(stderr=True)
+    console, path = Console(stderr=True), out / MARKER
+    marker = {"format": FORMAT, "complete": True, "settings": asdict(settings)}
     with taking(out):
-        if not _prepare(out, settings, overwrite):
-            console.print(Text(f"{out} already holds this scene; nothing to do."), soft_wrap=True)
-            return
-        write_json(out / MARKER, _marker(settings, complete=False))
+        if take_folder(out, path, "scene of this command"):
+            earlier = read_json(path)
+            if earlier == marker:
+                say(console, f"{out} already holds this scene; nothing to do.")
+                return
+            if not overwrite:
+                state = "another scene" if earlier.get("complete") else "an unfinished scene"
+                raise UserError(
+                    f"{out} holds {state}; pass --overwrite to replace it, or name another folder."
+                )
+            for name in ("images", "sparse"):  # what this command writes; --overwrite removes no more
+                shutil.rmtree(out / name, ignore_errors=True)
+            (out / "SOURCE.md").unlink(missing_ok=True)
+        write_json(path, {**marker, "complete": False})
     pictures, points = _draw(out, settings, console)
     (out / "SOURCE.md").write_text(_source(settings, pictures, points), encoding="utf-8")
-    write_json(out / MARKER, _marker(settings, complete=True))
-    drawn = f"{pictures} pictures and {points} points of {settings.courts} courts"
-    console.print(Text(f"{out}: {drawn}."), soft_wrap=True)
+    write_json(path, marker)
+    say(console, f"{out}: {pictures} pictures and {points} points of {settings.courts} courts.")
 
 
 def _draw(out: Path, settings: Settings, console: Console) -> tuple[int, int]:
@@ -150,28 +159,6 @@ def _a_view_on_each_core() -> Iterator[ThreadPoolExecutor]:
             yield pool
     finally:
         torch.set_num_threads(threads)
-
-
-def _prepare(out: Path, settings: Settings, overwrite: bool) -> bool:
-    """Make `out` an empty folder of ours. False if it holds this very scene already."""
-    path = out / MARKER
-    if not take_folder(out, path, "scene of this command"):
-        return True
-    earlier = read_json(path)
-    if earlier == _marker(settings, complete=True):
-        return False
-    if not overwrite:
-        state = "another scene" if earlier.get("complete") else "an unfinished scene"
-        raise UserError(f"{out} holds {state}; pass --overwrite to replace it, or name another folder.")
-    for name in ("images", "sparse"):  # what this command writes; --overwrite removes no more
-        shutil.rmtree(out / name, ignore_errors=True)
-    for name in ("SOURCE.md", MARKER):
-        (out / name).unlink(missing_ok=True)
-    return True
-
-
-def _marker(settings: Settings, complete: bool) -> dict:
-    return {"format": FORMAT, "complete": complete, "settings": asdict(settings)}
 
 
 def _source(settings: Settings, pictures: int, points: int) -> str:

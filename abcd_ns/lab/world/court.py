@@ -13,7 +13,7 @@ from abcd_ns.engine.types import View
 from abcd_ns.lab.world.solids import Solid, Thing, ball, block, tube, turned
 from abcd_ns.lab.world.sunlight import SunlitWorld
 from abcd_ns.lab.world.textures import Color, Material
-from abcd_ns.lab.world.world import look_at
+from abcd_ns.lab.world.world import camera
 
 Layout = Literal["grid", "row"]
 CELL = 12.0
@@ -312,15 +312,13 @@ def court_cameras(site: Site, court: int, count: int, size: tuple[int, int]) -> 
 
     Any part of the list looks from all around, and what a held-out view shows is in its neighbours' views.
     """
-    rng, (width, height) = site.rng("cameras", court), size
+    rng = site.rng("cameras", court)
     phase, middle = rng.uniform(0, 2 * np.pi), site.center(court)
-    focal = FOCAL * width
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
     views = []
     for k in range(count):
         angle, up = phase + k * TURN, np.interp((k + 0.5) / count, (0, 1), HEIGHTS)
         radius = 11.0 - 0.3 * up + rng.uniform(-0.3, 0.3)
         eye = middle + np.array([radius * math.cos(angle), radius * math.sin(angle), up])
         target = middle + np.append(rng.uniform(-0.5, 0.5, 2), 2.0)
-        views.append(View(look_at(torch.tensor(eye), torch.tensor(target)), K, width, height, k))
+        views.append(camera(eye, target, k, size, FOCAL, torch.float64))
     return views

@@ -51,17 +51,15 @@ class Land(World):
         """(x, y) of a tile's lower corner."""
         return tile % self.columns, tile // self.columns
 
+    @property
+    def middles(self) -> Float[Tensor, "tiles 3"]:
+        """Of the tiles."""
+        corners = torch.tensor([self.corner(tile) for tile in range(self.tiles)], dtype=torch.float64)
+        return torch.cat([corners + 0.5, torch.zeros(self.tiles, 1, dtype=torch.float64)], dim=1)
+
     def tree(self) -> BlockTree:
         """Cells of which each is one tile."""
-        corners = torch.tensor([self.corner(tile) for tile in range(self.tiles)], dtype=torch.float64)
-        middles = torch.cat([corners + 0.5, torch.zeros(self.tiles, 1, dtype=torch.float64)], dim=1)
-        return build_kd(middles, self.tiles)
-
-    def tile_of(self, tree: BlockTree) -> list[int]:
-        """By block of `tree`, the tile in its cell."""
-        middles = torch.tensor([[x + 0.5, y + 0.5, 0.0] for x, y in map(self.corner, range(self.tiles))])
-        blocks = tree.assign(middles).tolist()
-        return sorted(range(self.tiles), key=blocks.__getitem__)
+        return build_kd(self.middles, self.tiles)
 
     def make_tile(self, tile: int) -> Gaussians:
         """The Gaussians that training begins with: on the land, too grey, rather too large."""

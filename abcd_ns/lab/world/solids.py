@@ -46,20 +46,41 @@ class Solid:
         return replace(self, center=tuple(center.tolist()), frame=self.frame @ turn, holes=holes)
 
     @cached_property
-    def cut(self) -> "Lines":
-        """Through its holes."""
-        return Lines(self.holes)
+    def _to_unit(self) -> tuple[list[list[float]], list[float]]:
+        """Matrix and offset of the map into the unit shape."""
+        matrix = self.frame / torch.tensor(self.half).float()[:, None]
+        return matrix.tolist(), (matrix * torch.tensor(self.center).float()).sum(dim=1).tolist()
 
-    def first(
-        self, t: Float[Tensor, "n"], leave: Float[Tensor, "n"], origins: Rays, directions: Rays
-    ) -> Float[Tensor, "n"]:
-        """Where rays meet it that enter the whole shape at `t`: behind the holes that they meet before."""
+    def span(self, origins: Rays, directions: Rays) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """Where lines enter and leave it, holes left aside, in lengths of the direction; (FAR, -FAR) if not.
+
+        Elementwise: the bits of a ray do not depend on the others that it is traced with.
+        """
+        matrix, offset = self._to_unit
+        p = [weighted(row, origins) - shift for row, shift in zip(matrix, offset, strict=True)]
+        v = [weighted(row, directions) for row in matrix]
+        enter, leave = slabs(p, v, {"ball": (), "tube": (2,), "block": (0, 1, 2)}[self.shape])
+        if self.shape != "block":
+            p, v = p[: 3 if self.shape == "ball" else 2], v[: 3 if self.shape == "ball" else 2]
+            a = sum(x * x for x in v).clamp_min(1e-12)
+            b, c = sum(x * y for x, y in zip(p, v, strict=True)), sum(x * x for x in p) - 1
+            inside = b * b - a * c
+            root = inside.clamp_min(0).sqrt()
+            enter = torch.where(inside > 0, enter.maximum((-b - root) / a), FAR)
+            leave = leave.minimum((-b + root) / a)
+        missed = enter >= leave
+        return torch.where(missed, FAR, enter), torch.where(missed, -FAR, leave)
+
+    def meet(self, origins: Rays, directions: Rays) -> Float[Tensor, "n"]:
+        """How far along each ray it is: behind the holes that are met before; FAR where it is not."""
+        t, leave = self.span(origins, directions)
+        t = t.clamp_min(1e-4)  # who stands in a hole sees the hole
         rows = (t < leave).nonzero()[:, 0] if self.holes else ()
         if len(rows):
-            begin, end = self.cut.spans(_of(origins, rows), _of(directions, rows))
             within = t[rows]
-            for k in [*range(len(self.holes))] * 2:  # again: holes may overlap
-                within = torch.where((begin[k] <= within) & (within < end[k]), end[k], within)
+            spans = [hole.span(_of(origins, rows), _of(directions, rows)) for hole in self.holes]
+            for begin, end in spans * 2:  # again: holes may overlap
+                within = torch.where((begin <= within) & (within < end), end, within)
             t = t.index_copy(0, rows, within)
         return torch.where(t < leave, t, FAR)
 
@@ -122,43 +143,6 @@ def tube(radius: float, low: float, high: float, material: Material, *holes: Sol
     return Solid("tube", half, material, (0.0, 0.0, (low + high) / 2), turned(), holes)
 
 
-class Lines:
-    """Where lines enter and leave each of some solids, holes left aside; those of one shape at a time."""
-
-    def __init__(self, solids: Sequence[Solid]) -> None:
-        self._count, self._kinds = len(solids), []
-        for shape in ("ball", "tube", "block"):
-            rows = [k for k, solid in enumerate(solids) if solid.shape == shape]
-            if rows:
-                halves = torch.tensor([solids[k].half for k in rows]).float()
-                matrix = torch.stack([solids[k].frame for k in rows]) / halves[:, :, None]
-                centers = torch.tensor([solids[k].center for k in rows]).float()
-                self._kinds.append(
-                    (shape, torch.tensor(rows), matrix, (matrix * centers[:, None]).sum(dim=2))
-                )
-
-    def spans(self, origins: Rays, directions: Rays) -> tuple[Float[Tensor, "s n"], Float[Tensor, "s n"]]:
-        """In lengths of the direction, by solid and line; (FAR, -FAR) where it misses."""
-        count = directions.shape[1] if origins.shape[1] == 1 else origins.shape[1]
-        entered, left = origins.new_full((2, self._count, count), FAR)
-        for shape, rows, matrix, shift in self._kinds:
-            # Elementwise: the bits of a ray do not hang on which others it is traced with.
-            p = [weighted(matrix[:, k].T[..., None], origins) - shift[:, k, None] for k in range(3)]
-            v = [weighted(matrix[:, k].T[..., None], directions) for k in range(3)]
-            enter, leave = slabs(p, v, {"ball": (), "tube": (2,), "block": (0, 1, 2)}[shape])
-            if shape != "block":
-                p, v = p[: 3 if shape == "ball" else 2], v[: 3 if shape == "ball" else 2]
-                a = sum(x * x for x in v).clamp_min(1e-12)
-                b, c = sum(x * y for x, y in zip(p, v, strict=True)), sum(x * x for x in p) - 1
-                inside = b * b - a * c
-                root = inside.clamp_min(0).sqrt()
-                enter = torch.where(inside > 0, enter.maximum((-b - root) / a), FAR)
-                leave = leave.minimum((-b + root) / a)
-            missed = enter >= leave
-            entered[rows], left[rows] = torch.where(missed, FAR, enter), torch.where(missed, -FAR, leave)
-        return entered, left
-
-
 @dataclass(frozen=True, eq=False)
 class Thing:
     """What stands together, in an upright box that rays are tried with first."""
@@ -197,28 +181,16 @@ class Thing:
         if not len(rows):
             return
         start, ahead, mine, number = _of(origins, rows), _of(directions, rows), t[rows], which[rows]
-        places = iter(zip(*self._lines.spans(start, ahead), strict=True)) if self._here else iter(())
         for part in self.parts:
             if isinstance(part, Thing):
                 part.meet(start, ahead, mine, number, first)
                 first += len(part.solids)
                 continue
-            enter, leave = next(places)
-            found = part.first(
-                enter.clamp_min(1e-4), leave, start, ahead
-            )  # who stands in a hole sees the hole
+            found = part.meet(start, ahead)
             number = torch.where(found < mine, first, number)
             mine = mine.minimum(found)
             first += 1
         t[rows], which[rows] = mine, number
-
-    @cached_property
-    def _here(self) -> list[Solid]:
-        return [part for part in self.parts if isinstance(part, Solid)]
-
-    @cached_property
-    def _lines(self) -> Lines:
-        return Lines(self._here)
 
 
 def weighted(weights: Sequence, rows: Sequence[Tensor]) -> Tensor:

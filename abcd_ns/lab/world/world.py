@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -169,16 +170,18 @@ def look_at(eye: Tensor, target: Tensor) -> Float[Tensor, "4 4"]:
 
 
 def camera(
-    eye: tuple[float, float, float],
-    target: tuple[float, float, float],
+    eye: Sequence[float],
+    target: Sequence[float],
     index: int,
     size: tuple[int, int] = (48, 36),
+    focal: float = 1.0,
+    dtype: torch.dtype = torch.float32,
 ) -> View:
-    """A camera at `eye` that looks at `target`; 53 degrees wide."""
-    width, height = size
-    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    """A camera at `eye` that looks at `target`; `focal` is its focal length in widths of the picture."""
+    (width, height), f = size, focal * size[0]
+    K = torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]], dtype=dtype)
     pose = look_at(torch.tensor(eye, dtype=torch.float64), torch.tensor(target, dtype=torch.float64))
-    return View(pose.float(), K, width, height, index)
+    return View(pose.to(dtype), K, width, height, index)
 
 
 def ring(count: int, *, turn: float = 0.0, size: tuple[int, int] = (48, 36)) -> list[View]:

@@ -11,7 +11,7 @@ WORKER = """
 import json, os, pathlib, sys
 path = pathlib.Path(sys.argv[1])
 job = json.loads(path.read_text())
-changes = [f"{change['path']}={change['value']}" for change in job["variant"]["changes"]]
+changes = job["changes"]
 here = pathlib.Path(__file__).parent
 with open(here / "calls.txt", "a") as calls:
     calls.write(" ".join([job["method"], *changes]) + "\\n")

@@ -4,10 +4,10 @@ import dataclasses
 from pathlib import Path
 
 from abcd_ns.lab.job import Settings
-from abcd_ns.lab.results.findings import findings_of
 from abcd_ns.lab.results.records import read_record
 from abcd_ns.lab.results.results import SCHEMA, Arm, LeftOut, Results
 from abcd_ns.lab.results.run import CurvePoint, Failure, Run, ViewScore
+from abcd_ns.lab.results.tables import findings_of
 from abcd_ns.machine import Machine, Versions
 
 MACHINE = Machine(cpu="Made-up CPU", cores=2, torch_threads=2, ram_bytes=8 << 30, gpu=None, os="Linux x86_64")

@@ -19,14 +19,6 @@ def options(scene: Path, **given) -> Options:
     return Options(**{"data": str(scene), "out": "out", "steps": 10, **given})
 
 
-def test_defaults_make_a_plan(tmp_path):
-    plan = make_plan(options(tmp_path))
-    assert plan.methods == ("abcd-monolithic", "abcd", "abcd-ablated")
-    assert [(job.method, job.seed) for job in plan.jobs] == [(method, 0) for method in plan.methods]
-    assert plan.settings.scene == tmp_path.name
-    assert (plan.settings.steps, plan.settings.seconds, plan.settings.densify) == (10, None, True)
-
-
 def test_every_method_runs_with_every_seed_in_its_own_folder(tmp_path):
     plan = make_plan(options(tmp_path, methods=("abcd", "abcd-monolithic"), seeds=(3, 1)))
     assert [(job.method, job.seed) for job in plan.jobs] == [
@@ -74,7 +66,6 @@ def test_every_method_trains_under_its_own_name_by_its_own_options(tmp_path, met
         ({"downscale": 0}, "--downscale is 0"),
         ({"evals": 0}, "--evals is 0"),
         ({"max_gaussians": -1}, "--max-gaussians is -1"),
-        ({"methods": ("nerfacto",)}, "no method 'nerfacto'"),
         ({"methods": ()}, "at least one"),
         ({"methods": ("abcd", "abcd")}, "each once"),
         ({"methods": ("abcd-paper",), "steps": None, "seconds": 9.0}, "abcd-paper .* use --steps"),
@@ -97,7 +88,7 @@ def test_the_command_line_goes_before_the_file():
 
 
 def names_of(plan) -> list[tuple[str, str]]:
-    return [(job.method, job.variant.name) for job in plan.jobs]
+    return [(job.method, job.variant) for job in plan.jobs]
 
 
 def test_several_numbers_of_blocks_are_an_arm_each_of_every_method_that_has_any(tmp_path):
@@ -132,12 +123,6 @@ def test_splatfacto_has_none_of_the_options(tmp_path):
     assert [name for method, name in names_of(plan) if method == "splatfacto"] == ["default"]
 
 
-def test_more_seeds_and_arms_may_join_the_same_folder(tmp_path):
-    first, more = (make_plan(options(tmp_path, blocks=blocks)) for blocks in ((1, 2), (8, 1, 2)))
-    assert first.settings == more.settings
-    assert set(first.jobs) < set(more.jobs)
-
-
 @pytest.mark.parametrize(
     ("vary", "message"),
     [
@@ -151,19 +136,10 @@ def test_changes_that_cannot_be_trained_are_refused(tmp_path, vary, message):
         check_options(make_plan(options(tmp_path, vary=(vary,))).jobs[1])
 
 
-def test_a_single_number_of_blocks_in_a_file_is_one(tmp_path):
-    (tmp_path / "compare.toml").write_text("blocks = 3")
-    assert read_options(tmp_path / "compare.toml").blocks == (3,)
-
-
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_the_examples_make_plans(path, tmp_path):
     plan = make_plan(Options(data=str(tmp_path), out="out").over(read_options(path)))
-    assert set(plan.methods) <= set(METHODS)
-
-
-def test_there_are_examples():
-    assert "compare-castle" in [path.stem for path in CONFIGS]
+    assert {job.method for job in plan.jobs} <= set(METHODS)
 
 
 @pytest.mark.parametrize(
@@ -172,6 +148,7 @@ def test_there_are_examples():
         ("bloks = 3", "unknown field 'bloks'; did you mean 'blocks'"),
         ("blocks = 'three'", r"Expected array \| null, got str - at blocks"),
         ("methods = ['abcd', 3]", r"got int - at methods\[1\]"),
+        ("methods = ['nerfacto']", "nerfacto"),
         ("seeds = 0", r"Expected array \| null, got int - at seeds"),
         ("blocks = ", "cannot be read as TOML"),
     ],
@@ -185,11 +162,6 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, message):
     assert "\n" not in str(caught.value)
 
 
-def test_an_absent_file_is_refused(tmp_path):
-    with pytest.raises(UserError, match="does not exist"):
-        read_options(tmp_path / "absent.toml")
-
-
 @given(st.integers(1, 50))
 def test_moments_rise_to_the_end_of_the_run(evals):
     settings = Settings("scene", 1, 8, None, 100, evals, 0, True, 3)
@@ -197,9 +169,3 @@ def test_moments_rise_to_the_end_of_the_run(evals):
     assert list(settings.moments) == sorted(set(settings.moments))
     assert settings.moments[0] > 0
     assert settings.moments[-1] == 1
-
-
-def test_the_command_states_what_is_not_default(tmp_path):
-    plan = make_plan(options(tmp_path, max_gaussians=500, no_densify=True, seeds=(1, 2)))
-    for part in ("--steps 10", "--max-gaussians 500", "--no-densify", "--seeds 1 2", "--out out"):
-        assert part in plan.command

@@ -116,12 +116,6 @@ def test_reports_are_there_and_a_second_call_trains_nothing(compared):
     assert carry_out(plan, Console(file=stream, width=100)) == 0
     assert stream.getvalue().count("reused") == 2
     assert read_results(plan.out / "results.json").runs == results.runs
-
-
-@pytest.mark.cli
-def test_nothing_in_the_results_names_a_folder_of_this_machine(compared):
-    _, plan, _ = compared
-    text = (plan.out / "results.json").read_text()
-    assert json.loads(text)["settings"]["data"] == "scene"
+    text = (plan.out / "results.json").read_text()  # it names no folder of this machine
     assert str(plan.out.parent) not in text
     assert f"{Path.home()}/" not in text

@@ -3,17 +3,16 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abcd_ns.lab.compare.command import Options
 from abcd_ns.lab.results.records import RecordError, decode, encode, write_json
 from abcd_ns.lab.results.results import SCHEMA
 from abcd_ns.lab.results.run import CurvePoint, Run
-from abcd_ns.lab.runs.evaluate import mean, ordering_gap
-from abcd_ns.machine import describe_machine, describe_versions, disk_bytes, peak_rss_bytes
+from abcd_ns.lab.runs.evaluate import ordering_gap
 from tests.lab.compare.records import made_up_results, made_up_run, read_results
 
 RUN = ("arms", 0, "runs", 0)
@@ -41,7 +40,7 @@ def test_results_come_back_as_they_were_written(tmp_path_factory, psnr, gap, gau
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_no_number_that_json_lacks_is_written(tmp_path, number):
     bad = made_up_run(curve=(CurvePoint(1.0, 1, 20.0), CurvePoint(2.0, 2, number)))
-    with pytest.raises(ValueError, match=r"arms\[0\]\.runs\[1\]\.curve\[1\]\.psnr is (nan|-?inf)"):
+    with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "results.json", encode(made_up_results(made_up_run(), bad)))
     assert list(tmp_path.iterdir()) == []
 
@@ -93,6 +92,13 @@ def test_a_file_that_does_not_fit_is_refused_by_field(tmp_path, steps, change, m
     assert "\n" not in str(caught.value)
 
 
+def test_what_the_documents_rest_on_is_still_read():
+    stored = (Path(__file__).resolve().parents[3] / "docs" / "results").rglob("*.json")
+    paths = [path for path in stored if json.loads(path.read_text()).get("schema") == SCHEMA]
+    assert all(read_results(path).command.startswith("abcd ") for path in paths)
+    assert "stability" in {path.parent.name for path in paths}
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", "3"])
 def test_what_is_no_results_file_is_refused(tmp_path, content):
     path = tmp_path / "results.json"
@@ -111,10 +117,6 @@ def test_every_field_of_a_run_is_required():
             decode(Run, {name: value for name, value in data.items() if name != field.name}, "run.json")
 
 
-def test_whole_numbers_are_numbers():
-    assert decode(Options, {"seconds": 60}, "x.toml").seconds == 60.0
-
-
 @given(st.lists(st.floats(1e-12, 1.0), min_size=1, max_size=6))
 def test_ordering_gap_is_the_psnr_of_the_mean_squared_difference(squared):
     gap, note = ordering_gap(squared, blocks=2)
@@ -127,29 +129,3 @@ def test_no_ordering_gap_has_a_reason(squared, blocks):
     gap, note = ordering_gap(squared, blocks)
     assert gap is None
     assert note
-
-
-def test_a_mean_with_a_missing_value_is_missing():
-    assert mean([1.0, 2.0]) == 1.5
-    assert mean([1.0, None]) is None
-    assert mean([]) is None
-
-
-def test_this_machine_and_environment_fit_their_records():
-    for record in (describe_machine(), describe_versions()):
-        assert decode(type(record), encode(record), "") == record
-
-
-def test_peak_memory_grows_with_what_is_held():
-    before = peak_rss_bytes()
-    held = bytearray(before + (64 << 20))  # zeroed pages are not resident until they are written
-    for i in range(0, len(held), 4096):
-        held[i] = 1
-    assert peak_rss_bytes() >= before + (32 << 20)
-
-
-def test_disk_bytes_counts_what_is_there(tmp_path):
-    assert disk_bytes(tmp_path / "absent") == 0
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "data").write_bytes(b"x" * 100_000)
-    assert 100_000 <= disk_bytes(tmp_path) <= 200_000

@@ -33,6 +33,6 @@ def test_the_steps_of_a_budget_draw_as_many_views(drawn, views, waiting, blocks)
 
 def test_a_labs_seed_is_that_of_its_trainings_unless_they_name_one(tmp_path):
     stage = make_stage()
-    lab = Lab(tmp_path, use_native=False, seed=3)
+    lab = Lab(tmp_path, seed=3)
     assert lab.coordinator(stage.start(), stage.views, budget=100).config.seed == 3
     assert lab.coordinator(stage.start(), stage.views, budget=100, seed=5).config.seed == 5

@@ -1,1 +1,0 @@
-"""The ways to fail, by kind; each is declared where it is carried out."""
