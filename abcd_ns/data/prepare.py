@@ -47,6 +47,9 @@ class SceneOptions(DataParserConfig):
     read where it fits the model; otherwise photos are reduced in memory by area averaging, to sizes rounded
     down, and nothing is written. Intrinsics follow the sizes: fx x new width / old width, fy x new height /
     old height."""
+    max_side: int = 0
+    """Divides by the smallest whole number with which no photo is wider or higher than that, pixels. 0 leaves
+    it to downscale_factor, which counts where both are given."""
     scale_factor: float = 1.0
     """Multiplies the scene's size, after auto_scale_poses."""
     scene_scale: float = 1.0
@@ -124,12 +127,14 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
         raise InputError(f"--downscale-factor is {wanted}; it must be a whole number from 1.")
+    if options.max_side < 0:
+        raise InputError(f"--max-side is {options.max_side}; it must be a number of pixels, or 0.")
     if not 0 < options.scale_factor < math.inf:
         raise InputError(f"--scale-factor is {options.scale_factor}; it must be above 0 and finite.")
     problems = Problems()
     try:
         scene = read_scene(options.data, options.images_path, options.masks_path)
-        factor = automatic_factor(scene) if wanted is None else int(wanted)
+        factor = automatic_factor(scene, options.max_side) if wanted is None else int(wanted)
         with problems.collect():
             check_layout(scene)
         with problems.collect():
@@ -147,15 +152,19 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     lists = scene.split_lists
     if lists and (both := len(lists.train & lists.held_out)):
         more.append(f"{both} view(s) are trained on and held out: scores there say nothing about new views.")
-    reduced = [_reduction(scene, sources, factor)] if wanted is None and factor > 1 and needs_photos else []
+    chosen = wanted is None and not options.max_side and factor > 1
+    reduced = [_reduction(scene, sources, factor)] if chosen and needs_photos else []
     notes = (*scene.notes, *notes, *more)
     return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, tuple(reduced))
 
 
-def automatic_factor(scene: Scene) -> int:
+def automatic_factor(scene: Scene, max_side: int = 0) -> int:
     """What photos are divided by where nothing is said: the smallest power of two that leaves no side longer
-    than MAX_AUTO_SIDE, as nerfstudio's parsers have it, but by the largest photo and not by the first."""
+    than MAX_AUTO_SIDE, as nerfstudio's parsers have it, but by the largest photo and not by the first. With
+    `max_side` the smallest whole number that leaves none longer than that."""
     longest, factor = max((max(frame.lens.size) for frame in scene.frames), default=0), 1
+    if max_side:
+        return max(-(-longest // max_side), 1)
     while longest / factor > MAX_AUTO_SIDE:
         factor *= 2
     return factor

@@ -20,8 +20,7 @@ def tiles(run: RunFolder, held_out: HeldOut | None) -> list[Tile]:
     """The four most important numbers of a run."""
     story, limit = run.story, run.story.trainings[-1].limit
     psnr, ssim = _scores(story, held_out)
-    seconds = story.seconds * max(len(story.workers), 1)  # layers' are summed over workers
-    layers = f", {story.layer_seconds / seconds:.0%} for layers" if story.layer_seconds else ""
+    layers = f", {story.layer_share:.0%} of it for layers" if story.layer_share else ""
     ram, device = _peaks(run)
     of = f"of {run.settings.machine.ram_bytes / GIB:.0f} GiB"
     gpu = run.settings.machine.gpu

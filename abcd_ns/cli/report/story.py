@@ -22,6 +22,7 @@ from abcd_ns.nerfstudio.run.log_lines import (
     VisitEndLine,
     VisitLine,
     WorkerLine,
+    layer_share,
 )
 
 L = TypeVar("L", bound=Line)
@@ -58,6 +59,8 @@ class Story:
     """Where training began, and where it was resumed; at least one."""
     samples: tuple[SampleLine, ...]
     visits: tuple[Visit, ...]
+    ended: tuple[VisitEndLine, ...]
+    """The last lines of visits that ended."""
     sweeps: tuple[SweepEndLine, ...]
     held_out: tuple[HeldOutLine, ...]
     """Those with a PSNR."""
@@ -94,9 +97,9 @@ class Story:
         return known[-1].gaussians
 
     @property
-    def layer_seconds(self) -> float:
-        """Training time that went into drawing layers."""
-        return sum(visit.layer_seconds for visit in self.visits)
+    def layer_share(self) -> float:
+        """Of the time of all visits that ended, the share for drawing layers."""
+        return layer_share(self.ended)
 
     def of_block(self, block: int) -> tuple[Visit, ...]:
         """The visits to one block."""
@@ -125,6 +128,7 @@ def read_story(path: Path) -> Story:
         trainings=trainings,
         samples=_of(lines, SampleLine),
         visits=visits,
+        ended=_of(lines, VisitEndLine),
         sweeps=_of(lines, SweepEndLine),
         workers=_of(lines, WorkerLine),
         held_out=tuple(line for line in _of(lines, HeldOutLine) if line.psnr is not None),
