@@ -35,7 +35,6 @@ from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_go_on
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
-
 UNLIMITED_STEPS = 10**8
 """From so many on the number of steps means that seconds end the run."""
 

@@ -18,7 +18,6 @@ from xml.etree import ElementTree
 import torch
 from rich.console import Console
 
-from abcd_ns.cli.doctor.hardware import look_at_hardware
 from abcd_ns.cli.report.run_folder import CHECKPOINTS
 from abcd_ns.engine.render import make_rasterizer, self_check
 from abcd_ns.lab.compare.command import Options, impossible, make_plan
@@ -88,7 +87,7 @@ class ScoredJob(Job):
 
 def build(_: Task) -> Iterator[Found]:
     """gsplat's extension, compiled if need be; whether the rasterizers compute what they should."""
-    found: Found = {"hardware": asdict(look_at_hardware())}
+    found: Found = {"hardware": asdict(describe_machine())}
     yield found
     device, began = "cuda" if torch.cuda.is_available() else "cpu", time.perf_counter()
     rasterizer = make_rasterizer("auto", device)

@@ -9,6 +9,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
+from abcd_ns.cli.check.command import check
 from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast
 from abcd_ns.cli.plan.forecast import Forecast, device_shares, disk_shares, views_of_blocks
 from abcd_ns.engine.space.partition import build_kd
@@ -16,8 +17,11 @@ from abcd_ns.engine.train.memory import DeviceNeeds
 from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import FITTED, Fit
+from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.nerfstudio.workers import blocks_to_begin_with
 from abcd_ns.units import GIB
+from tests.cli.check.scenes import wide
+from tests.data.dataparser_scenes import NAMES, parser, write_model, write_photos
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 FITS = {"something": 1}
@@ -156,8 +160,32 @@ def test_what_does_not_fit_is_said_with_what_to_do(fits, where, said):
 
 
 def test_blocks_that_hardly_any_view_sees_are_counted(fits):
-    (line,) = dataclasses.replace(fits, views_of_block=(0, 2, 3)).warnings
+    (line,) = dataclasses.replace(fits, views_of_block=(0, 2, 3)).advice
     assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
+
+
+def test_days_come_with_a_way_out(fits, capsys):
+    assert not fits.advice
+    long = dataclasses.replace(fits, seconds_per_step=12.0, factor=4)
+    (line,) = long.advice
+    assert "may take 24 days" in line
+    assert "--pipeline.max-seconds 7200" in line
+    assert "--downscale 8" in line
+    print_forecast(long, Console(width=200))
+    assert "note: This may take 24 days" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("photos", "points"), [(2, 600), (3, 600), (4, 600), (4, 0)])
+def test_plan_and_check_take_what_training_takes(tmp_path, capsys, photos, points):
+    """Few photos, and no points: training warns and begins."""
+    write_model(tmp_path / "sparse/0", points=points, names=NAMES[:photos], params=wide)
+    write_photos(tmp_path / "images", names=NAMES[:photos])
+    assert inspect(parser(tmp_path).config).train == photos - 1
+    assert check(data=tmp_path) == 0
+    assert plan(tmp_path, Wanted(max_gaussians=100, steps=10)) == 0
+    said = capsys.readouterr().out
+    assert "few-photos" in said
+    assert "does not fit" not in said
 
 
 def test_the_screen_is_short_and_says_more_when_asked(capsys):

@@ -73,7 +73,9 @@ def test_what_is_next_names_the_run_and_how_to_train_what_was_not_visited(coordi
     coordinator.state.views, coordinator.state.visit = {0: 3, 1: 0, 2: 1}, 2
     coordinator.state.health = {0: BlockHealth(visits=2)}
     coordinator.run.budget, coordinator.run.stopwatch = Budget(1000, 60.0), Stopwatch(60.0)
-    monkeypatch.setattr(sys, "argv", ["ns-train", "abcd", "--data", "my wall", "--pipeline.max-seconds", "60"])
+    monkeypatch.setattr(
+        sys, "argv", ["ns-train", "abcd", "--data", "my wall", "--pipeline.max-seconds", "60"]
+    )
     lines = next_steps(coordinator, "abcd", Path("my wall"), Path("run/nerfstudio_models"))
     assert "    abcd report run --data 'my wall'" in lines
     assert "    ns-viewer --load-config run/config.yml" in lines

@@ -34,7 +34,7 @@ def next_steps(trainer: Trainer, method: str, data: Path, checkpoints: Path) -> 
 
 def _doubled(trainer: Trainer) -> dict[str, object]:
     """The option that ended the run, with twice its value."""
-    budget = trainer.run.budget
-    if budget.seconds is None or trainer.state.step * budget.seconds >= budget.steps * trainer.stopwatch.seconds:
+    budget, seconds = trainer.run.budget, trainer.stopwatch.seconds
+    if budget.seconds is None or trainer.state.step / budget.steps >= seconds / budget.seconds:
         return {"--max-num-iterations": 2 * budget.steps}
     return {"--pipeline.max-seconds": f"{2 * budget.seconds:g}"}
