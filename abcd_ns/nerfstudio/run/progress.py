@@ -165,7 +165,7 @@ class ProgressReport:
         quality = "" if self._psnr is None else f"{self._psnr:.2f} dB  "
         left = ""
         # What workers are at counts as progress, and says nothing of time; the final pruning has no forecast.
-        if coordinator.state.step and not coordinator.finished:
+        if coordinator.state.step and coordinator.progress < 1:
             left = f"  {clock(seconds_left(coordinator.stopwatch.seconds, coordinator.progress))} left"
         return f"{where}  {what}  {quality}{coordinator.count():,} Gaussians  {_memory()}{left}"
 
