@@ -16,7 +16,7 @@ from abcd_ns.cli.terminal import print_facts, print_plain
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.runner import take_folder, taking
 from abcd_ns.nerfstudio.run import STATE
-from abcd_ns.nerfstudio.run.log_lines import EndLine
+from abcd_ns.nerfstudio.run.log_lines import EndLine, HeldOutLine
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
 from abcd_ns.units import bytes_in_words
 from abcd_ns.viewer.texts import clock
@@ -108,11 +108,11 @@ def _run(command: Sequence[str], logs: Path, console: Console) -> None:
 
 def _sum_up(out: Path, run: Path, seconds: float, taken: float, console: Console) -> None:
     story = read_story(run / STATE / LOG_FILE)
-    scores, end = story.held_out[-1], story.last(EndLine)
+    scores, end = story.last(HeldOutLine), story.last(EndLine)
     missed = sum(not story.of_block(block) for block in range(story.blocks)) if story.visits else 0
     console.print("\n[bold]Done[/]")
     facts = {
-        "held-out PSNR": f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}",
+        "held-out PSNR": f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}" if scores else "not measured",
         "Gaussians": f"{end.gaussians:,}",
         "peak RAM": f"{bytes_in_words(end.peak_rss_bytes)} in training",
         "not visited": f"{missed} of {story.blocks} blocks",

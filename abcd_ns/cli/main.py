@@ -128,6 +128,11 @@ def main(args: Sequence[str] | None = None) -> int:
     except UserError as error:
         print_error(f"error: {error}")
         return EXIT_USER_ERROR
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print_error(f"error: {error.filename} cannot be used: {error.strerror}.")
+        return EXIT_USER_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 

@@ -4,7 +4,7 @@ import ast
 import io
 import re
 from collections.abc import Iterator
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,21 +31,21 @@ def flags_of(name: str) -> set[str]:
     target: Any = COMMANDS[name].load() if name in COMMANDS else NERFSTUDIO[name]
     default = {"default": target} if name == "ns-train" else {}
     text = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(text), pytest.raises(SystemExit):
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(text), suppress(SystemExit):
         patch.setenv("COLUMNS", "400")
         tyro.cli(type(target) if default else target, args=["--help"], **default)
     return {flag.replace("_", "-") for flag in FLAG.findall(text.getvalue())}
 
 
 def messages(source: str) -> Iterator[str]:
-    """Every text of several words; parts of f-strings that are not known are left out."""
+    """Every text; parts of f-strings that are not known are "{}"."""
     inside: set[int] = set()  # parts come after their f-string
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.JoinedStr):
             parts = [part.value if isinstance(part, ast.Constant) else "{}" for part in node.values]
             inside |= {id(part) for part in node.values}
             yield "".join(map(str, parts))
-        elif id(node) not in inside and isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value:
+        elif isinstance(getattr(node, "value", None), str) and id(node) not in inside:
             yield node.value
 
 
@@ -53,10 +53,12 @@ def unknown(source: str, own: set[str]) -> list[str]:
     """Options in messages that neither `own` has, nor a program that the message names."""
     found = []
     for text in messages(source):
-        named = {name for name in (*COMMANDS, *NERFSTUDIO) if re.search(rf"\b(abcd )?{name}\b", text)}
+        named = [name for name in COMMANDS if f"abcd {name}" in text]
+        named += [name for name in NERFSTUDIO if name in text]
         known = own.union(ELSEWHERE, *(flags_of(name) for name in named))
         known |= {flag[:place] for flag in known for place, letter in enumerate(flag) if letter == "."}
-        found += [f"{flag} in {text!r}" for flag in FLAG.findall(text) if flag.replace("_", "-") not in known]
+        flags = FLAG.findall(text) if " " in text else []  # else it is a word of a command line
+        found += [f"{flag} in {text!r}" for flag in flags if flag.replace("_", "-") not in known]
     return found
 
 

@@ -67,17 +67,16 @@ def draw_progress(story: Story) -> str | None:
 
 
 def _draw_visits(axes: Axes, story: Story) -> None:
-    """Which block was trained when; each visit begins with drawing its layers. The warm-up trains all."""
+    """Which block was trained when; each visit begins with drawing its layers. The warm-up is shaded."""
     _over_time(axes, story, "block").grid(visible=False)
-    for visit in story.visits:
-        top, height, alpha = visit.block, 0.8, 0.85 if visit.end else 0.5
-        if top is None:
-            top, height, alpha = 0, story.blocks - 0.2, 0.3
-        for seconds, color in ((visit.seconds, STEPS), (visit.layer_seconds, LAYERS)):
-            bar = Rectangle((visit.began, top + 0.6), seconds, height, color=color, lw=0, alpha=alpha)
-            axes.add_patch(bar)
-    for color, alpha, name in ((STEPS, 0.85, "steps"), (LAYERS, 0.85, "layers"), (STEPS, 0.3, "warm-up")):
-        axes.plot([], [], "s", color=color, alpha=alpha, label=name)
+    warm_up = [visit for visit in story.visits if visit.block is None]
+    visits = [visit for visit in story.visits if visit.block is not None]
+    for visit in warm_up:
+        axes.axvspan(visit.seconds - visit.visit_seconds, visit.seconds, color=STEPS, alpha=0.3, lw=0)
+    rows = [visit.block + 1 for visit in visits]
+    began = [visit.seconds - visit.visit_seconds for visit in visits]
+    axes.barh(rows, [visit.visit_seconds for visit in visits], left=began, color=STEPS, label="steps")
+    axes.barh(rows, [visit.layer_seconds for visit in visits], left=began, color=LAYERS, label="layers")
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     axes.set_ylim(story.blocks + 0.6, 0.4)
     axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))

@@ -3,6 +3,7 @@
 from abcd_ns.cli.report.held_out import HeldOut
 from abcd_ns.cli.report.run_folder import RunFolder
 from abcd_ns.cli.terminal import many
+from abcd_ns.engine.train.health_record import BlockHealth, standing
 from abcd_ns.engine.train.memory import FLOAT
 from abcd_ns.lab.results.tables import NOTHING
 from abcd_ns.nerfstudio.run.log_lines import (
@@ -11,7 +12,9 @@ from abcd_ns.nerfstudio.run.log_lines import (
     ShedAtEndLine,
     SweepEndLine,
     TrainingLine,
+    VisitLine,
     WorkerLine,
+    layer_share,
 )
 from abcd_ns.units import GIB, MIB
 from abcd_ns.viewer.texts import clock
@@ -80,35 +83,30 @@ def block_rows(run: RunFolder) -> list[tuple[str, ...]]:
 
 def _block_row(run: RunFolder, block: int, gaussians: int | None) -> tuple[str, ...]:
     visits, health = run.story.of_block(block), run.state.health
-    seconds = sum(visit.seconds for visit in visits)
-    layers = sum(visit.layer_seconds for visit in visits)
-    psnrs = [f"{visit.end.psnr:.2f}" for visit in visits if visit.end and visit.end.psnr is not None]
+    seconds = sum(visit.visit_seconds for visit in visits)
+    psnrs = [f"{visit.psnr:.2f}" for visit in visits if visit.psnr is not None]
     return (
         str(block + 1),
         known(gaussians),
         known(health[block].shed if block in health else None),
         known(run.state.views.get(block)),
-        str(sum(visit.end is not None for visit in visits)),
+        str(len(visits)),
         known(seconds or None, "{:.1f} s"),
-        known(layers / seconds if seconds else None, "{:.0%}"),
+        known(layer_share(visits) if visits else None, "{:.0%}"),
         f"{' to '.join(dict.fromkeys([psnrs[0], psnrs[-1]]))} dB" if psnrs else NOTHING,
-        _state(run, block, gaussians),
+        _state(run, block),
     )
 
 
-def _state(run: RunFolder, block: int, gaussians: int | None) -> str:
-    visits, active = run.story.visits, run.state.active
-    if not visits:
+def _state(run: RunFolder, block: int) -> str:
+    """As the terminal tells it at the end of a run."""
+    active = run.state.active
+    if not run.story.of(VisitLine):
         return "trained in every step"
     if active is not None and active.geometry.block == block:
         return "in training when saved"
-    if gaussians == 0:
-        return "empty"
-    if any(visit.end for visit in run.story.of_block(block)):
-        return "trained"
-    if run.state.views.get(block) == 0:
-        return "no view shows it"
-    return "in the warm-up only" if any(visit.block is None for visit in visits) else "not yet visited"
+    record = run.state.health.get(block) or BlockHealth(visits=len(run.story.of_block(block)))
+    return standing(block, record, run.state.views)
 
 
 def _peaks(run: RunFolder) -> tuple[str, str]:

@@ -1,9 +1,7 @@
 """A run's log, read back: what happened when."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,25 +25,6 @@ L = TypeVar("L", bound=Line)
 
 
 @dataclass(frozen=True)
-class Visit:
-    """One visit, from its first line and its last."""
-
-    block: int | None
-    """None for the warm-up."""
-    began: float
-    """Training time, s."""
-    seconds: float
-    """How long it took, or has taken so far."""
-    end: VisitEndLine | None
-    """None where the log ends within the visit."""
-
-    @property
-    def layer_seconds(self) -> float:
-        """Of its time, what went into layers."""
-        return self.end.layer_seconds if self.end else 0.0
-
-
-@dataclass(frozen=True)
 class Story:
     """All of a log."""
 
@@ -61,10 +40,10 @@ class Story:
         """The last line of a kind, if there is one."""
         return next(reversed(self.of(kind)), None)
 
-    @cached_property
-    def visits(self) -> tuple[Visit, ...]:
-        """In the order of their numbers."""
-        return tuple(_join_visits(self))
+    @property
+    def visits(self) -> tuple[VisitEndLine, ...]:
+        """Those that ended, the warm-up's among them."""
+        return self.of(VisitEndLine)
 
     @property
     def held_out(self) -> tuple[HeldOutLine, ...]:
@@ -100,10 +79,10 @@ class Story:
     @property
     def layer_share(self) -> float:
         """Of the time of all visits that ended, the share for drawing layers."""
-        return layer_share(self.of(VisitEndLine))
+        return layer_share(self.visits)
 
-    def of_block(self, block: int) -> tuple[Visit, ...]:
-        """The visits to one block."""
+    def of_block(self, block: int) -> tuple[VisitEndLine, ...]:
+        """The visits to one block that ended."""
         return tuple(visit for visit in self.visits if visit.block == block)
 
 
@@ -125,7 +104,8 @@ def read_story(path: Path) -> Story:
     training = story.last(TrainingLine)
     if training is None:
         raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
-    numbers = [1 + visit.block for visit in story.visits if visit.block is not None]
+    visits = (*story.of(VisitLine), *story.visits)
+    numbers = [1 + visit.block for visit in visits if visit.block is not None]
     return Story(story.lines, max([training.blocks, *numbers]))
 
 
@@ -145,14 +125,3 @@ def _read_line(text: str, where: str) -> Line:
 
 def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is no number in JSON")
-
-
-def _join_visits(story: Story) -> Iterator[Visit]:
-    begun = {line.visit: line for line in story.of(VisitLine)}
-    over = {line.visit: line for line in story.of(VisitEndLine)}
-    for number in sorted({*begun, *over}):
-        first, last = begun.get(number), over.get(number)
-        # A resumed run whose past is lost has visits without a beginning.
-        ended = story.seconds if last is None else last.seconds
-        began = ended - last.visit_seconds if first is None else first.seconds
-        yield Visit((first or last).block, began, ended - began, last)
