@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from abcd_ns.cli.doctor.facts import PACKAGES, Facts, gather
+from abcd_ns.cli.doctor.facts import Facts, gather
 from abcd_ns.cli.doctor.rules import findings_of
 from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
 from abcd_ns.cli.terminal import many, print_facts
@@ -20,8 +20,8 @@ CANNOT_TRAIN = 1
 """Exit code where something makes training impossible."""
 MAIN = ("torch", "nerfstudio", "gsplat", "viser")
 """Packages whose versions are always shown."""
-DETAILS = {*PACKAGES, "OS", "driver", "torch's CUDA", "compilers", "LPIPS"}
-"""Rows that only --verbose shows."""
+DETAILS = ("os", "driver", "torch_cuda", "compiler", "nvcc", "ninja", "lpips_missing")
+"""Facts that only --verbose shows, beside the other packages' versions."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,9 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     check_json(json)
     report = diagnose(gather())
     console = Console()
-    rows = {name: value for name, value in _rows(report.facts).items() if verbose or name not in DETAILS}
-    print_facts(rows, console)
+    details = report.facts.versions | {name: getattr(report.facts, name) for name in DETAILS}
+    more = {name.replace("_", " "): str(value or "none") for name, value in details.items() if verbose}
+    print_facts(_rows(report.facts) | more, console)
     shown = [finding for finding in report.findings if verbose or finding.level != "note"]
     print_findings(shown, console)
     ill = any(finding.level == "error" for finding in report.findings)
@@ -72,31 +73,23 @@ def diagnose(facts: Facts) -> Report:
 
 
 def _rows(f: Facts) -> dict[str, str]:
-    """All there is to show."""
-    versions = {name: version or "not installed" for name, version in f.versions.items()}
+    """What is always shown."""
     rows = {
         "abcd_ns": f"{f.abcd_ns}; Python {f.python}",
-        "packages": ", ".join(f"{name} {versions.get(name)}" for name in MAIN),
-        **{name: version for name, version in versions.items() if name not in MAIN},
+        "packages": ", ".join(f"{name} {f.versions.get(name) or 'not installed'}" for name in MAIN),
         "GPU": f.gpu or "none: training runs on the CPU, which is meant for small pictures",
         "CPU": f"{f.cpu}, {f.cores} cores" if f.cpu else "unknown, as torch does not start",
         "RAM": f"{bytes_in_words(f.ram_bytes)}, {bytes_in_words(f.ram_free_bytes)} free",
         "disk": f"{bytes_in_words(f.disk_free_bytes)} free",
-        "OS": f.os,
-        "driver": f.driver or "none",
-        "torch's CUDA": f.torch_cuda or "none",
         "workers": _workers(f),
     }
     if f.folder is None:
         return rows | {"kernels": "unknown, as packages do not start"}
     checks = [f"{name} differs by {error:.0e}" for name, error in f.self_check.items()]
-    tools = f.compiler or "no C++ compiler", f"nvcc {f.nvcc}" if f.nvcc else "no nvcc"
     return rows | {
         "CPU rasterizer": f"compiled, in {f.folder}" if f.built else "first use compiles it",
         "gsplat's": f.gsplat or "not built",
         "self-check": ", ".join([*checks, *(f"{name} FAILED" for name in f.failed)]),
-        "compilers": ", ".join([*tools, "ninja" if f.ninja else "no ninja"]),
-        "LPIPS": "no weights" if f.lpips_missing else "weights are there",
     }
 
 
