@@ -56,23 +56,37 @@ def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) 
 @in_style
 def draw_progress(story: Story) -> str | None:
     """Visits, Gaussians and memory over training time, one below the other; None where nothing is known."""
-    sampled = bool(story.of(SampleLine))
-    drawers = [_draw_visits] * bool(story.visits) + [_draw_gaussians, _draw_memory] * sampled
-    if not drawers:
+    samples, panels = story.of(SampleLine), {}
+    if samples:
+        memory = {"RAM": [line.rss_bytes / GIB for line in samples]}
+        if any(line.device_bytes is not None for line in samples):
+            memory["GPU"] = [(line.device_bytes or 0) / GIB for line in samples]
+        panels = {"Gaussians": {"in the scene": [line.gaussians for line in samples]}, "memory (GiB)": memory}
+    rows = bool(story.visits) + len(panels)
+    if not rows:
         return None
-    figure = Figure(figsize=(WIDTH, HEIGHT * len(drawers)), layout="constrained")
-    for axes, draw in zip(figure.subplots(len(drawers), squeeze=False)[:, 0], drawers, strict=True):
-        draw(axes, story)
+    figure = Figure(figsize=(WIDTH, HEIGHT * rows), layout="constrained")
+    below = iter(figure.subplots(rows, squeeze=False)[:, 0])
+    if story.visits:
+        _draw_visits(next(below), story)
+    for what, curves in panels.items():
+        axes = _over_time(next(below), story, what)
+        for (name, values), color in zip(curves.items(), (STEPS, LAYERS), strict=False):
+            axes.plot([line.seconds for line in samples], values, color=color, label=name)
+        axes.legend(frameon=False, loc="lower right")
+        axes.set_ylim(bottom=0)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     return _uri(figure)
 
 
 def _draw_visits(axes: Axes, story: Story) -> None:
     """Which block was trained when; each visit begins with drawing its layers. The warm-up is shaded."""
     _over_time(axes, story, "block").grid(visible=False)
-    warm_up = [visit for visit in story.visits if visit.block is None]
+    first = story.visits[0]
+    if first.block is None:
+        ends = first.seconds - first.visit_seconds, first.seconds
+        axes.axvspan(*ends, color=STEPS, alpha=0.3, linewidth=0, label="warm-up")
     visits = [visit for visit in story.visits if visit.block is not None]
-    for visit in warm_up:
-        axes.axvspan(visit.seconds - visit.visit_seconds, visit.seconds, color=STEPS, alpha=0.3, lw=0)
     rows = [visit.block + 1 for visit in visits]
     began = [visit.seconds - visit.visit_seconds for visit in visits]
     axes.barh(rows, [visit.visit_seconds for visit in visits], left=began, color=STEPS, label="steps")
@@ -80,29 +94,6 @@ def _draw_visits(axes: Axes, story: Story) -> None:
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     axes.set_ylim(story.blocks + 0.6, 0.4)
     axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))
-
-
-def _draw_gaussians(axes: Axes, story: Story) -> None:
-    trainings = story.of(TrainingLine)
-    points = sorted((line.seconds, line.gaussians) for line in (*trainings, *story.of(SampleLine)))
-    _over_time(axes, story, "Gaussians").plot(*zip(*points, strict=True), color=STEPS)
-    limit = trainings[-1].limit
-    if limit is not None and limit < 3 * max(count for _, count in points):
-        axes.axhline(limit, color=LAYERS, linestyle="--", label="limit")
-        axes.legend(frameon=False, loc="lower right")
-    axes.set_ylim(bottom=0)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
-
-
-def _draw_memory(axes: Axes, story: Story) -> None:
-    lines = story.of(SampleLine)
-    seconds = [line.seconds for line in lines]
-    _over_time(axes, story, "memory (GiB)")
-    axes.plot(seconds, [line.rss_bytes / GIB for line in lines], color=STEPS, label="RAM")
-    if any(line.device_bytes is not None for line in lines):
-        axes.plot(seconds, [(line.device_bytes or 0) / GIB for line in lines], color=LAYERS, label="GPU")
-    axes.legend(frameon=False, loc="lower right")
-    axes.set_ylim(bottom=0)
 
 
 @in_style
