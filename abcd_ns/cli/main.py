@@ -2,13 +2,12 @@
 
 import difflib
 import importlib
-import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from abcd_ns import __version__
-from abcd_ns.errors import UserError
+from abcd_ns.errors import UserError, missing
 
 # What a shell expects: 2 for wrong usage, 128 + SIGINT for Ctrl-C.
 EXIT_USER_ERROR = 2
@@ -28,9 +27,16 @@ class Command(NamedTuple):
     """Whether the function parses its words by itself."""
 
     def load(self) -> Callable[..., int | None]:
-        """Import the function. Takes seconds where it needs torch or nerfstudio."""
+        """Import the function. Takes seconds where it needs torch or nerfstudio.
+
+        Raises:
+            UserError: a package is missing.
+        """
         module, function = self.target.split(":")
-        return getattr(importlib.import_module(module), function)
+        try:
+            return getattr(importlib.import_module(module), function)
+        except ImportError as error:
+            raise UserError(missing(error)) from None
 
 
 COMMANDS = (
@@ -100,10 +106,15 @@ def run_command(command: Command, args: Sequence[str]) -> int:
     return tyro.cli(command.load(), prog=f"abcd {command.name}", args=list(args)) or 0
 
 
-def print_error(message: str) -> None:
-    """Print `message` on stderr, in red where a person reads it (https://no-color.org is respected)."""
-    coloured = sys.stderr.isatty() and "NO_COLOR" not in os.environ
-    print(f"\033[31m{message}\033[0m" if coloured else message, file=sys.stderr)
+def refuse(message: str) -> int:
+    """Print what the user can mend on stderr, in red where a person reads it; returns the exit code."""
+    # Here and not above: `abcd --help` has no use for it.
+    from rich.console import Console
+
+    from abcd_ns.cli.terminal import print_plain
+
+    print_plain(f"error: {message}", Console(stderr=True), "red")
+    return EXIT_USER_ERROR
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -126,13 +137,11 @@ def main(args: Sequence[str] | None = None) -> int:
             return 0
         return run_command(find_command(first), args[1:])
     except UserError as error:
-        print_error(f"error: {error}")
-        return EXIT_USER_ERROR
+        return refuse(str(error))
     except OSError as error:
         if error.filename is None:
             raise
-        print_error(f"error: {error.filename} cannot be used: {error.strerror}.")
-        return EXIT_USER_ERROR
+        return refuse(f"{error.filename} cannot be used: {error.strerror}.")
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 

@@ -81,6 +81,11 @@ def test_every_command_exists(command):
     assert callable(command.load()), function
 
 
+def test_a_missing_package_is_one_line():
+    with pytest.raises(UserError, match=r"No module named 'no_such_package'.*`abcd doctor` looks closer"):
+        cli.Command("lost", "no_such_package:run", "").load()
+
+
 def test_arguments_reach_the_function(greet, capsys):
     assert greet("--name", "moon", "--times", "2") == 0
     assert capsys.readouterr().out == "hello moon hello moon\n"
@@ -124,16 +129,6 @@ def test_an_unknown_command_is_one_line_with_a_hint(name, hint, capsys):
 def test_an_error_of_the_user_is_one_line_without_traceback(greet, capsys):
     assert greet("--name", "nobody") == 2
     assert capsys.readouterr().err == "error: nobody: no such scene; give an existing folder.\n"
-
-
-@pytest.mark.parametrize(("no_color", "expected"), [(False, "\033[31merror\033[0m\n"), (True, "error\n")])
-def test_errors_are_red_on_a_terminal_unless_asked_not_to(no_color, expected, monkeypatch, capsys):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    if no_color:
-        monkeypatch.setenv("NO_COLOR", "1")
-    cli.print_error("error")
-    assert capsys.readouterr().err == expected
 
 
 def test_a_file_that_the_system_refuses_is_one_line(greet, capsys):
