@@ -149,7 +149,7 @@ class AbcdPipeline(VanillaPipeline):
         def end_run(step: int) -> None:
             self.coordinator.dismiss()
             evaluates = trainer.config.steps_per_eval_all_images and self.datamanager.eval_dataset
-            if self.coordinator.finished and evaluates:
+            if self.coordinator.finished and trainer.training_state == "completed" and evaluates:
                 self.get_average_eval_image_metrics(step)
             report.close()
             log.close()

@@ -256,8 +256,9 @@ class AbcdTrainer(Trainer):
         self._say(f"To go on:\n  {command}")
 
     def _say_what_is_next(self) -> None:
-        # Whoever has the process quit goes on by a script.
-        if self.pipeline.coordinator.finished and not self.config.viewer.quit_on_train_completion:
+        over = self.pipeline.coordinator.finished and self._training_state == "completed"
+        # Where the process quits by itself a script goes on.
+        if over and not self.config.viewer.quit_on_train_completion:
             data = self.config.pipeline.datamanager.reader().data
             method, trainer = self.config.method_name, self.pipeline.coordinator
             self._say("\n".join(["Next:", *next_steps(trainer, method, data, self.checkpoint_dir)]))
