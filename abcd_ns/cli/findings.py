@@ -1,7 +1,7 @@
 """What `abcd check` and `abcd doctor` find: how serious, what it is, why it matters, what to do; --json."""
 
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -37,37 +37,7 @@ class Finding:
     """What to do about it; empty where there is nothing to be done."""
 
 
-@dataclass(frozen=True)
-class Rule:
-    """How a finding is found, and in which words it is told."""
-
-    level: Level
-    name: str
-    look: Callable[[Any], Any]
-    """Takes all that is known, and returns values for the texts: a mapping, a list of mappings for several
-    findings, or anything true where the texts need none. What is false makes no finding."""
-    what: str
-    """With fields of the values; `f` is all that is known."""
-    fix: str = ""
-
-    def findings(self, known: Any) -> list[Finding]:
-        """Those of this rule."""
-        found = self.look(known) or []
-        values = [{"f": known, **(v if isinstance(v, Mapping) else {})} for v in _listed(found)]
-        return [Finding(self.level, self.name, self.what.format(**v), self.fix.format(**v)) for v in values]
-
-
-def _listed(found: Any) -> list[Any]:
-    return found if isinstance(found, list) else [found]
-
-
-error, warning, note = partial(Rule, "error"), partial(Rule, "warning"), partial(Rule, "note")
-"""A rule whose findings are of that level."""
-
-
-def judge(rules: Iterable[Rule], known: Any) -> list[Finding]:
-    """All that the rules find."""
-    return [finding for rule in rules for finding in rule.findings(known)]
+error, warning, note = (partial(Finding, level) for level in STYLES)
 
 
 def by_level(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -80,10 +50,9 @@ def print_findings(findings: Sequence[Finding], console: Console) -> None:
     """In groups by level. Errors stand in one line each, as `ns-train` has them."""
     for level, style in STYLES.items():
         group = [finding for finding in findings if finding.level == level]
-        if not group:
-            continue
-        title = level if len(group) == 1 else f"{level}s ({len(group)})"
-        console.print(f"\n{title}", style=style, highlight=False)
+        if group:
+            title = level if len(group) == 1 else f"{level}s ({len(group)})"
+            console.print(f"\n{title}", style=style, highlight=False)
         for finding in group[:SHOWN]:
             _print(finding, console)
         if len(group) > SHOWN:
@@ -92,16 +61,12 @@ def print_findings(findings: Sequence[Finding], console: Console) -> None:
 
 def _print(finding: Finding, console: Console) -> None:
     # Names of files may hold newlines, and bytes that no terminal takes.
-    what, fix = f"{finding.name}: {one_line(finding.what)}", one_line(finding.fix)
+    what, fix = f"  {finding.name}: {one_line(finding.what)}", one_line(finding.fix)
     wide = {"width": min(console.width, WIDEST), "break_long_words": False, "break_on_hyphens": False}
-    if finding.level == "error":
-        lines = [f"  {what}"]
-    else:
-        lines = textwrap.wrap(what, initial_indent="  ", subsequent_indent="    ", **wide)
+    lines = [what] if finding.level == "error" else textwrap.wrap(what, subsequent_indent="    ", **wide)
     if fix:
         lines += textwrap.wrap(fix, initial_indent="    -> ", subsequent_indent="       ", **wide)
-    for line in lines:
-        print_plain(line, console)
+    print_plain("\n".join(lines), console)
 
 
 def check_json(path: Path | None) -> None:
@@ -110,11 +75,9 @@ def check_json(path: Path | None) -> None:
     Raises:
         UserError: `path` is a folder, or lies in none.
     """
-    if path is None:
-        return
-    if path.is_dir():
+    if path is not None and path.is_dir():
         raise UserError(f"--json {path} is a folder; name a file.")
-    if not path.parent.is_dir():
+    if path is not None and not path.parent.is_dir():
         raise UserError(f"--json {path}: the folder {path.parent} does not exist; make it first.")
 
 
@@ -124,9 +87,8 @@ def write_report(path: Path | None, report: Any) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    if path is None:
-        return
     try:
-        write_json(path, encode(report))
+        if path is not None:
+            write_json(path, encode(report))
     except OSError as error:
         raise UserError(f"--json {path} cannot be written ({error.strerror}); name another file.") from None

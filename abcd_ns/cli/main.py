@@ -2,13 +2,12 @@
 
 import difflib
 import importlib
-import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from abcd_ns import __version__
-from abcd_ns.errors import UserError
+from abcd_ns.errors import UserError, missing
 
 # What a shell expects: 2 for wrong usage, 128 + SIGINT for Ctrl-C.
 EXIT_USER_ERROR = 2
@@ -25,48 +24,55 @@ class Command(NamedTuple):
     target: str
     help: str
     hands_on: bool = False
-    """The function takes the words as they are."""
+    """Whether the function parses its words by itself."""
 
     def load(self) -> Callable[..., int | None]:
-        """Import the function, which takes seconds (torch, nerfstudio)."""
+        """Import the function. Takes seconds where it needs torch or nerfstudio.
+
+        Raises:
+            UserError: a package is missing.
+        """
         module, function = self.target.split(":")
-        return getattr(importlib.import_module(module), function)
+        try:
+            return getattr(importlib.import_module(module), function)
+        except ImportError as error:
+            raise UserError(missing(error)) from None
 
 
 COMMANDS = (
-    Command("demo", "abcd_ns.cli.demo:demo", "make a small scene, train it block by block, show the result"),
-    Command("poses", "abcd_ns.cli.poses.command:poses", "find camera poses for photos, by pycolmap"),
-    Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training on it"),
+    Command("demo", "abcd_ns.cli.demo:demo", "make a small scene, train it, show the result"),
     Command("doctor", "abcd_ns.cli.doctor.command:doctor", "examine this machine and its packages"),
-    Command("synth", "abcd_ns.lab.synth.command:synth", "render a synthetic scene to train on"),
-    Command("train", "abcd_ns.cli.train:train", "ns-train, with options from a TOML file", hands_on=True),
-    Command("plan", "abcd_ns.cli.plan.command:plan", "say what a run will need, before it begins"),
-    Command("report", "abcd_ns.cli.report.command:report", "show all about a training run on one HTML page"),
+    Command("poses", "abcd_ns.cli.poses.command:poses", "find the camera poses of photos, by pycolmap"),
+    Command("check", "abcd_ns.cli.check.command:check", "examine a data set before training"),
+    Command("plan", "abcd_ns.cli.plan.command:plan", "predict blocks, memory and time of a run"),
+    Command("train", "abcd_ns.cli.train:train", "run ns-train with options from a TOML file", hands_on=True),
+    Command("report", "abcd_ns.cli.report.command:report", "write an HTML page about a run"),
     Command("export", "abcd_ns.cli.export.command:export", "write a scene as .ply, .spz, .sog or .glb"),
-    Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as a mesh of triangles"),
+    Command("mesh", "abcd_ns.cli.mesh.command:mesh", "write a scene's surface as triangles"),
     Command("compare", "abcd_ns.lab.compare.command:compare", "compare methods, numbers of blocks, options"),
+    Command("stability", "abcd_ns.lab.stability.command:stability", "run small scenes on which methods fail"),
+    Command("synth", "abcd_ns.lab.synth.command:synth", "render a synthetic scene to train on"),
     Command(
-        "stability",
-        "abcd_ns.lab.stability.command:stability",
-        "make methods fail on small scenes and see what ABCD does",
+        "completion", "abcd_ns.cli.completion:completion", "print a script that completes words in a shell"
     ),
-    Command("completion", "abcd_ns.cli.completion:completion", "complete words of this command in a shell"),
 )
 
 EXAMPLES = {
-    "abcd demo": "see it work, without a GPU or any data",
-    "abcd synth --help": "the options of one command",
-    "abcd check --data garden": "see whether your own photographs can be trained on",
+    "abcd demo": "see it work, without a GPU or data",
+    "abcd check --data garden": "see whether your photos can be trained on",
     "ns-train abcd --data garden": "train on them",
+    "abcd train cpu --data garden": "train without a GPU",
+    "abcd report --help": "the options of one command",
 }
 
 
 def help_text() -> str:
     """The text of `abcd --help`."""
-    options = {"--help": "show this text; after a command, its options", "--version": "show the version"}
+    options = {"--help": "show this text, or after a command its options", "--version": "show the version"}
     return "\n".join(
         [
-            "usage: abcd COMMAND [OPTIONS]\n\nGaussian splatting, one block at a time.\n\ncommands:",
+            "usage: abcd COMMAND [OPTIONS]\n",
+            "Train 3D Gaussian Splatting scenes larger than the GPU, one block at a time.\n\ncommands:",
             *(f"  {command.name:<12}{command.help}" for command in COMMANDS),
             "\noptions:",
             *(f"  {name:<12}{what}" for name, what in options.items()),
@@ -100,10 +106,15 @@ def run_command(command: Command, args: Sequence[str]) -> int:
     return tyro.cli(command.load(), prog=f"abcd {command.name}", args=list(args)) or 0
 
 
-def print_error(message: str) -> None:
-    """Print `message` on stderr, in red where a person reads it (https://no-color.org is respected)."""
-    coloured = sys.stderr.isatty() and "NO_COLOR" not in os.environ
-    print(f"\033[31m{message}\033[0m" if coloured else message, file=sys.stderr)
+def refuse(message: str) -> int:
+    """Print what the user can mend on stderr, in red where a person reads it; returns the exit code."""
+    # Here and not above: `abcd --help` has no use for it.
+    from rich.console import Console
+
+    from abcd_ns.cli.terminal import print_plain
+
+    print_plain(f"error: {message}", Console(stderr=True), "red")
+    return EXIT_USER_ERROR
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -126,8 +137,11 @@ def main(args: Sequence[str] | None = None) -> int:
             return 0
         return run_command(find_command(first), args[1:])
     except UserError as error:
-        print_error(f"error: {error}")
-        return EXIT_USER_ERROR
+        return refuse(str(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return refuse(f"{error.filename} cannot be used: {error.strerror}.")
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 

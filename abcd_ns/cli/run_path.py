@@ -1,10 +1,14 @@
 """Which folder a user means by a run."""
 
+from itertools import chain
 from pathlib import Path
 
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.run import STATE
+
+LEVELS = 3
+"""A run is that many folders below the outputs: SCENE/METHOD/TIME."""
 
 
 def find_run(path: Path, *holds: str) -> Path:
@@ -24,9 +28,12 @@ def find_run(path: Path, *holds: str) -> Path:
 
 
 def _hint(path: Path, name: str) -> str:
-    if not path.is_dir():
-        return "there is no such folder."
-    below = sorted(path.glob(f"**/{STATE}/{name}"), key=lambda found: found.stat().st_mtime)
-    if below:
-        return f"did you mean {below[-1].parent.parent}?"
+    if not path.exists():
+        return "there is no such folder. If the run was moved, give its new folder."
+    wanted = f"{STATE}/{name}"
+    above = [parent for parent in path.absolute().parents if (parent / wanted).exists()]
+    below = chain.from_iterable(path.glob("*/" * level + wanted) for level in range(1, LEVELS + 1))
+    newest = max(below, key=lambda found: found.stat().st_mtime, default=None)
+    if above or newest is not None:
+        return f"did you mean {above[0] if above else newest.parents[1]}?"
     return "give a folder outputs/SCENE/METHOD/TIME that this version of `ns-train abcd` wrote."

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 NAMED = 3
 """Of a list, how many are named."""
@@ -16,11 +14,10 @@ def print_plain(text: str, console: Console, style: str | None = None) -> None:
 
 
 def print_facts(facts: Mapping[str, str], console: Console) -> None:
-    """Print names and values in two columns."""
-    table = Table.grid(padding=(0, 2))
+    """Print names and values in two columns; long values are not wrapped, so that they can be copied."""
+    width = max(map(len, facts))
     for name, value in facts.items():
-        table.add_row(Text(name), Text(value))
-    console.print(table)
+        print_plain(f"{name:<{width}}  {value}", console)
 
 
 def few(names: Sequence[str], count: int | None = None) -> str:

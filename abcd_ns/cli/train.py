@@ -12,13 +12,14 @@ from abcd_ns.lab.results.records import read_toml
 
 USAGE = """usage: abcd train FILE.toml [OPTIONS]
 
-Run `ns-train` with the options of a TOML file, then those given here: what comes later counts.
+Run `ns-train` with the options of a TOML file. Options given here replace those of the file.
 
-  abcd train small-gpu --data garden
+  abcd train cpu --data garden          # no GPU: a small model in 15 minutes
+  abcd train small-gpu --data garden    # a small GPU, or a shared one
+  abcd train mine.toml --data garden    # a file of your own
 
-The file says `method = "abcd"`, or another method of ns-train, and options under their names, in tables:
---pipeline.device-budget-gb 6 stands in [pipeline] as device-budget-gb = 6. small-gpu, cpu and garden
-come with abcd; a file of your own is named by its path.
+cpu, small-gpu and garden come with abcd. A file begins with the method of ns-train: method = "abcd".
+Options stand in tables: --pipeline.blocks 8 is blocks = 8 in [pipeline].
 docs/reference.md lists all options."""
 METHOD = "method"
 

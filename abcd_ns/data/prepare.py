@@ -50,6 +50,9 @@ class SceneOptions(DataParserConfig):
     """Divides the photos' width and height.
     None takes the smallest of 1, 2, 4, ... that leaves no side over 1,600 px.
     Reads images_N if it fits the model; else photos are reduced in memory, by area averaging."""
+    max_side: int = 0
+    """Divides by the smallest whole number with which no photo is wider or higher than that, pixels. 0 leaves
+    it to downscale_factor, which counts where both are given."""
     scale_factor: float = 1.0
     """Multiplies the scene's size, after auto_scale_poses."""
     scene_scale: float = 1.0
@@ -141,13 +144,15 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     wanted = options.downscale_factor
     if wanted is not None and (int(wanted) != wanted or wanted < 1):
         raise InputError(f"{DOWNSCALE} is {wanted}; it must be a whole number from 1.")
+    if options.max_side < 0:
+        raise InputError(f"{OPTION}max-side is {options.max_side}; it must be a number of pixels, or 0.")
     if not 0 < options.scale_factor < math.inf:
         raise InputError(f"{OPTION}scale-factor is {options.scale_factor}; it must be above 0 and finite.")
     problems = Problems()
     try:
         scene = read_scene(options.data, options.colmap_path, options.images_path, options.masks_path)
         scene = as_stored(scene)
-        factor = automatic_factor(scene) if wanted is None else int(wanted)
+        factor = automatic_factor(scene, options.max_side) if wanted is None else int(wanted)
         with problems.collect():
             check_layout(scene)
         with problems.collect():
@@ -168,15 +173,19 @@ def prepare(options: SceneOptions, needs_photos: bool) -> Prepared:
     masked = sum(source.mask_path is not None for source in sources)
     if 0 < masked < len(sources):
         more.append(f"{masked} of {len(sources)} photos have a mask; the others count as a whole.")
-    reduced = [_reduction(scene, sources, factor)] if wanted is None and factor > 1 and needs_photos else []
+    chosen = wanted is None and not options.max_side and factor > 1
+    reduced = [_reduction(scene, sources, factor)] if chosen and needs_photos else []
     notes = (*scene.notes, *notes, *more)
     return Prepared(scene, sources, lenses, factor, similarity, points, in_model, notes, tuple(reduced))
 
 
-def automatic_factor(scene: Scene) -> int:
+def automatic_factor(scene: Scene, max_side: int = 0) -> int:
     """What photos are divided by where nothing is said: the smallest power of two that leaves no side longer
-    than MAX_AUTO_SIDE, as nerfstudio's parsers have it, but by the largest photo and not by the first."""
+    than MAX_AUTO_SIDE, as nerfstudio's parsers have it, but by the largest photo and not by the first. With
+    `max_side` the smallest whole number that leaves none longer than that."""
     longest, factor = max((max(frame.lens.size) for frame in scene.frames), default=0), 1
+    if max_side:
+        return max(-(-longest // max_side), 1)
     while longest / factor > MAX_AUTO_SIDE:
         factor *= 2
     return factor

@@ -16,12 +16,27 @@ from abcd_ns.nerfstudio.datamanager import reading
 class Inspected:
     """A capture, as far as memory hangs on it."""
 
-    pixels: int
-    """Of the largest photo as it is trained on."""
+    train: int
+    """Views to train on."""
+    held_out: int
+    size: tuple[int, int]
+    """Width and height of the largest photo as it is trained on, px."""
     points: int
     """0 where Gaussians begin at random."""
     factor: int
     """By which the photos' width and height are divided."""
+
+    @property
+    def pixels(self) -> int:
+        """Of the largest photo as it is trained on."""
+        return self.size[0] * self.size[1]
+
+    def in_words(self) -> str:
+        """One line for the terminal."""
+        width, height = self.size
+        reduced = f", divided by {self.factor}" if self.factor > 1 else ""
+        views = f"{self.train:,} views to train on, {self.held_out:,} held out"
+        return f"{views}; photos of up to {width} x {height} px{reduced}."
 
 
 def inspect(config: DataParserConfig) -> Inspected:
@@ -38,8 +53,10 @@ def inspect(config: DataParserConfig) -> Inspected:
         raise InputError(f"{config.data} has no photos to train on.")
     sources = list(dict.fromkeys(source for part in parts for source in part.metadata[PHOTOS]))
     check_masks(sources)
-    largest = max(width * height for width, height in (source.size for source in sources))
-    return Inspected(largest, len(parts[0].metadata.get("points3D_xyz", ())), factor_of(parser))
+    largest = max((source.size for source in sources), key=lambda size: size[0] * size[1])
+    train, held_out = (len(part.image_filenames) for part in parts)
+    points = len(parts[0].metadata.get("points3D_xyz", ()))
+    return Inspected(train, held_out, largest, points, factor_of(parser))
 
 
 def where_data_is(data: Path | None, config: Path) -> Path | None:

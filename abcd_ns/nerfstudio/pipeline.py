@@ -87,8 +87,8 @@ class AbcdPipeline(VanillaPipeline):
         self.coordinator = self._begin(trainer.run, attributes.optimizers.optimizers)
         self.datamanager.follow(self.coordinator)
         self.model.follow(self.coordinator)
-        report = ProgressReport(self.coordinator)
         log = keep_log(trainer.run, self.datamanager.train_dataset.photos, self.coordinator)
+        report = ProgressReport(self.coordinator, log.visits)
         self.coordinator.announce.subscribe(report)
         self.coordinator.announce.subscribe(log)
         self.panel.follow(self.coordinator)
@@ -102,8 +102,11 @@ class AbcdPipeline(VanillaPipeline):
                 self.coordinator.complete()
                 trainer.stop_training = True
 
-        def end_run(step: int) -> None:  # noqa: ARG001
+        def end_run(step: int) -> None:
             self.coordinator.dismiss()
+            evaluates = trainer.config.steps_per_eval_all_images and self.datamanager.eval_dataset
+            if self.coordinator.finished and trainer.training_state == "completed" and evaluates:
+                self.get_average_eval_image_metrics(step)
             report.close()
             log.close()
 

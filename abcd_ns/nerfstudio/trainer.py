@@ -28,12 +28,16 @@ from abcd_ns.nerfstudio.inspection import Inspected, inspect
 from abcd_ns.nerfstudio.options import check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run import STATE, STORE
+from abcd_ns.nerfstudio.run.ending import next_steps
 from abcd_ns.nerfstudio.run.resuming import RunRequest, check_start, find_start, has_begun, pin_name
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, command_to_go_on
 from abcd_ns.run.fit import Demand, device_budget, find_fit
 from abcd_ns.run.store import Start
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
+
+UNLIMITED_STEPS = 10**8
+"""From so many on the number of steps means that seconds end the run."""
 
 
 @dataclass
@@ -110,8 +114,9 @@ class AbcdTrainerConfig(TrainerConfig):
         pipeline = self.pipeline
         what = f"{self.method_name} on {pipeline.datamanager.reader().data}"
         seconds = "" if pipeline.max_seconds is None else f", at most {pipeline.max_seconds:g} s"
+        steps = f", {self.max_num_iterations:,} steps" if self.max_num_iterations < UNLIMITED_STEPS else ""
         blocks = {0: "as few blocks as fit", 1: "1 block"}.get(pipeline.blocks, f"{pipeline.blocks} blocks")
-        CONSOLE.print(f"{what}: {blocks}, {self.max_num_iterations:,} steps{seconds}", highlight=False)
+        CONSOLE.print(f"{what}: {blocks}{steps}{seconds}", highlight=False)
 
     def save_config(self) -> None:
         """Check what can be checked within seconds, then save; the first thing `ns-train` writes."""
@@ -140,6 +145,7 @@ class AbcdTrainerConfig(TrainerConfig):
             check_start(start, self.get_base_dir() / STATE / STORE, self.pipeline.blocks)
             check_options(self)
             found = inspect(self.pipeline.datamanager.reader())
+            CONSOLE.print(found.in_words(), highlight=False)
             if self.pipeline.blocks == 0:
                 self._check_fit(found)
 
@@ -201,7 +207,8 @@ class AbcdTrainer(Trainer):
         at = TrainingCallbackLocation
         hold = TrainingCallback([at.BEFORE_TRAIN_ITERATION], lambda step: self._signals.hold())  # noqa: ARG005
         release = TrainingCallback([at.AFTER_TRAIN_ITERATION], lambda step: self._signals.release())  # noqa: ARG005
-        self.callbacks = [hold, *self.callbacks, release]
+        after = TrainingCallback([at.AFTER_TRAIN], lambda step: self._say_what_is_next())  # noqa: ARG005
+        self.callbacks = [hold, *self.callbacks, release, after]
 
     def train(self) -> None:
         """As nerfstudio's; a signal, or what the user can mend, ends the process and says how to go on."""
@@ -298,6 +305,14 @@ class AbcdTrainer(Trainer):
         if command is None or not has_begun(self.base_dir / STATE / STORE):
             return  # whoever started this training knows better, or there is nothing to go on from yet
         self._say(f"To go on:\n  {command}")
+
+    def _say_what_is_next(self) -> None:
+        over = self.pipeline.coordinator.finished and self._training_state == "completed"
+        # Where the process quits by itself a script goes on.
+        if over and not self.config.viewer.quit_on_train_completion:
+            data = self.config.pipeline.datamanager.reader().data
+            method, trainer = self.config.method_name, self.pipeline.coordinator
+            self._say("\n".join(["Next:", *next_steps(trainer, method, data, self.checkpoint_dir)]))
 
     def _say(self, text: str) -> None:
         CONSOLE.print(text, highlight=False, markup=False, emoji=False, soft_wrap=True)

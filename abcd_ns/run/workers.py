@@ -26,7 +26,7 @@ def blocks_to_begin_with(fit: Fit, workers: int) -> int:
     if workers and not fit.limit:
         raise UserError(
             f"{bytes_in_words(fit.budget)} of the device have no room for a block among others, which "
-            "workers need: leave --pipeline.workers out, or give smaller photos."
+            "workers need: train without workers, or on smaller photos."
         )
     return max(fit.blocks, BLOCKS_EACH * workers)
 

@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from abcd_ns.cli.doctor.hardware import look_at_hardware
 from abcd_ns.cli.report.run_folder import CHECKPOINTS
 from abcd_ns.engine.render import make_rasterizer, self_check
 from abcd_ns.lab.compare.command import Options, make_plan, terrain_jobs
@@ -85,7 +84,7 @@ class ScoredJob(Job):
 
 def build(_: Task) -> Iterator[Found]:
     """gsplat's extension, compiled if need be; whether the rasterizers compute what they should."""
-    found: Found = {"hardware": asdict(look_at_hardware())}
+    found: Found = {"hardware": asdict(describe_machine())}
     yield found
     device, began = "cuda" if torch.cuda.is_available() else "cpu", time.perf_counter()
     rasterizer = make_rasterizer("auto", device)

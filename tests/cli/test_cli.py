@@ -4,6 +4,7 @@ import importlib.util
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from abcd_ns import __version__
 from abcd_ns.cli import main as cli
 from abcd_ns.errors import UserError
+from tests.cli.report.runs import made_up_folder
 
 THERE_ARE = f"there are: {', '.join(command.name for command in cli.COMMANDS)}."
 
@@ -27,6 +29,8 @@ def _greet(name: str, times: int = 1) -> int | None:
     """
     if name == "nobody":
         raise _NoSuchScene("nobody: no such scene; give an existing folder.")
+    if name == "locked":
+        raise PermissionError(13, "Permission denied", "run/log.jsonl")
     if name == "ctrl-c":
         raise KeyboardInterrupt
     if name == "bug":
@@ -77,6 +81,11 @@ def test_every_command_exists(command):
     assert callable(command.load()), function
 
 
+def test_a_missing_package_is_one_line():
+    with pytest.raises(UserError, match=r"No module named 'no_such_package'.*`abcd doctor` looks closer"):
+        cli.Command("lost", "no_such_package:run", "").load()
+
+
 def test_arguments_reach_the_function(greet, capsys):
     assert greet("--name", "moon", "--times", "2") == 0
     assert capsys.readouterr().out == "hello moon hello moon\n"
@@ -122,14 +131,45 @@ def test_an_error_of_the_user_is_one_line_without_traceback(greet, capsys):
     assert capsys.readouterr().err == "error: nobody: no such scene; give an existing folder.\n"
 
 
-@pytest.mark.parametrize(("no_color", "expected"), [(False, "\033[31merror\033[0m\n"), (True, "error\n")])
-def test_errors_are_red_on_a_terminal_unless_asked_not_to(no_color, expected, monkeypatch, capsys):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    if no_color:
-        monkeypatch.setenv("NO_COLOR", "1")
-    cli.print_error("error")
-    assert capsys.readouterr().err == expected
+def test_a_file_that_the_system_refuses_is_one_line(greet, capsys):
+    assert greet("--name", "locked") == 2
+    assert capsys.readouterr().err == "error: run/log.jsonl cannot be used: Permission denied.\n"
+
+
+def wrong_words() -> list[tuple[str, str]]:
+    """What users type by mistake, in a folder with a run, a photo and nothing else; and what is said."""
+    return [
+        ("report absent", "absent is no run with abcd/settings.json: there is no such folder"),
+        ("report photo.jpg", "photo.jpg is no run"),
+        ("report run/abcd", "did you mean"),
+        ("report outputs", "outputs is no run with abcd/settings.json: give a folder"),
+        ("report run --out absent/page.html", "absent does not exist"),
+        ("export absent --out scene.ply", "absent is no run with abcd/store"),
+        ("export run --out scene.obj", "run is no run with abcd/store"),
+        ("export run --out absent/scene.ply", "absent does not exist; make it first"),
+        ("mesh run --data photos --out scene.obj", "--out scene.obj must end in .ply"),
+        ("mesh absent --data photos --out scene.ply", "absent is no run"),
+        ("plan --data absent", "absent"),
+        ("poses absent", "absent/images does not exist"),
+        ("train absent.toml", "absent.toml does not exist"),
+        ("train run", "run cannot be read as TOML"),
+        ("demo --out photo.jpg", "photo.jpg is a file"),
+        ("doctor --json absent/doctor.json", "the folder absent does not exist"),
+        ("check --data absent --json absent/check.json", "the folder absent does not exist"),
+    ]
+
+
+@pytest.mark.parametrize(("words", "said"), wrong_words(), ids=[words for words, _ in wrong_words()])
+def test_what_users_get_wrong_is_one_line_that_says_what_to_give(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made_up_folder(Path("run"))
+    Path("outputs").mkdir()
+    Path("photo.jpg").touch()
+    before = sorted(tmp_path.rglob("*"))
+    assert cli.main(words.split()) == 2
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error: "))
+    assert said in line
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_ctrl_c_is_quiet(greet, capsys):

@@ -7,87 +7,68 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import psutil
 import pytest
 import torch
 from torch.utils import cpp_extension
 
-from abcd_ns.cli.doctor import command, hardware, kernels, packages
+from abcd_ns.cli.doctor import command, facts, kernels
 from abcd_ns.cli.doctor.command import diagnose, doctor
-from abcd_ns.cli.doctor.facts import Facts
-from abcd_ns.cli.doctor.hardware import Gpu, Hardware
-from abcd_ns.cli.doctor.kernels import Kernels, build_folder, find_extension, look_at_kernels
-from abcd_ns.cli.doctor.packages import VERSIONS, Packages, look_at_packages
+from abcd_ns.cli.doctor.facts import PACKAGES, Facts
+from abcd_ns.cli.doctor.kernels import build_folder, find_extension
 from abcd_ns.cli.doctor.rules import TESTED
 from abcd_ns.errors import UserError
 
 GIB = 2**30
 HEALTHY = Facts(
-    Packages(
-        abcd_ns="0.1.0",
-        commit=None,
-        python="3.11.9",
-        versions=dict.fromkeys(VERSIONS, "1.0") | TESTED | {"viser": "1.0.25"},
-        ray="2.60.0",
-        broken={},
-        registered=True,
-        has_ns_train=True,
-    ),
-    Hardware(
-        os="Linux",
-        cpu="a CPU",
-        cores=8,
-        ram_bytes=64 * GIB,
-        ram_free_bytes=60 * GIB,
-        disk_free_bytes=500 * GIB,
-        may_write=True,
-        gpu=Gpu("a GPU", 80 * GIB, "9.0"),
-        gpus=2,
-        torch_cuda="13.0",
-        driver="580.1",
-    ),
-    Kernels(
-        built=True,
-        folder="/cache/kernels",
-        compiler="g++",
-        gsplat="/cache/gsplat_cuda.so",
-        nvcc="13.0",
-        ninja=True,
-        self_check={"torch on cpu": 1e-6, "gsplat on cuda": 2e-5},
-        failed={},
-        lpips_missing=None,
-    ),
+    abcd_ns="0.1.0",
+    python="3.11.9",
+    versions=dict.fromkeys(PACKAGES, "1.0") | TESTED | {"viser": "1.0.25"},
+    ray="2.60.0",
+    broken={},
+    registered=True,
+    has_ns_train=True,
+    os="Linux",
+    ram_bytes=64 * GIB,
+    ram_free_bytes=60 * GIB,
+    disk_free_bytes=500 * GIB,
+    may_write=True,
+    driver="580.1",
+    cpu="a CPU",
+    cores=8,
+    gpu="a GPU, 80.0 GiB, capability 9.0",
+    gpus=2,
+    torch_cuda="13.0",
+    folder="/cache/kernels",
+    built=True,
+    gsplat="/cache/gsplat_cuda.so",
+    compiler="g++",
+    nvcc="13.0",
+    ninja=True,
+    self_check={"torch on cpu": 1e-6, "gsplat on cuda": 2e-5},
 )
-NO_GPU = replace(HEALTHY, hardware=replace(HEALTHY.hardware, gpu=None, driver=None))
-
-
-def with_packages(**changes) -> Facts:
-    return replace(HEALTHY, packages=replace(HEALTHY.packages, **changes))
+NO_GPU = replace(HEALTHY, gpu=None, driver=None)
+TORCHVISION = {"torchvision": "operator torchvision::nms does not exist"}
 
 
 def with_version(**versions) -> Facts:
-    return with_packages(versions=HEALTHY.packages.versions | versions)
+    return replace(HEALTHY, versions=HEALTHY.versions | versions)
 
 
-def with_hardware(**changes) -> Facts:
-    return replace(HEALTHY, hardware=replace(HEALTHY.hardware, **changes))
-
-
-def with_kernels(facts: Facts = HEALTHY, **changes) -> Facts:
-    return replace(facts, kernels=replace(facts.kernels, **changes))
+def but(found: Facts = HEALTHY, **changes) -> Facts:
+    return replace(found, **changes)
 
 
 @pytest.mark.parametrize(
-    ("facts", "said"),
+    ("found", "said"),
     [
-        (HEALTHY, "up to 2, one for each GPU: --pipeline.workers, by Ray 2.60.0"),
-        (with_packages(ray=None), "up to 2, one for each GPU: --pipeline.workers, after pip install"),
-        (with_hardware(gpus=1), "none here: one GPU"),
+        (HEALTHY, "up to 2, one for each GPU: ns-train's --pipeline.workers, by Ray 2.60.0"),
+        (but(ray=None), "up to 2, one for each GPU: ns-train's --pipeline.workers, after pip install"),
+        (but(gpus=1), "none here: one GPU"),
         (NO_GPU, "up to 8, one for each core"),
     ],
 )
-def test_it_says_how_many_workers_there_could_be(capsys, monkeypatch, facts, said):
-    monkeypatch.setattr(command, "gather", lambda: facts)
+def test_it_says_how_many_workers_there_could_be(capsys, monkeypatch, found, said):
+    monkeypatch.setattr(command, "gather", lambda: found)
     assert doctor() == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("workers"))
     assert said in line
@@ -98,41 +79,36 @@ def test_a_healthy_machine_has_no_findings():
 
 
 @pytest.mark.parametrize(
-    ("facts", "level", "name", "said"),
+    ("found", "level", "name", "said"),
     [
         (with_version(pycolmap=None), "error", "missing-packages", "pycolmap"),
-        (with_packages(broken={"cv2": "libGL.so.1: no"}), "error", "broken-package", "apt-get"),
-        (
-            with_packages(broken={"torchvision": "operator torchvision::nms does not exist"}),
-            "error",
-            "broken-package",
-            "do not belong together",
-        ),
-        (with_packages(broken={"open3d": "libusb"}), "warning", "broken-export", "ns-export"),
-        (with_packages(registered=False), "error", "not-registered", "pip install ."),
-        (with_packages(has_ns_train=False), "error", "no-ns-train", "nerfstudio"),
+        (but(broken={"cv2": "libGL.so.1: no"}), "error", "broken-package", "apt-get"),
+        (but(broken=TORCHVISION), "error", "broken-package", "do not belong together"),
+        (but(broken={"open3d": "libusb"}), "warning", "broken-export", "ns-export"),
+        (but(registered=False), "error", "not-registered", "pip install ."),
+        (but(has_ns_train=False), "error", "no-ns-train", "nerfstudio"),
         (with_version(gsplat="1.5.3"), "warning", "untested-version", "gsplat==1.4.0"),
         (with_version(viser="0.2.7"), "note", "viewer-hole", "websocket-host 127.0.0.1"),
         (with_version(viser="1.0.24"), "note", "viewer-hole", "1.0.24"),
-        (with_hardware(may_write=False), "error", "read-only-folder", "--output-dir"),
-        (with_hardware(disk_free_bytes=GIB), "warning", "little-disk", "1.0 GiB"),
-        (with_hardware(ram_free_bytes=GIB), "warning", "little-ram", "1.0 GiB"),
+        (but(may_write=False), "error", "read-only-folder", "--output-dir"),
+        (but(disk_free_bytes=GIB), "warning", "little-disk", "1.0 GiB"),
+        (but(ram_free_bytes=GIB), "warning", "little-ram", "1.0 GiB"),
         (NO_GPU, "note", "no-gpu", "CPU"),
-        (with_hardware(gpu=None, torch_cuda=None), "warning", "torch-without-cuda", "580.1"),
-        (with_hardware(gpu=None), "warning", "cuda-unavailable", "CUDA_VISIBLE_DEVICES"),
-        (with_kernels(NO_GPU, built=False), "note", "library-not-compiled", "15 seconds"),
-        (with_kernels(NO_GPU, built=False, compiler=None), "warning", "no-compiler", "g++"),
-        (with_kernels(gsplat=None), "note", "gsplat-not-built", "MAX_JOBS"),
-        (with_kernels(gsplat=None, nvcc=None), "error", "gsplat-cannot-be-built", "nvcc"),
-        (with_kernels(gsplat=None, ninja=False), "error", "gsplat-cannot-be-built", "ninja"),
-        (with_kernels(gsplat=None, nvcc="12.4"), "error", "gsplat-cannot-be-built", "12.4"),
-        (with_kernels(failed={"gsplat on cuda": "is off"}), "error", "self-check", "rasterizer torch"),
-        (with_kernels(failed={"torch on cpu": "is off"}), "error", "self-check", "/cache/kernels"),
-        (with_kernels(lpips_missing="LPIPS needs weights"), "note", "no-lpips", "LPIPS needs weights"),
+        (but(gpu=None, torch_cuda=None), "warning", "torch-without-cuda", "580.1"),
+        (but(gpu=None), "warning", "cuda-unavailable", "CUDA_VISIBLE_DEVICES"),
+        (but(NO_GPU, built=False), "note", "library-not-compiled", "15 seconds"),
+        (but(NO_GPU, built=False, compiler=None), "warning", "no-compiler", "g++"),
+        (but(gsplat=None), "note", "gsplat-not-built", "MAX_JOBS"),
+        (but(gsplat=None, nvcc=None), "error", "gsplat-cannot-be-built", "nvcc"),
+        (but(gsplat=None, ninja=False), "error", "gsplat-cannot-be-built", "ninja"),
+        (but(gsplat=None, nvcc="12.4"), "error", "gsplat-cannot-be-built", "12.4"),
+        (but(failed={"gsplat on cuda": "is off"}), "error", "self-check", "rasterizer torch"),
+        (but(failed={"torch on cpu": "is off"}), "error", "self-check", "/cache/kernels"),
+        (but(lpips_missing="LPIPS needs weights"), "note", "no-lpips", "LPIPS needs weights"),
     ],
 )
-def test_each_ailment_is_found_with_its_cure(facts, level, name, said):
-    wanted = [finding for finding in diagnose(facts).findings if finding.name == name]
+def test_each_ailment_is_found_with_its_cure(found, level, name, said):
+    wanted = [finding for finding in diagnose(found).findings if finding.name == name]
     assert [finding.level for finding in wanted] == [level]
     assert said in wanted[0].what + wanted[0].fix
 
@@ -143,8 +119,8 @@ def test_sound_versions_are_left_alone(versions):
 
 
 def test_where_torch_does_not_start_the_rest_is_still_said(capsys, monkeypatch):
-    broken = replace(with_packages(broken={"torch": "ImportError: libcudart"}), hardware=None, kernels=None)
-    monkeypatch.setattr(command, "gather", lambda: broken)
+    found = but(NO_GPU, broken={"torch": "ImportError: libcudart"}, cpu=None, folder=None)
+    monkeypatch.setattr(command, "gather", lambda: found)
     assert doctor() == 1
     printed = capsys.readouterr().out
     assert "torch does not start: ImportError: libcudart" in printed
@@ -153,8 +129,8 @@ def test_where_torch_does_not_start_the_rest_is_still_said(capsys, monkeypatch):
 
 
 def test_where_all_is_well_the_screen_is_short_and_notes_wait_to_be_asked_for(capsys, monkeypatch):
-    facts = with_kernels(with_version(viser="0.2.7"), lpips_missing="LPIPS needs weights")
-    monkeypatch.setattr(command, "gather", lambda: facts)
+    found = but(with_version(viser="0.2.7"), lpips_missing="LPIPS needs weights")
+    monkeypatch.setattr(command, "gather", lambda: found)
     assert doctor() == 0
     short = capsys.readouterr().out
     assert len(short.splitlines()) <= 12
@@ -168,15 +144,15 @@ def test_where_all_is_well_the_screen_is_short_and_notes_wait_to_be_asked_for(ca
 
 def test_the_report_names_no_home(tmp_path, monkeypatch, capsys):
     home = str(Path.home())
-    facts = with_kernels(with_packages(broken={"cv2": f"no {home}/lib.so"}), folder=f"{home}/.cache/x")
-    monkeypatch.setattr(command, "gather", lambda: facts)
+    found = but(broken={"cv2": f"no {home}/lib.so"}, folder=f"{home}/.cache/x")
+    monkeypatch.setattr(command, "gather", lambda: found)
     doctor(json=tmp_path / "report.json", verbose=True)
     text = (tmp_path / "report.json").read_text()
     for said in (text, capsys.readouterr().out):
         assert home + "/" not in said
         assert "~/.cache/x" in said
         assert "~/lib.so" in said
-    assert json.loads(text)["facts"]["kernels"]["nvcc"] == "13.0"
+    assert json.loads(text)["facts"]["nvcc"] == "13.0"
 
 
 def test_a_report_that_cannot_be_written_is_refused_first(tmp_path):
@@ -187,35 +163,28 @@ def test_a_report_that_cannot_be_written_is_refused_first(tmp_path):
 # Looking
 
 
-def test_this_environment_starts(monkeypatch):
-    monkeypatch.setattr(packages, "_start_apart", lambda _: None)
-    calls = []
-    found = look_at_packages(lambda: calls.append(1))
-    assert found.broken == {}
+def test_this_environment_starts_and_looking_builds_nothing(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(facts, "_start_apart", lambda _: None)
+    for name in ("ABCD_KERNELS", "TORCH_EXTENSIONS_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / name))
+    found = facts.gather()
+    assert (found.broken, found.failed, found.built, found.gsplat) == ({}, {}, False, None)
+    assert 0 <= found.self_check["torch on cpu"] < 2e-3
     assert found.versions["nerfstudio"] is not None
-    assert len(calls) == len(packages.STARTED) + 1
+    assert (found.gpu is None) == (not torch.cuda.is_available())
+    assert os.listdir(tmp_path) == []
 
 
 def test_modules_that_do_not_start_are_told_with_their_error(monkeypatch, tmp_path):
     (tmp_path / "a_broken_module.py").write_text("raise RuntimeError('no such operator\\nmore')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(packages, "STARTED", ("json", "a_broken_module", "no_module_of_this_name"))
-    monkeypatch.setattr(packages, "EXPORT", "a_broken_module")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    broken = look_at_packages(lambda: None).broken
-    assert broken["a_broken_module"] == "more"  # the export's, looked at in a process of its own
-    assert broken["no_module_of_this_name"].startswith("ModuleNotFoundError")
-    assert "json" not in broken
-
-
-def test_hardware_is_what_others_see(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    found = hardware.look_at_hardware()
-    assert found.ram_bytes == psutil.virtual_memory().total
-    assert 0 < found.ram_free_bytes <= found.ram_bytes
-    assert found.may_write
-    assert (found.gpu is None) == (not torch.cuda.is_available())
-    assert list(tmp_path.iterdir()) == []
+    assert facts._start("json") is None
+    assert facts._start("a_broken_module") == "RuntimeError: no such operator"
+    assert facts._start("no_module_of_this_name").startswith("ModuleNotFoundError")
+    monkeypatch.setattr(facts, "EXPORT", "a_broken_module")  # looked at in a process of its own
+    assert facts._start("a_broken_module") == "more"
 
 
 @pytest.mark.parametrize(
@@ -239,25 +208,13 @@ def test_an_extension_that_was_built_is_found(monkeypatch, tmp_path):
     assert find_extension() == tmp_path / "gsplat_cuda" / "gsplat_cuda.so"
 
 
-def test_looking_at_kernels_builds_nothing(monkeypatch, tmp_path):
-    monkeypatch.setenv("ABCD_KERNELS", str(tmp_path / "kernels"))
-    monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path / "extensions"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    found = look_at_kernels(on_gpu=False)
-    assert not found.built
-    assert found.gsplat is None
-    assert found.failed == {}
-    assert 0 <= found.self_check["torch on cpu"] < 2e-3
-    assert os.listdir(tmp_path) == []
-
-
 def test_an_extension_that_does_not_load_is_a_finding(monkeypatch, tmp_path):
     """As one that was built for another torch."""
     monkeypatch.delitem(sys.modules, "gsplat.cuda._backend", raising=False)
     path = tmp_path / "gsplat_cuda.so"
     path.write_bytes(b"no library")
-    _, failed = kernels._self_checks(False, path)
-    assert str(path) in failed["gsplat on cuda"]
+    monkeypatch.setattr(kernels, "find_extension", lambda: path)
+    assert str(path) in kernels.look_at_kernels(on_gpu=True)["failed"]["gsplat on cuda"]
     assert "gsplat.cuda._backend" not in sys.modules
 
 
@@ -265,8 +222,8 @@ def test_it_starts_without_torch():
     """Otherwise it could not say what is wrong with torch."""
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "from abcd_ns.cli.doctor import command, packages\n"
-        "packages._start_apart = lambda _: None\n"
+        "from abcd_ns.cli.doctor import command, facts\n"
+        "facts._start_apart = lambda _: None\n"
         "sys.exit(command.doctor())"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

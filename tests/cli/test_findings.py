@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from abcd_ns.cli.findings import Finding, Rule, by_level, judge, print_findings
+from abcd_ns.cli.findings import Finding, by_level, print_findings
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = (ROOT / "docs/troubleshooting.md").read_text()
@@ -42,26 +42,6 @@ def test_text_is_wrapped_and_errors_are_not():
 def test_names_of_files_are_no_markup():
     name = "[red]a.png[/red] :smile:"
     assert printed(Finding("note", "n", name))[-1] == f"  n: {name}"
-
-
-def test_a_rule_finds_nothing_one_thing_or_several():
-    facts = {"broken": ["a", "b"], "free": 3}
-    rules = [
-        Rule(
-            "error",
-            "broken",
-            lambda f: [{"who": who} for who in f["broken"]],
-            "{who} is broken.",
-            "Mend {who}.",
-        ),
-        Rule("note", "free", lambda f: f["free"] < 9, "Free: {f[free]}."),
-        Rule("note", "never", lambda f: f["free"] > 9 and {"free": 0}, "Free: {free}."),
-    ]
-    assert judge(rules, facts) == [
-        Finding("error", "broken", "a is broken.", "Mend a."),
-        Finding("error", "broken", "b is broken.", "Mend b."),
-        Finding("note", "free", "Free: 3."),
-    ]
 
 
 def names_in_code() -> set[str]:

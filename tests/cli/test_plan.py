@@ -7,17 +7,19 @@ import math
 import pytest
 import torch
 from rich.console import Console
-from torch import Tensor
 
+from abcd_ns.cli.check.command import check
 from abcd_ns.cli.plan.command import Capture, Wanted, forecast, plan, print_forecast
 from abcd_ns.cli.plan.forecast import Forecast, device_shares, disk_shares, views_of_blocks
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.train.memory import DeviceNeeds
-from abcd_ns.engine.types import View
 from abcd_ns.errors import UserError
+from abcd_ns.nerfstudio.inspection import inspect
 from abcd_ns.run.fit import FITTED, Fit
 from abcd_ns.run.workers import blocks_to_begin_with
 from abcd_ns.units import GIB
+from tests.cli.check.scenes import wide
+from tests.data.dataparser_scenes import NAMES, parser, write_model, write_photos
 from tests.reference.scenes import random_gaussians, ring_of_views
 
 FITS = {"something": 1}
@@ -45,22 +47,6 @@ def test_views_of_blocks_counts_as_a_loop_over_points_does():
     assert 0 < sum(expected) < 30
 
 
-def test_of_many_points_a_choice_from_every_block_is_looked_at(monkeypatch):
-    points, views = random_gaussians(3000).means * 3, ring_of_views(5)
-    tree, looked_at, depths_of = build_kd(points, 6), [], View.depths_of
-    everything = views_of_blocks(tree, points, views)
-
-    def count(view: View, some: Tensor):
-        looked_at.append(tree.assign(some).bincount(minlength=6).tolist())
-        return depths_of(view, some)
-
-    monkeypatch.setattr("abcd_ns.cli.plan.forecast.MOST_POINTS", 1000)
-    monkeypatch.setattr(View, "depths_of", count)
-    assert views_of_blocks(tree, points, views) == everything
-    assert [sum(by_block) for by_block in looked_at] == [1000] * 5
-    assert {number for by_block in looked_at for number in by_block} <= {166, 167}
-
-
 def test_a_forecast_adds_up():
     found = forecast(capture(), Wanted(blocks=4, max_gaussians=1000, steps=100), Console(quiet=True))
     assert (found.fit.blocks, sum(found.points_of_block), len(found.views_of_block)) == (4, 400, 4)
@@ -86,8 +72,10 @@ def test_blocks_whose_number_is_given_have_no_limit_and_are_warned_of():
 def test_workers_for_whom_there_is_no_room_are_refused():
     alone = Fit(blocks=1, limit=0, sole=5000, budget=GIB, gaussians=1000, batch=4)
     assert blocks_to_begin_with(alone, 0) == 1
-    with pytest.raises(UserError, match=r"1\.0 GiB of the device have no room for a block among others"):
+    words = r"1\.0 GiB of the device have no room for a block among others"
+    with pytest.raises(UserError, match=words) as refused:
         blocks_to_begin_with(alone, 2)
+    assert "--" not in str(refused.value)  # `abcd plan` and `ns-train` have other names for it
     assert blocks_to_begin_with(dataclasses.replace(alone, limit=5000), 3) == 6
 
 
@@ -121,16 +109,6 @@ def test_large_photos_are_planned_for_as_they_are_trained_on():
     assert not found.warnings
 
 
-def test_a_device_keeps_layers_and_photos_besides():
-    limit = DeviceNeeds(100, 4).block_limit(GIB)
-    fit = Fit(blocks=2, limit=limit, sole=10**9, budget=GIB, gaussians=10**9, batch=4)
-    shares = device_shares(fit, DeviceNeeds(100, 4))
-    assert list(shares.values())[2:] == [GIB // 8, GIB // 8]
-    assert GIB - DeviceNeeds(100, 4).gaussian_bytes < sum(shares.values()) <= GIB
-    alone = device_shares(dataclasses.replace(fit, blocks=1), DeviceNeeds(100, 1, levels=0))
-    assert list(alone.values())[2:] == [0, GIB // 8]
-
-
 def test_disk_holds_two_generations_and_a_checkpoint():
     fit = Fit(blocks=1, limit=10**9, sole=10**9, budget=GIB, gaussians=1000, batch=4)
     needs = DeviceNeeds(100, 1)
@@ -156,8 +134,32 @@ def test_what_does_not_fit_is_said_with_what_to_do(fits, where, said):
 
 
 def test_blocks_that_hardly_any_view_sees_are_counted(fits):
-    (line,) = dataclasses.replace(fits, views_of_block=(0, 2, 3)).warnings
+    (line,) = dataclasses.replace(fits, views_of_block=(0, 2, 3)).advice
     assert line.startswith("2 of 3 blocks are seen by fewer than 3 views")
+
+
+def test_days_come_with_a_way_out(fits, capsys):
+    assert not fits.advice
+    long = dataclasses.replace(fits, seconds_per_step=12.0, factor=4)
+    (line,) = long.advice
+    assert "may take 24 days" in line
+    assert "--pipeline.max-seconds 7200" in line
+    assert "--downscale 8" in line
+    print_forecast(long, Console(width=200))
+    assert "note: This may take 24 days" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("photos", "points"), [(2, 600), (3, 600), (4, 600), (4, 0)])
+def test_plan_and_check_take_what_training_takes(tmp_path, capsys, photos, points):
+    """Few photos, and no points: training warns and begins."""
+    write_model(tmp_path / "sparse/0", points=points, names=NAMES[:photos], params=wide)
+    write_photos(tmp_path / "images", names=NAMES[:photos])
+    assert inspect(parser(tmp_path).config).train == photos - 1
+    assert check(data=tmp_path) == 0
+    assert plan(tmp_path, Wanted(max_gaussians=100, steps=10)) == 0
+    said = capsys.readouterr().out
+    assert "few-photos" in said
+    assert "does not fit" not in said
 
 
 def test_the_screen_is_short_and_says_more_when_asked(capsys):

@@ -51,6 +51,7 @@ def test_ns_train_takes_every_file_in_configs(path):
     config = tyro.cli(AnnotatedBaseConfigUnion, args=[*words, "--pipeline.max-seconds", "77"])
     assert config.method_name == words[0] == "abcd"
     assert config.pipeline.max_seconds == 77
+    assert config.pipeline.datamanager.dataparser.max_side == (320 if path.stem == "cpu" else 0)
     assert f"abcd train {path.stem} --data" in path.read_text()
 
 

@@ -38,6 +38,12 @@ def test_a_factor_that_is_given_is_taken_and_nothing_is_said(long_scene, capsys,
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize(("side", "width"), [(320, 3300 // 11), (4000, 3300)])
+def test_a_longest_side_that_is_given_is_kept_to_by_a_whole_number(long_scene, capsys, side, width):
+    assert max(widths(long_scene, max_side=side)) == width
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.parametrize(("longest", "factor"), [(1600, 1), (1601, 2), (3200, 2), (3201, 4), (6401, 8)])
 @pytest.mark.parametrize("upright", [False, True])
 def test_the_factor_is_nerfstudios(longest, factor, upright):

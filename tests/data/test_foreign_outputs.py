@@ -168,14 +168,16 @@ def test_a_colour_for_masked_pixels_is_refused(photo):
 
 
 def test_a_capture_is_measured(scene):
-    assert inspect(colmap(scene)) == Inspected(SIZES[0][0] * SIZES[0][1], 20, 1)
+    assert inspect(colmap(scene)) == Inspected(8, 2, SIZES[0], 20, 1)
     write_photos(scene / "images_2", divide=2)
-    half = (SIZES[0][0] // 2) * (SIZES[0][1] // 2)
-    assert inspect(colmap(scene, downscale_factor=2)) == Inspected(half, 20, 2)
+    half = Inspected(8, 2, (SIZES[0][0] // 2, SIZES[0][1] // 2), 20, 2)
+    assert inspect(colmap(scene, downscale_factor=2)) == half
+    said = "8 views to train on, 2 held out; photos of up to {} x {} px, divided by 2."
+    assert half.in_words() == said.format(*half.size)
 
 
 def test_a_capture_without_points_has_none(tmp_path):
-    assert inspect(BlenderDataParserConfig(data=write_blender(tmp_path))) == Inspected(32 * 24, 0, 1)
+    assert inspect(BlenderDataParserConfig(data=write_blender(tmp_path))) == Inspected(3, 3, (32, 24), 0, 1)
 
 
 @pytest.mark.parametrize(

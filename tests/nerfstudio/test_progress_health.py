@@ -2,14 +2,17 @@
 
 import io
 import re
+import sys
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from abcd_ns.engine.events import Mended, Shedding, StepTaken, VisitBegan
+from abcd_ns.engine.events import HeldOutScored, Mended, Shedding, StepTaken, VisitBegan
 from abcd_ns.engine.train.health_record import BlockHealth
-from abcd_ns.engine.train.run_state import Stopwatch
+from abcd_ns.engine.train.run_state import Budget, Stopwatch
 from abcd_ns.nerfstudio.run import progress
+from abcd_ns.nerfstudio.run.ending import next_steps
 from abcd_ns.nerfstudio.run.progress import ProgressReport
 from tests.reference.scenes import make_coordinator, random_gaussians, ring_of_views
 
@@ -74,6 +77,36 @@ def test_the_end_names_blocks_that_were_not_simply_trained(coordinator, capsys):
         "  block 3: seen by 1 view only",
         "  3 giants shrunk",
     ]
+
+
+def test_the_end_tells_held_out_psnr_where_it_was_measured_after_the_last_step(coordinator, capsys):
+    report = ProgressReport(coordinator)
+    report(HeldOutScored(11.0, None))
+    report(StepTaken(1, 0, 1, psnr=20.0))
+    report.close()
+    assert "PSNR 20.00 dB on training crops" in capsys.readouterr().out
+    report(HeldOutScored(19.5, 0.7))
+    report.close()
+    said = capsys.readouterr().out
+    assert "held-out PSNR 19.50 dB" in said
+    assert "crops" not in said
+
+
+def test_what_is_next_names_the_run_and_how_to_train_what_was_not_visited(coordinator, monkeypatch):
+    coordinator.state.views, coordinator.state.visit = {0: 3, 1: 0, 2: 1}, 2
+    coordinator.state.health = {0: BlockHealth(visits=2)}
+    coordinator.run.budget, coordinator.run.stopwatch = Budget(1000, 60.0), Stopwatch(60.0)
+    monkeypatch.setattr(
+        sys, "argv", ["ns-train", "abcd", "--data", "my wall", "--pipeline.max-seconds", "60"]
+    )
+    lines = next_steps(coordinator, "abcd", Path("my wall"), Path("run/nerfstudio_models"))
+    assert "    abcd report run --data 'my wall'" in lines
+    assert "    ns-viewer --load-config run/config.yml" in lines
+    what, command = lines[-2:]
+    assert what == "  Train twice as long. 1 of 3 blocks were not visited."
+    assert command.endswith("--load-dir run/nerfstudio_models --pipeline.max-seconds 120 --data 'my wall'")
+    coordinator.state.step = 1000
+    assert "--max-num-iterations 2000" in next_steps(coordinator, "abcd", Path("wall"), Path("run/m"))[-1]
 
 
 def test_without_visits_nothing_is_said_of_them(coordinator, capsys):

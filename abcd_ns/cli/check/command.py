@@ -7,10 +7,10 @@ from typing import Any
 
 from rich.console import Console
 
-from abcd_ns.cli.check.rules import RULES
+from abcd_ns.cli.check.rules import doubts
 from abcd_ns.cli.check.summary import print_summary, summarize
 from abcd_ns.cli.check.survey import Survey, survey
-from abcd_ns.cli.findings import Finding, by_level, check_json, judge, print_findings, write_report
+from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
 from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import InputError, one_line
 from abcd_ns.data.prepare import DOWNSCALE
@@ -37,16 +37,16 @@ class Report:
 
 
 def check(*, data: Path, downscale: int | None = None, json: Path | None = None) -> int:
-    """Examine a data set without training, and explain what is wrong or doubtful with it.
+    """Examine a data set before training. Say what is wrong or doubtful, and what to do about it.
 
-    Reads it as `ns-train abcd` does and refuses what that refuses, in the same words; then decodes every
-    photo. Writes nothing unless --json is given. Exit code: 2 if training would refuse the data or stop at
-    them, else 0.
+    abcd check --data garden
+
+    Reads the data as `ns-train abcd` does, then decodes every photo. Writes nothing unless --json is given.
+    The exit code is 2 if training would refuse the data.
 
     Args:
-        data: Folder with a COLMAP model or a transforms.json, and photos; as for `ns-train abcd --data`.
-        downscale: Divides the photos' width and height, as training's downscale-factor. Left out, no side is
-            over 1600 px, as in training.
+        data: Folder with photos and a COLMAP model or a transforms.json, as for `ns-train abcd --data`.
+        downscale: Divides the photos' width and height. Left out, no side is over 1600 px, as in training.
         json: Also write what was found into this file.
 
     Raises:
@@ -86,4 +86,4 @@ def findings_of(found: Survey) -> list[Finding]:
     """What is wrong or doubtful with a scene that can be read: the reader's own notes, then all others."""
     findings = [Finding("warning", "input", note) for note in found.prepared.notes]
     findings += [Finding("note", "input", note) for note in found.prepared.chosen]
-    return findings + judge(RULES, found)
+    return [*findings, *doubts(found)]

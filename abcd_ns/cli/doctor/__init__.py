@@ -1,4 +1,4 @@
 """`abcd doctor`: whether this machine and environment can train, and what to do where not.
 
-`hardware`, `packages` and `kernels` look, `rules` judge.
+`facts` and `kernels` look, `rules` judge.
 """

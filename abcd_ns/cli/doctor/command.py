@@ -7,24 +7,21 @@ from pathlib import Path
 from rich.console import Console
 
 from abcd_ns.cli.doctor.facts import Facts, gather
-from abcd_ns.cli.doctor.hardware import Hardware
-from abcd_ns.cli.doctor.kernels import Kernels
-from abcd_ns.cli.doctor.packages import VERSIONS
-from abcd_ns.cli.doctor.rules import RULES
-from abcd_ns.cli.findings import Finding, by_level, check_json, judge, print_findings, write_report
-from abcd_ns.cli.terminal import many, print_plain
+from abcd_ns.cli.doctor.rules import findings_of
+from abcd_ns.cli.findings import Finding, by_level, check_json, print_findings, write_report
+from abcd_ns.cli.terminal import many, print_facts
 from abcd_ns.lab.results.records import decode, encode
 from abcd_ns.machine import without_home
 from abcd_ns.units import bytes_in_words
 
-SCHEMA = 1
+SCHEMA = 2
 """Of the JSON file; changes with its fields."""
 CANNOT_TRAIN = 1
 """Exit code where something makes training impossible."""
 MAIN = ("torch", "nerfstudio", "gsplat", "viser")
 """Packages whose versions are always shown."""
-DETAILS = {*VERSIONS, "OS", "driver", "torch's CUDA", "compilers", "LPIPS"}
-"""Rows that only --verbose shows."""
+DETAILS = ("os", "driver", "torch_cuda", "compiler", "nvcc", "ninja", "lpips_missing")
+"""Facts that only --verbose shows, beside the other packages' versions."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +35,14 @@ class Report:
 
 
 def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
-    """Look at this machine and environment: versions, hardware, compiled kernels; and say what to fix.
+    """Examine this machine: versions, hardware, compiled kernels. Say what to fix.
 
-    Compiles nothing, and writes nothing unless --json is given. What it prints is fit to be copied into an
-    issue: it names no user and no folder of theirs. The exit code is 1 if training cannot work, else 0.
+    Compiles nothing and writes nothing unless --json is given. The output names no user and no home folder,
+    so that it can be copied into an issue. The exit code is 1 if training cannot work.
 
     Args:
-        json: Also write all that was found into this file.
-        verbose: Show all of it here too, notes included.
+        json: Also write everything that was found into this file.
+        verbose: Show all versions and notes.
 
     Raises:
         UserError: the JSON file cannot be written.
@@ -53,10 +50,9 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
     check_json(json)
     report = diagnose(gather())
     console = Console()
-    rows = {name: value for name, value in _rows(report.facts).items() if verbose or name not in DETAILS}
-    width = max(map(len, rows))
-    for name, value in rows.items():
-        print_plain(f"{name:<{width}}  {value}", console)
+    details = report.facts.versions | {name: getattr(report.facts, name) for name in DETAILS}
+    more = {name.replace("_", " "): str(value or "none") for name, value in details.items() if verbose}
+    print_facts(_rows(report.facts) | more, console)
     shown = [finding for finding in report.findings if verbose or finding.level != "note"]
     print_findings(shown, console)
     ill = any(finding.level == "error" for finding in report.findings)
@@ -72,55 +68,36 @@ def doctor(*, json: Path | None = None, verbose: bool = False) -> int:
 
 def diagnose(facts: Facts) -> Report:
     """What follows from the facts."""
-    report = Report(SCHEMA, facts, by_level(judge(RULES, facts)))
+    report = Report(SCHEMA, facts, by_level(findings_of(facts)))
     return decode(Report, json_text.loads(without_home(json_text.dumps(encode(report)))), "the report")
 
 
-def _rows(facts: Facts) -> dict[str, str]:
-    """All there is to show."""
-    packages, hardware, kernels = facts.packages, facts.hardware, facts.kernels
-    number, plus, changes = (packages.commit or "").partition("+")
-    commit = f", commit {number[:10]}{plus}{changes}" if number else ""
-    versions = {name: version or "not installed" for name, version in packages.versions.items()}
+def _rows(f: Facts) -> dict[str, str]:
+    """What is always shown."""
     rows = {
-        "abcd_ns": f"{packages.abcd_ns}{commit}; Python {packages.python}",
-        "packages": ", ".join(f"{name} {versions.get(name)}" for name in MAIN),
-        **{name: version for name, version in versions.items() if name not in MAIN},
+        "abcd_ns": f"{f.abcd_ns}; Python {f.python}",
+        "packages": ", ".join(f"{name} {f.versions.get(name) or 'not installed'}" for name in MAIN),
+        "GPU": f.gpu or "none: training runs on the CPU, which is meant for small pictures",
+        "CPU": f"{f.cpu}, {f.cores} cores" if f.cpu else "unknown, as torch does not start",
+        "RAM": f"{bytes_in_words(f.ram_bytes)}, {bytes_in_words(f.ram_free_bytes)} free",
+        "disk": f"{bytes_in_words(f.disk_free_bytes)} free",
+        "workers": _workers(f),
     }
-    rows |= _hardware(hardware, packages.ray) if hardware else {"machine": "unknown, as torch does not start"}
-    return rows | (_kernels(kernels) if kernels else {"kernels": "unknown, as packages do not start"})
-
-
-def _hardware(hardware: Hardware, ray: str | None) -> dict[str, str]:
-    gpu, device = hardware.gpu, "none: training runs on the CPU, which is meant for small pictures"
-    most, workers = hardware.cores, f"up to {hardware.cores}, one for each core, for two blocks each"
-    if gpu is not None:
-        device = f"{gpu.name}, {bytes_in_words(gpu.memory_bytes)}, capability {gpu.capability}"
-        how = f"by Ray {ray}" if ray else "after pip install 'abcd-ns[cluster]'"
-        most, workers = hardware.gpus, f"up to {hardware.gpus}, one for each GPU: --pipeline.workers, {how}"
-    return {
-        "GPU": device,
-        "CPU": f"{hardware.cpu}, {hardware.cores} cores",
-        "RAM": f"{bytes_in_words(hardware.ram_bytes)}, {bytes_in_words(hardware.ram_free_bytes)} free",
-        "disk": f"{bytes_in_words(hardware.disk_free_bytes)} free",
-        "OS": hardware.os,
-        "driver": hardware.driver or "none",
-        "torch's CUDA": hardware.torch_cuda or "none",
-        "workers": workers if most > 1 else f"none here: one {'GPU' if gpu else 'core'}",
+    if f.folder is None:
+        return rows | {"kernels": "unknown, as packages do not start"}
+    checks = [f"{name} differs by {error:.0e}" for name, error in f.self_check.items()]
+    return rows | {
+        "CPU rasterizer": f"compiled, in {f.folder}" if f.built else "first use compiles it",
+        "gsplat's": f.gsplat or "not built",
+        "self-check": ", ".join([*checks, *(f"{name} FAILED" for name in f.failed)]),
     }
 
 
-def _kernels(kernels: Kernels) -> dict[str, str]:
-    checks = [f"{name} differs by {error:.0e}" for name, error in kernels.self_check.items()]
-    tools = (
-        kernels.compiler or "no C++ compiler",
-        f"nvcc {kernels.nvcc}" if kernels.nvcc else "no nvcc",
-        "ninja" if kernels.ninja else "no ninja",
-    )
-    return {
-        "CPU rasterizer": f"compiled, in {kernels.folder}" if kernels.built else "first use compiles it",
-        "gsplat's": kernels.gsplat or "not built",
-        "self-check": ", ".join([*checks, *(f"{name} FAILED" for name in kernels.failed)]),
-        "compilers": ", ".join(tools),
-        "LPIPS": "no weights" if kernels.lpips_missing else "weights are there",
-    }
+def _workers(f: Facts) -> str:
+    """How many blocks could be trained at once."""
+    if f.gpu and f.gpus > 1:
+        how = f"by Ray {f.ray}" if f.ray else "after pip install 'abcd-ns[cluster]'"
+        return f"up to {f.gpus}, one for each GPU: ns-train's --pipeline.workers, {how}"
+    if f.gpu or f.cores < 2:
+        return f"none here: one {'GPU' if f.gpu else 'core'}"
+    return f"up to {f.cores}, one for each core, for two blocks each"

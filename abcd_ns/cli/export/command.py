@@ -39,27 +39,26 @@ def export(
     box: Annotated[Box | None, tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="")] = None,
     frame: Literal["data", "nerfstudio"] = "data",
 ) -> int:
-    """Write a trained scene as viewers of 3D Gaussian Splatting read it: .ply, .spz, .sog, .glb.
+    """Write a trained scene for viewers of 3D Gaussian Splatting: .ply, .spz, .sog, .glb.
 
     abcd export outputs/garden/abcd/TIME --out garden.ply
 
     abcd export outputs/garden/abcd/TIME --out parts --by-block
 
-    The suffix of --out is the format. .ply is read everywhere and loses nothing; .spz, .sog and
-    .compressed.ply are for the web, and 4 to 15 times smaller; .glb is glTF with KHR_gaussian_splatting.
+    The suffix of --out sets the format. .ply is read everywhere and loses nothing. .spz, .sog and
+    .compressed.ply are for the web, 4 to 15 times smaller. .glb is glTF with KHR_gaussian_splatting.
 
-    Reads the blocks that a run stored, also those of a run that was stopped or killed. .ply and .glb are
-    written block by block, so that no scene is too large. Gaussians too transparent for any rasterizer are
-    left out.
+    Works on runs that were stopped or killed, too. .ply and .glb are written block by block, so that no scene
+    is too large. Gaussians too transparent for any rasterizer are left out.
 
     Args:
-        run: A run's folder, outputs/SCENE/METHOD/TIME, or its config.yml.
-        out: A new file that ends in .ply, .compressed.ply, .spz, .sog or .glb. With --by-block a new folder,
-            of which each file is a block: .ply, or as the folder's own name ends.
-        by_block: One file for each block.
-        box: Only Gaussians with their means in this box, in the coordinates of `frame`.
-        frame: "data" is that of the photos' poses, as COLMAP or transforms.json have them, with its scale;
-            "nerfstudio" is that of the run, its viewer and `ns-export`.
+        run: Folder of the run, outputs/SCENE/METHOD/TIME, or its config.yml.
+        out: A new file that ends in .ply, .compressed.ply, .spz, .sog or .glb. With --by-block a new folder;
+            its files are .ply, or end as the folder's own name does.
+        by_block: Write one file for each block.
+        box: Export only Gaussians whose means lie in this box, in the coordinates of `frame`.
+        frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.
+            "nerfstudio" has those of the run, its viewer and `ns-export`.
 
     Raises:
         UserError: there is no run, it has nothing to show yet, or `out` exists or cannot be written.

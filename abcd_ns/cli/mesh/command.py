@@ -59,21 +59,21 @@ def mesh(
 
     abcd mesh outputs/garden/abcd/TIME --data garden --out garden.ply
 
-    Renders the depth of every training view from the stored blocks, and fuses the depths on a grid of voxels,
-    one part of space after the other. RAM holds one part and the mesh.
+    Renders the depth of every training view and fuses the depths on a grid of voxels, one part of space after
+    the other. RAM holds one part and the mesh.
 
     Args:
-        run: A run's folder, outputs/SCENE/METHOD/TIME.
-        data: The run's photos, as given to `ns-train`: cameras are read from there.
-        out: A new file that ends in .ply. While it is made, 7 bytes for each pixel of all training views lie
-            beside it.
-        voxel: Side of the voxels, in the units of `frame`: smaller ones show more, noise too. Left out, twice
-            what a pixel covers where it meets the surface, the median.
-        box: Only what lies in this box, in the coordinates of `frame`.
-        frame: "data" is that of the photos' poses, as COLMAP or transforms.json have them, with its scale;
-            "nerfstudio" is that of the run, its viewer and `ns-export`.
-        depth: Of a pixel. "median" is where half of it is covered. "expected" is the mean, which floaters in
-            front of a wall move off the wall.
+        run: Folder of the run, outputs/SCENE/METHOD/TIME.
+        data: Folder of the run's photos, as given to `ns-train`. Cameras are read from there.
+        out: A new file that ends in .ply. Until it is complete, 7 bytes for each pixel of all training views
+            lie beside it.
+        voxel: Side of the voxels, in the units of `frame`. Smaller voxels show more detail and more noise.
+            Left out, twice the median width of a pixel on the surface.
+        box: Keep only what lies in this box, in the coordinates of `frame`.
+        frame: "data" has the coordinates and scale of the photos' poses, as in COLMAP or transforms.json.
+            "nerfstudio" has those of the run, its viewer and `ns-export`.
+        depth: Depth of a pixel. "median" is where half of it is covered. "expected" is the mean, which
+            floaters in front of a wall move off the wall.
 
     Raises:
         UserError: there is no run, it has nothing to show yet, the data is not the run's, there is no

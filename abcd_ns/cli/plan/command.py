@@ -1,4 +1,4 @@
-"""`abcd plan`: what a run on these photos will need, and what would not fit."""
+"""`abcd plan`: what a run on these photos needs, and what would not fit."""
 
 import math
 import shutil
@@ -19,13 +19,14 @@ from abcd_ns.cli.plan.forecast import (
     Forecast,
     device_shares,
     disk_shares,
+    in_words,
     ram_shares,
     sent_shares,
     time_steps,
     views_of_blocks,
 )
 from abcd_ns.cli.terminal import many, print_facts
-from abcd_ns.engine.gaussians.initialize import gaussians_from_points
+from abcd_ns.engine.gaussians.initialize import gaussians_from_points, random_points
 from abcd_ns.engine.gaussians.thin_points import thin_points
 from abcd_ns.engine.space.partition import MAX_BLOCKS, build_kd
 from abcd_ns.engine.train.memory import levels_of
@@ -46,17 +47,16 @@ class Wanted:
     """What a run is to be like."""
 
     blocks: Number = 0
-    """number of blocks; 0 takes as few as the device's budget permits."""
+    """Number of blocks. 0 takes as few as the device's budget permits."""
     device_budget_gb: Annotated[float, tyro.conf.arg(metavar="GiB")] = 0.0
-    """memory of the device that training may take; 0 takes 0.9 of what is free on a GPU, or a quarter of
-    the RAM on a CPU, as in training."""
+    """Memory of the device that training may take. 0 takes 90% of a GPU's free memory, or a quarter of the
+    RAM on a CPU."""
     max_gaussians: Number = 0
-    """limit on Gaussians in the whole scene; 0 is none, and five for each point are expected."""
+    """Limit on Gaussians in the scene. 0 sets none; the forecast is five for each point."""
     steps: Number = 30_000
-    """of the run."""
+    """Steps of the run."""
     workers: Number = 1
-    """blocks trained at once, each by a process on a GPU of its own or on a part of the cores; ns-train's
-    default is one, and all cores where there is no GPU."""
+    """Blocks trained at once, each by a process on its own GPU or on a part of the cores."""
 
 
 @tyro.conf.configure(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
@@ -66,21 +66,19 @@ def plan(
     downscale: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     verbose: bool = False,
 ) -> int:
-    """Say what a run on these photos will need, and what would not fit; trains nothing.
+    """Predict blocks, memory, disk and time of a run. Trains nothing.
 
-    To time a step it compiles what the first training would compile, where that was not done yet.
+    Times one step. This compiles the kernels if no training has done so yet.
 
     abcd plan --data garden
 
     abcd plan --data garden --device-budget-gb 6
 
-    abcd plan --data garden --workers 4
-
     Args:
-        data: the scene, as for `ns-train abcd --data`.
-        wanted: options of the run.
-        downscale: divides the photos' width and height; left out, no side is over 1600 px, as in training.
-        verbose: show what takes the memory, and how points and views are spread over the blocks.
+        data: Folder of the scene, as for `ns-train abcd --data`.
+        wanted: Options of the run.
+        downscale: Divides the photos' width and height. Left out, no side is over 1600 px, as in training.
+        verbose: Show what takes the memory, and the points and views of the blocks.
 
     Returns:
         0; 1 if something would not fit.
@@ -116,7 +114,6 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
 
     Raises:
         InputError: training would refuse them.
-        UserError: there are no points.
     """
     parser = AbcdDataParserConfig(downscale_factor=downscale)
     config = AbcdDataManagerConfig(data=data, dataparser=parser)
@@ -124,17 +121,18 @@ def read(data: Path, downscale: int | None, console: Console) -> Capture:
     with console.status("Reading the capture"):
         manager = config.setup(device="cpu", test_mode="val")
         dataset = manager.train_dataset
-        if "points3D_xyz" not in dataset.metadata:
-            raise UserError(f"{data} has no points to plan by: training would begin at random places.")
-        points = dataset.metadata["points3D_xyz"].float()
-        views = training_views(dataset.cameras, points)
-        pixels = methods.abcd.config.pipeline.training.point_pixels
-        thinned = thin_points(points, dataset.metadata["points3D_rgb"].float(), views, pixels)
-        return Capture(*thinned, views, manager.dataparser.factor)
+        options = methods.abcd.config.pipeline
+        seeds = dataset.metadata.get("points3D_xyz"), dataset.metadata.get("points3D_rgb")
+        views = training_views(dataset.cameras, seeds[0])
+        if seeds[0] is None:  # as training begins then
+            seeds = random_points(options.model.num_random, options.model.random_scale)
+        else:
+            seeds = thin_points(*(seed.float() for seed in seeds), views, options.training.point_pixels)
+        return Capture(*seeds, views, manager.dataparser.factor)
 
 
 def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
-    """Cut the points into blocks, look who sees them, and time a step.
+    """Cut the points into blocks, count the views of each, and time a step.
 
     Raises:
         UserError: the device's budget has no room for any block.
@@ -179,6 +177,7 @@ def forecast(capture: Capture, wanted: Wanted, console: Console) -> Forecast:
         steps=wanted.steps,
         seconds_per_step=seconds,
         workers=wanted.workers,
+        factor=capture.factor,
         sent=sent_shares(fit, needs) if wanted.workers > 1 else {},
     )
 
@@ -202,7 +201,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     rows = {
         "blocks": f"{fit.blocks}{at_the_end}",
         "Gaussians": f"{found.points:,} points to begin with, {fit.gaussians:,} expected",
-        "time": f"{_hours(low)} to {_hours(high)}: {found.steps:,} steps of {views}",
+        "time": f"{in_words(low)} to {in_words(high)}: {found.steps:,} steps of {views}",
     }
     for place, shares in found.shares.items():
         needed, free = sum(shares.values()), found.free[place]
@@ -220,9 +219,7 @@ def print_forecast(found: Forecast, console: Console, verbose: bool = False) -> 
     print_facts(rows, console)
     for line in found.warnings:
         console.print(f"[bold red]does not fit:[/] {line}", highlight=False)
+    for line in found.advice:
+        console.print(f"[yellow]note:[/] {line}", highlight=False)
     if not (found.warnings or verbose):
         console.print("\nAll of it fits. What takes the memory: abcd plan --verbose", highlight=False)
-
-
-def _hours(hours: float) -> str:
-    return f"{hours * 60:.0f} min" if hours < 2 else f"{hours:.0f} h"

@@ -31,6 +31,8 @@ PLACES = {
     "disk": ("of disk", "are free in this folder", "use `ns-train --output-dir` on another disk"),
 }
 """Where memory is needed, and the words for a lack of it, with the fix."""
+DAY = 24
+"""Hours from which on a forecast names ways to take less."""
 LAYERS_BY_STEPS = 0.15
 """Time for layers by the time of steps: they take 10 to 18% of runs on a CPU (docs/results)."""
 
@@ -57,6 +59,8 @@ class Forecast:
     seconds_per_step: float
     """Measured with the initial points."""
     workers: int
+    factor: int
+    """By which the photos' width and height are divided."""
     sent: Shares
     """What a visit by a worker moves; nothing without workers."""
 
@@ -70,15 +74,34 @@ class Forecast:
     @property
     def warnings(self) -> list[str]:
         """What would not fit, each with what to do about it."""
-        lines, views = [], self.views_of_block
+        lines = []
         for place, (where, how, cure) in PLACES.items():
             needed, free = sum(self.shares[place].values()), self.free[place]
             if needed > free:
                 lines.append(f"{bytes_in_words(needed)} {where}, but {bytes_in_words(free)} {how}: {cure}.")
-        if few := sum(count <= TOO_FEW_VIEWS for count in views):
-            seen = f"{few} of {len(views)} blocks are seen by fewer than {TOO_FEW_VIEWS + 1} views"
-            lines.append(f"{seen}: use fewer blocks.")
         return lines
+
+    @property
+    def advice(self) -> list[str]:
+        """What can be trained, but would take long or turn out badly, each with what to do about it."""
+        lines, views = [], self.views_of_block
+        few = sum(count <= TOO_FEW_VIEWS for count in views)
+        if few and len(views) > 1:
+            seen = f"{few} of {len(views)} blocks are seen by fewer than {TOO_FEW_VIEWS + 1} views"
+            lines.append(f"{seen}: use fewer --blocks.")
+        if self.hours[1] >= DAY:
+            lines.append(
+                f"This may take {in_words(self.hours[1])}. `ns-train abcd --pipeline.max-seconds 7200` ends "
+                f"it after two hours. Smaller photos (--downscale {2 * self.factor}) and fewer --steps help."
+            )
+        return lines
+
+
+def in_words(hours: float) -> str:
+    """A duration in minutes, hours or days."""
+    if hours >= 2 * DAY:
+        return f"{hours / DAY:.0f} days"
+    return f"{hours * 60:.0f} min" if hours < 2 else f"{hours:.0f} h"
 
 
 def views_of_blocks(tree: BlockTree, points: Tensor, views: list[View]) -> tuple[int, ...]:

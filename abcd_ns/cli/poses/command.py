@@ -34,21 +34,21 @@ def poses(
     several_lenses: bool = False,
     seed: int = 0,
 ) -> int:
-    """Find where photos were taken, and points of the scene: what training begins with.
+    """Find the camera poses of photos, and points of the scene, by pycolmap.
 
     abcd poses garden
 
-    The photos are in DATA/images. Writes a COLMAP model to DATA/sparse/0, by pycolmap; then
-    `ns-train abcd --data DATA` trains. Photos should overlap by two thirds, be sharp, and show nothing that
-    moves. On a CPU 50 photos take minutes. Twice as many take four times as long.
+    Reads DATA/images and writes a COLMAP model to DATA/sparse/0. Then `ns-train abcd --data DATA` trains.
+    Photos should be sharp, overlap by two thirds and show nothing that moves. On a CPU 50 photos take
+    minutes. Twice as many take four times as long.
 
     Args:
         data: Folder of the scene.
-        order: "any" compares each photo with each; "video" with those that follow by name, for many photos.
+        order: "any" compares each photo with each. "video" compares it with those that follow by name.
         lens: COLMAP's camera model. OPENCV suits phones and cameras, OPENCV_FISHEYE fisheyes, PINHOLE photos
             without distortion.
-        several_lenses: The photos are of several lenses, or zoomed; assumed where their sizes differ.
-        seed: Of pycolmap's random choices.
+        several_lenses: The photos are of several lenses, or zoomed. Assumed where their sizes differ.
+        seed: Seed of pycolmap's random choices.
 
     Returns:
         0; 1 if fewer than half of the photos have a pose.
@@ -56,22 +56,25 @@ def poses(
     Raises:
         UserError: there are no photos, a model is there already, or no two photos match.
     """
-    photos, names, sizes = _photos(data)
+    photos = data / "images"
+    names, sizes = _look(photos)
     if (data / "sparse").exists():
         raise UserError(f"{data / 'sparse'} exists already; move it away to find poses anew.")
-    _check_lens(lens)
-    console = Console()
-    for line in _unread(photos):
-        print_plain(line, console)
+    lenses = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    if lens not in lenses:
+        raise UserError(f"--lens {lens} is no camera model of COLMAP's: {', '.join(lenses)}.")
+    console, notes = Console(), _unread(photos)
     one_lens = not several_lenses and len(sizes) == 1
     if not several_lenses and not one_lens:
-        console.print(f"Photos of {len(sizes)} sizes: assuming several lenses.")
+        notes.append(f"Photos of {len(sizes)} sizes: assuming several lenses.")
     if order == "any" and len(names) > MANY:
-        console.print(
-            f"{len(names)} photos: comparing each with each takes hours. Use --order video for a video."
+        notes.append(
+            f"Comparing {len(names)} photos with each other takes hours. For a video: --order video."
         )
-    task = Task(photos, names, data / WORK, lens, one_lens, order, seed)
-    return _report(data, names, _model(data, task, console), console)
+    for line in notes:
+        print_plain(line, console)
+    model = _model(data, Task(photos, names, data / WORK, lens, one_lens, order, seed), console)
+    return _report(data, names, model, console)
 
 
 def _model(data: Path, task: Task, console: Console) -> Model:
@@ -81,10 +84,8 @@ def _model(data: Path, task: Task, console: Console) -> Model:
         task.work.mkdir()
         model = find_poses(task, console)
         if model is None:
-            raise UserError(
-                f"No two photos in {task.photos} match. They need to overlap, and to be taken from different "
-                "places."
-            )
+            why = "They need to overlap, and to be taken from different places."
+            raise UserError(f"No two photos in {task.photos} match. {why}")
         (data / "sparse").mkdir()
         os.replace(model.folder, data / "sparse" / "0")
     except OSError as error:
@@ -94,9 +95,8 @@ def _model(data: Path, task: Task, console: Console) -> Model:
     return model
 
 
-def _photos(data: Path) -> tuple[Path, tuple[str, ...], set[tuple[int, int]]]:
-    """The folder of photos, their names in it, sorted, and what sizes they have."""
-    folder = data / "images"
+def _look(folder: Path) -> tuple[tuple[str, ...], set[tuple[int, int]]]:
+    """The photos' names in their folder, sorted, and what sizes they have."""
     if not folder.is_dir():
         raise UserError(f"{folder} does not exist; put the photos there.")
     found = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
@@ -110,7 +110,7 @@ def _photos(data: Path) -> tuple[Path, tuple[str, ...], set[tuple[int, int]]]:
             check_complete(path, header)
             sizes.add(header.size)
     problems.raise_if_any()
-    return folder, tuple(str(path.relative_to(folder)) for path in found), sizes
+    return tuple(str(path.relative_to(folder)) for path in found), sizes
 
 
 def _unread(folder: Path) -> list[str]:
@@ -121,12 +121,6 @@ def _unread(folder: Path) -> list[str]:
     (most, _), *_ = kinds.most_common()
     counted = ", ".join(f"{count:,} {kind}" for kind, count in sorted(kinds.items()))
     return [f"Not read: {counted}; make JPEGs of them, by `mogrify -format jpg *{most}` for instance."]
-
-
-def _check_lens(lens: str) -> None:
-    if lens not in pycolmap.CameraModelId.__members__ or lens == "INVALID":
-        known = ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
-        raise UserError(f"--lens {lens} is no camera model of COLMAP's: {known}.")
 
 
 def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) -> int:
@@ -140,6 +134,5 @@ def _report(data: Path, names: tuple[str, ...], model: Model, console: Console) 
     if fewer_than_half:
         lines.append("That is fewer than half. Take photos between those that do not match, or try --lens.")
     lines.append(f"Next: ns-train abcd --data {shlex.quote(str(data))}")
-    for line in lines:
-        print_plain(line, console)
+    print_plain("\n".join(lines), console)
     return int(fewer_than_half)

@@ -22,7 +22,6 @@ FOCAL_FACTORS = (1.2, 0.72, 0.5)
 camera, a wide one. Bundle adjustment finds the true one from a start that is not too far off."""
 OVERLAP = 12
 """Photos of a video are matched with that many that follow, and with some farther on."""
-SECONDS_BETWEEN_LOOKS = 0.3
 
 Order = Literal["any", "video"]
 
@@ -79,7 +78,7 @@ def find_poses(task: Task, console: Console) -> Model | None:
             poses = bars.add_task("finding poses", total=count)
             over = False
             while not over:
-                over = bool(wait([found], SECONDS_BETWEEN_LOOKS).done)
+                over = bool(wait([found], timeout=0.3).done)
                 bars.update(features, completed=_rows(task.database, "images"))
                 bars.update(matches, completed=_rows(task.database, "matches"))
                 bars.update(poses, completed=posed.value)
@@ -139,8 +138,7 @@ def _set_focal_lengths(task: Task, factor: float) -> bool:
         guessed = [camera for camera in database.read_all_cameras() if not camera.has_prior_focal_length]
         for camera in guessed:
             params = camera.params
-            for place in camera.focal_length_idxs():
-                params[place] = factor * max(camera.width, camera.height)
+            params[camera.focal_length_idxs()] = factor * max(camera.width, camera.height)
             camera.params = params
             database.update_camera(camera)
     return bool(guessed)
@@ -154,15 +152,11 @@ def _map(task: Task, out: Path) -> list[Model]:
     _posed.value = 0
     options = pycolmap.IncrementalPipelineOptions(random_seed=task.seed, min_model_size=3)
     options.mapper.random_seed = task.seed
-    found = pycolmap.incremental_mapping(
-        task.database, task.photos, out, options=options, next_image_callback=another
-    )
-    return [
-        Model(
-            out / str(number),
-            tuple(sorted(model.image(i).name for i in model.reg_image_ids())),
-            model.num_points3D(),
-            model.compute_mean_reprojection_error(),
-        )
-        for number, model in sorted(found.items())
-    ]
+    places = task.database, task.photos, out
+    found = pycolmap.incremental_mapping(*places, options=options, next_image_callback=another)
+    models = []
+    for number, model in sorted(found.items()):
+        posed = tuple(sorted(model.image(row).name for row in model.reg_image_ids()))
+        error = model.compute_mean_reprojection_error()
+        models.append(Model(out / str(number), posed, model.num_points3D(), error))
+    return models

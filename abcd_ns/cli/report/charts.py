@@ -3,7 +3,6 @@
 import base64
 from collections.abc import Sequence
 from io import BytesIO
-from statistics import fmean
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,13 +14,14 @@ from nerfstudio.cameras.cameras import Cameras
 from abcd_ns.cli.report.run_folder import Checkpoint
 from abcd_ns.cli.report.story import Story
 from abcd_ns.lab.results.style import COLORS, in_style, lay_grid, short
+from abcd_ns.nerfstudio.run.log_lines import SampleLine, TrainingLine
 from abcd_ns.units import GIB
 
 WIDTH, HEIGHT = 8.0, 2.6
 """Inches."""
 SMOOTHED = 0.06
 """Share of the samples that each point of a smoothed line is the mean of."""
-STEPS, LAYERS, QUIET, HELD_OUT = "#0072b2", "#d55e00", "#767676", "#d55e00"
+STEPS, LAYERS, QUIET = "#0072b2", "#d55e00", "#767676"
 SHOWN = (0.03, 0.97)
 """Quantiles of the Gaussians between which a map reaches, and beyond where cameras are."""
 BINS = 160
@@ -37,17 +37,18 @@ def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) 
     scored = {line.step: (line.seconds, line.psnr) for line in story.held_out}
     if measured is not None:
         scored[measured[0]] = (story.seconds_at(measured[0]), measured[1])
-    crops = [(line.seconds, line.psnr) for line in story.samples if line.psnr is not None]
+    crops = [(line.seconds, line.psnr) for line in story.of(SampleLine) if line.psnr is not None]
     if not scored and not crops:
         return None
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     axes = _over_time(figure.subplots(), story, "PSNR (dB)")
     if crops:
-        axes.plot(*zip(*crops, strict=True), ".", color=QUIET, markersize=2.5, alpha=0.5)
-        axes.plot(*zip(*smoothed(crops), strict=True), color=QUIET, linewidth=1.2, label="training crops")
+        points = np.array(crops).T
+        axes.plot(*points, ".", color=QUIET, markersize=2.5, alpha=0.5)
+        axes.plot(*smoothed(points), color=QUIET, linewidth=1.2, label="training crops")
     if scored:
-        points, color = sorted(scored.values()), COLORS.get(method, STEPS)
-        axes.plot(*zip(*points, strict=True), "o-", color=color, clip_on=False, label="held-out views")
+        style = {"color": COLORS.get(method, STEPS), "clip_on": False, "label": "held-out views"}
+        axes.plot(*zip(*sorted(scored.values()), strict=True), "o-", **style)
     axes.legend(frameon=False, loc="lower right")
     return _uri(figure)
 
@@ -55,50 +56,44 @@ def draw_quality(story: Story, measured: tuple[int, float] | None, method: str) 
 @in_style
 def draw_progress(story: Story) -> str | None:
     """Visits, Gaussians and memory over training time, one below the other; None where nothing is known."""
-    drawers = [_draw_visits] * bool(story.visits) + [_draw_gaussians, _draw_memory] * bool(story.samples)
-    if not drawers:
+    samples, panels = story.of(SampleLine), {}
+    if samples:
+        memory = {"RAM": [line.rss_bytes / GIB for line in samples]}
+        if any(line.device_bytes is not None for line in samples):
+            memory["GPU"] = [(line.device_bytes or 0) / GIB for line in samples]
+        panels = {"Gaussians": {"in the scene": [line.gaussians for line in samples]}, "memory (GiB)": memory}
+    rows = bool(story.visits) + len(panels)
+    if not rows:
         return None
-    figure = Figure(figsize=(WIDTH, HEIGHT * len(drawers)), layout="constrained")
-    for axes, draw in zip(figure.subplots(len(drawers), squeeze=False)[:, 0], drawers, strict=True):
-        draw(axes, story)
+    figure = Figure(figsize=(WIDTH, HEIGHT * rows), layout="constrained")
+    below = iter(figure.subplots(rows, squeeze=False)[:, 0])
+    if story.visits:
+        _draw_visits(next(below), story)
+    for what, curves in panels.items():
+        axes = _over_time(next(below), story, what)
+        for (name, values), color in zip(curves.items(), (STEPS, LAYERS), strict=False):
+            axes.plot([line.seconds for line in samples], values, color=color, label=name)
+        axes.legend(frameon=False, loc="lower right")
+        axes.set_ylim(bottom=0)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     return _uri(figure)
 
 
 def _draw_visits(axes: Axes, story: Story) -> None:
-    """Which block was trained when; each visit begins with drawing its layers. The warm-up trains all."""
+    """Which block was trained when; each visit begins with drawing its layers. The warm-up is shaded."""
     _over_time(axes, story, "block").grid(visible=False)
-    for visit in story.visits:
-        top, height = (0.6, story.blocks - 0.2) if visit.block is None else (visit.block + 0.6, 0.8)
-        for seconds, color in ((visit.seconds, STEPS), (visit.layer_seconds, LAYERS)):
-            alpha = 0.3 if visit.block is None else 0.85 if visit.done else 0.5
-            axes.add_patch(Rectangle((visit.began, top), seconds, height, color=color, lw=0, alpha=alpha))
-    for color, alpha, name in ((STEPS, 0.85, "steps"), (LAYERS, 0.85, "layers"), (STEPS, 0.3, "warm-up")):
-        axes.plot([], [], "s", color=color, alpha=alpha, label=name)
+    first = story.visits[0]
+    if first.block is None:
+        ends = first.seconds - first.visit_seconds, first.seconds
+        axes.axvspan(*ends, color=STEPS, alpha=0.3, linewidth=0, label="warm-up")
+    visits = [visit for visit in story.visits if visit.block is not None]
+    rows = [visit.block + 1 for visit in visits]
+    began = [visit.seconds - visit.visit_seconds for visit in visits]
+    axes.barh(rows, [visit.visit_seconds for visit in visits], left=began, color=STEPS, label="steps")
+    axes.barh(rows, [visit.layer_seconds for visit in visits], left=began, color=LAYERS, label="layers")
     axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     axes.set_ylim(story.blocks + 0.6, 0.4)
     axes.yaxis.set_major_locator(MaxNLocator(12, integer=True))
-
-
-def _draw_gaussians(axes: Axes, story: Story) -> None:
-    points = sorted((line.seconds, line.gaussians) for line in (*story.trainings, *story.samples))
-    _over_time(axes, story, "Gaussians").plot(*zip(*points, strict=True), color=STEPS)
-    limit = story.trainings[-1].limit
-    if limit is not None and limit < 3 * max(count for _, count in points):
-        axes.axhline(limit, color=LAYERS, linestyle="--", label="limit")
-        axes.legend(frameon=False, loc="lower right")
-    axes.set_ylim(bottom=0)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
-
-
-def _draw_memory(axes: Axes, story: Story) -> None:
-    seconds = [line.seconds for line in story.samples]
-    _over_time(axes, story, "memory (GiB)")
-    axes.plot(seconds, [line.rss_bytes / GIB for line in story.samples], color=STEPS, label="RAM")
-    if any(line.device_bytes is not None for line in story.samples):
-        device = [(line.device_bytes or 0) / GIB for line in story.samples]
-        axes.plot(seconds, device, color=LAYERS, label="GPU")
-    axes.legend(frameon=False, loc="lower right")
-    axes.set_ylim(bottom=0)
 
 
 @in_style
@@ -109,7 +104,6 @@ def draw_map(checkpoint: Checkpoint, cameras: Sequence[Cameras]) -> str:
         cameras: those trained on, and those held out; none where the data is gone.
     """
     tree, means = checkpoint.tree, checkpoint.means.double().numpy()
-    owner = tree.assign(checkpoint.means).numpy()
     centers = [found.camera_to_worlds[:, :3, 3].cpu().double().numpy() for found in cameras]
     planes = [(0, 1), (0, 2)] if bool((tree.axis == 2).any()) else [(0, 1)]
     figure = Figure(figsize=(WIDTH, WIDTH / len(planes)), layout="constrained")
@@ -122,32 +116,28 @@ def draw_map(checkpoint: Checkpoint, cameras: Sequence[Cameras]) -> str:
         look = {"norm": "log", "cmap": "Greys", "alpha": 0.8, "rasterized": True}
         axes.hist2d(*means[:, plane].T, BINS, range=frame, **look)
         for block in range(tree.num_blocks):
-            cell, own = tree.cell(block), means[owner == block][:, plane]
+            cell = tree.cell(block)
             lower, upper = (np.clip(side.numpy()[[*plane]], low, high) for side in (cell.lower, cell.upper))
             axes.add_patch(Rectangle(lower, *(upper - lower), fill=False, edgecolor=STEPS))
-            middle = np.clip(np.median(own, axis=0), lower, upper) if len(own) else (lower + upper) / 2
+            middle = (lower + upper) / 2
             axes.annotate(str(block + 1), middle, color=STEPS, ha="center", va="center", fontsize=13)
-        for found, color in zip(centers, (QUIET, HELD_OUT), strict=False):
+        for found, color in zip(centers, (QUIET, LAYERS), strict=False):
             axes.plot(*found[:, plane].T, ".", color=color, markersize=4)
         axes.set(aspect="equal", xlabel="xyz"[plane[0]], ylabel="xyz"[plane[1]], xlim=frame[0], ylim=frame[1])
     return _uri(figure)
 
 
-def smoothed(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Running means: each point is that of its neighbours, as many on either side."""
-    reach = int(len(points) * SMOOTHED / 2)
-    found = []
-    for place, (x, _) in enumerate(points):
-        here = min(reach, place, len(points) - 1 - place)
-        found.append((x, fmean(y for _, y in points[place - here : place + here + 1])))
-    return found
+def smoothed(points: np.ndarray) -> np.ndarray:
+    """Running means of points [2, n] over SMOOTHED of them."""
+    reach = max(int(points.shape[1] * SMOOTHED), 1)
+    return np.stack([np.convolve(row, np.ones(reach) / reach, "valid") for row in points])
 
 
 def _over_time(axes: Axes, story: Story, what: str) -> Axes:
     """With time across, and dashed lines where a run was resumed."""
     axes.set(xlabel="training time (s)", ylabel=what, xlim=(0, max(story.seconds, 1e-3)))
     lay_grid(axes)
-    for line in story.trainings[1:]:
+    for line in story.of(TrainingLine)[1:]:
         axes.axvline(line.seconds, color=QUIET, linewidth=0.8, linestyle="--")
     return axes
 

@@ -16,12 +16,9 @@ from abcd_ns.cli.terminal import print_plain
 from abcd_ns.data.input_errors import one_line
 from abcd_ns.errors import UserError
 from abcd_ns.lab.runs.options import check_ranges
-from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
 
 PAGE_FILE = "report.html"
-NO_PHOTOS = "Held-out views and their photos are shown if their folder is named: --data {}"
-UNDRAWN = "Held-out views could not be drawn. {}"
 
 
 def report(
@@ -32,19 +29,19 @@ def report(
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None,
     pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 3,
 ) -> int:
-    """Write a page about a training run: held-out views, quality, memory, visits, blocks, settings.
+    """Write an HTML page about a training run: held-out views, quality, memory, visits, blocks, settings.
 
     abcd report outputs/garden/abcd/TIME --data garden
 
-    The page is one file that needs no network and no other file. With --data, held-out views are rendered
-    from the newest checkpoint and shown over their photos.
+    The page is a single file and needs no network. With --data it shows renderings of the newest checkpoint
+    over their photos.
 
     Args:
-        run: A run's folder, outputs/SCENE/METHOD/TIME, as `ns-train abcd` leaves it.
-        data: The run's photos, as given to `ns-train`. The path in the run is not followed: a run from
-            elsewhere could name any folder, and the page would show its content.
-        out: The page. Default: report.html in the run's folder.
-        pictures: Held-out views to show, from the best to the worst.
+        run: Folder of the run, outputs/SCENE/METHOD/TIME.
+        data: Folder of the run's photos, as given to `ns-train`. The path stored in the run is not followed:
+            a run from elsewhere could name any folder, and the page would show its content.
+        out: File of the page. Default: report.html in the run's folder.
+        pictures: Number of held-out views to show, from the best to the worst.
 
     Raises:
         UserError: `run` is no run, something in it is damaged, or `out` is another file.
@@ -54,15 +51,15 @@ def report(
     out = folder / PAGE_FILE if out is None else out
     _check_page(out)
     console, found = Console(), open_run(folder)
-    pipeline, notes = _load(found, data)
-    held_out, cameras = None, []
-    if pipeline is not None:
-        data_of = pipeline.datamanager
-        cameras = [data_of.train_dataset.cameras, data_of.eval_dataset.cameras]
+    held_out, cameras, notes = None, [], _notes(found, data)
+    if data is not None and found.checkpoint is not None:
         try:
+            pipeline = load_pipeline(found, found.checkpoint, data)
+            sets = pipeline.datamanager.train_dataset, pipeline.datamanager.eval_dataset
+            cameras = [each.cameras for each in sets]
             held_out = look_at_held_out(pipeline, pictures, console)
         except UserError as error:  # photos may go missing until they are read
-            notes.append(UNDRAWN.format(error))
+            notes.append(f"Held-out views could not be drawn. {error}")
     page = render_page(found, held_out, cameras, notes)
     try:
         # A file's name may have bytes that are no text.
@@ -87,21 +84,19 @@ def _check_page(out: Path) -> None:
                 raise UserError(f"--out {out} is no page of this command; name another file.")
 
 
-def _load(run: RunFolder, data: Path | None) -> tuple[AbcdPipeline | None, list[str]]:
-    """The trained model, or None and why there is none."""
+def _notes(run: RunFolder, data: Path | None) -> list[str]:
+    """What the reader of the page must know first."""
     notes, version = [], run.settings.versions.abcd_ns
     if version != __version__:
         notes.append(f"The run is of abcd_ns {one_line(version)}; the defaults are those of {__version__}.")
     if run.checkpoint is None:
-        return None, [*notes, "There is no checkpoint yet, and so no held-out views and no map."]
+        return [*notes, "There is no checkpoint yet, and so no held-out views and no map."]
     if run.checkpoint.step < run.story.step:
         notes.append(
             f"Pictures and blocks are those of the checkpoint at step {run.checkpoint.step:,}; the log "
             f"goes on to step {run.story.step:,}."
         )
     if data is None:
-        return None, [*notes, NO_PHOTOS.format(one_line(shlex.quote(run.settings.data_path)))]
-    try:
-        return load_pipeline(run, run.checkpoint, data), notes
-    except UserError as error:
-        return None, [*notes, UNDRAWN.format(error)]
+        given = one_line(shlex.quote(run.settings.data_path))
+        notes.append(f"Held-out views and their photos are shown if their folder is named: --data {given}")
+    return notes

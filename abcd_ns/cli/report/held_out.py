@@ -61,8 +61,7 @@ def look_at_held_out(pipeline: AbcdPipeline, pictures: int, console: Console) ->
         scores.append(score(drawn))
         gaps.append(squared_gap(drawn))
     gap, note = ordering_gap(gaps, pipeline.model.tree.num_blocks) if scores else (None, "no held-out view")
-    places = pick(scores, pictures)
-    shown = {}
+    places, shown = pick(scores, pictures), {}
     for drawn in track(draw_held_out(pipeline, places), "Pictures", total=len(places), **bar):
         row = drawn.view.row
         shown[row] = _show(drawn, scores[row], places[row], len(places))
@@ -72,17 +71,18 @@ def look_at_held_out(pipeline: AbcdPipeline, pictures: int, console: Console) ->
 
 def pick(scores: Sequence[ViewScore], wanted: int) -> dict[int, str]:
     """Rows of `wanted` views, spread evenly from the best PSNR to the worst, each with its rank in words."""
-    ranked = sorted(scores, key=lambda view: -view.psnr_merged)
-    wanted, last = min(wanted, len(ranked)), len(ranked) - 1
-    ranks = [last // 2] if wanted == 1 else [round(k * last / (wanted - 1)) for k in range(wanted)]
+    ranked, last = sorted(scores, key=lambda view: -view.psnr_merged), len(scores) - 1
+    wanted = min(wanted, len(ranked))
+    ranks = [last // 2] if wanted == 1 else np.linspace(0, last, wanted).round().astype(int).tolist()
     words = {last // 2: "median", last: "worst", 0: "best"} if last else {0: "the only one"}
-    return {ranked[rank].row: words.get(rank, f"{rank + 1} of {last + 1}") for rank in dict.fromkeys(ranks)}
+    return {ranked[rank].row: words.get(rank, f"{rank + 1} of {last + 1}") for rank in ranks}
 
 
-def data_uri(picture: PictureArray, lossless: bool) -> str:
-    """A picture, uint8 [h, w, 3], as a PNG or JPEG that stands in the page itself."""
-    stream, kind = BytesIO(), "png" if lossless else "jpeg"
-    Image.fromarray(picture).save(stream, kind, quality=88, optimize=True)
+def data_uri(picture: PictureArray, width: int, height: int) -> str:
+    """A picture, uint8 [h, w, 3], in another size, as a PNG or JPEG that stands in the page itself."""
+    stream, kind = BytesIO(), "png" if width * height <= LOSSLESS_PIXELS else "jpeg"
+    small = Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS)
+    small.save(stream, kind, quality=88, optimize=True)
     return f"data:image/{kind};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
@@ -92,12 +92,9 @@ def _show(drawn: Drawn, scored: ViewScore, place: str, count: int) -> Shown:
     error = matplotlib.colormaps[ERROR_COLORS](amplified, bytes=True)[..., :3]
     height, width = photo.shape[:2]
     scale = min(1.0, (PAGE_PIXELS / (3 * count * height * width)) ** 0.5)
-    size = (max(round(width * scale), 1), max(round(height * scale), 1))
-    images = [
-        Image.fromarray(image).resize(size, Image.Resampling.LANCZOS) for image in (photo, picture, error)
-    ]
-    lossless = size[0] * size[1] <= LOSSLESS_PIXELS
-    return Shown(scored, place, *(data_uri(np.asarray(image), lossless) for image in images), *size)
+    width, height = max(round(width * scale), 1), max(round(height * scale), 1)
+    uris = [data_uri(image, width, height) for image in (photo, picture, error)]
+    return Shown(scored, place, *uris, width, height)
 
 
 def _to_bytes(picture: Tensor) -> PictureArray:

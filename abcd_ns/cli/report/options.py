@@ -2,39 +2,33 @@
 
 import shlex
 
-from abcd_ns.cli.report.run_folder import default_config
+from abcd_ns.cli.report.run_folder import registered_config
+from abcd_ns.errors import UserError
 from abcd_ns.machine import without_home
 from abcd_ns.nerfstudio.datamanager import OUR_READER
-from abcd_ns.nerfstudio.options import MIRRORED
+from abcd_ns.nerfstudio.options import MIRRORED, mirror
 from abcd_ns.nerfstudio.run.settings import Plain, Settings, flat_options
 
-ABOUT_THE_PLACE = {
-    "data",
-    "experiment_name",
-    "load_checkpoint",
-    "load_config",
-    "load_dir",
-    "load_step",
-    "machine.device_type",
-    "output_dir",
-    "pipeline.datamanager.data",
-    "pipeline.datamanager.dataparser.data",
-    "timestamp",
+READER = "pipeline.datamanager.dataparser."
+OF_THE_PLACE = {
+    *("data", "experiment_name", "load_checkpoint", "load_config", "load_dir", "load_step", "output_dir"),
+    *("machine.device_type", "pipeline.datamanager.data", f"{READER}data", "timestamp"),
 }
 """Options that say where a run was made and kept, not how it was trained."""
 TAKEN_OVER = {"pipeline.training.seed", *(f"pipeline.model.{name}" for name in MIRRORED)}
 """Options that follow others."""
-READER = "pipeline.datamanager.dataparser."
 NO_FLAGS = ("pipeline.training.recipe.", "pipeline.training.limits.")
 """Prefixes of what is no option of `ns-train`: the method sets it, or the device's memory."""
 
 
 def changed_options(settings: Settings) -> list[tuple[str, str, str]]:
     """Name, value and default of options that differ from the defaults; none of an unknown method."""
-    config = default_config(settings.method, settings.reader)
-    if config is None:
+    try:
+        config = registered_config(settings)
+    except UserError:
         return []
-    defaults, passed_over = flat_options(config), ABOUT_THE_PLACE | TAKEN_OVER
+    mirror(config.pipeline.training, config.pipeline.model)
+    defaults, passed_over = flat_options(config), OF_THE_PLACE | TAKEN_OVER
     return [
         (name, as_text(value), as_text(defaults.get(name)))
         for name, value in settings.options.items()

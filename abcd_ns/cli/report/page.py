@@ -19,6 +19,7 @@ from abcd_ns.cli.report.story import Story
 from abcd_ns.lab.compare.pictures import ERROR_GAIN
 from abcd_ns.lab.results.tables import NOTHING, about_machine
 from abcd_ns.machine import without_home
+from abcd_ns.nerfstudio.run.log_lines import TrainingLine
 
 GENERATOR = "abcd report"
 """Begins the page's generator, by which a page of ours is known."""
@@ -44,9 +45,8 @@ def render_page(
         notes: what the reader must know first.
     """
     settings, story, checkpoint = run.settings, run.story, run.checkpoint
-    psnr = None if held_out is None else held_out.mean("psnr_merged")
-    measured = None if psnr is None or checkpoint is None else (checkpoint.step, psnr)
-    views = [] if held_out is None else list(held_out.shown)
+    psnr = held_out and held_out.mean("psnr_merged")
+    views = held_out.shown if held_out else ()
     versions = vars(settings.versions) | {"machine": about_machine(settings.machine)}
     pages = Environment(loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("page.html").render(
@@ -55,19 +55,17 @@ def render_page(
         # As a Content-Security-Policy names the one script that may run.
         script_hash="sha256-" + base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode(),
         css=Markup((HERE / "page.css").read_text(encoding="utf-8")),
-        scene=settings.scene,
-        method=settings.method,
-        begun=f"{settings.begun:%Y-%m-%d %H:%M} UTC",
+        settings=settings,
         unfinished=_unfinished(story),
         tiles=tiles(run, held_out),
         notes=[without_home(note) for note in notes],
-        quality=charts.draw_quality(story, measured, settings.method),
+        quality=charts.draw_quality(story, psnr and (checkpoint.step, psnr), settings.method),
         progress=charts.draw_progress(story),
         first=views[(len(views) - 1) // 2] if views else None,
         views=views,
-        view_count=0 if held_out is None else len(held_out.scores),
+        held_out=held_out,
         error_limit=f"{100 / ERROR_GAIN:g}%",
-        map=None if checkpoint is None or not len(checkpoint.means) else charts.draw_map(checkpoint, cameras),
+        map=charts.draw_map(checkpoint, cameras) if checkpoint and len(checkpoint.means) else None,
         figures=more_figures(run, held_out).items(),
         block_titles=BLOCK_TITLES,
         blocks=block_rows(run),
@@ -79,5 +77,5 @@ def render_page(
 
 
 def _unfinished(story: Story) -> list[str]:
-    resumed = [f"resumed at step {line.step:,}" for line in story.trainings if line.step > 0]
-    return resumed if story.end is not None else [*resumed, "not ended: still running, or interrupted"]
+    resumed = [f"resumed at step {line.step:,}" for line in story.of(TrainingLine) if line.step > 0]
+    return resumed if story.ended else [*resumed, "not ended: still running, or interrupted"]

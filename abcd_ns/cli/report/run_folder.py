@@ -20,8 +20,7 @@ from abcd_ns.errors import UserError, first_line
 from abcd_ns.lab.results.records import read_record
 from abcd_ns.lab.runs.configs import registered
 from abcd_ns.lab.runs.options import set_options
-from abcd_ns.nerfstudio.datamanager import OUR_READER, READERS
-from abcd_ns.nerfstudio.options import mirror
+from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
@@ -71,8 +70,7 @@ def open_run(path: Path) -> RunFolder:
     Raises:
         UserError: something in the folder is missing, damaged or of another version.
     """
-    settings = read_settings(path)
-    story = read_story(path / STATE / LOG_FILE)
+    settings, story = read_settings(path), read_story(path / STATE / LOG_FILE)
     checkpoint = _newest(path / CHECKPOINTS)
     if checkpoint is not None:  # the log does not tell of a block that was cut off and not yet visited
         story = replace(story, blocks=max(story.blocks, checkpoint.tree.num_blocks))
@@ -87,10 +85,6 @@ def read_settings(path: Path) -> Settings:
 def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPipeline:
     """The trained model with its data, for drawing.
 
-    Args:
-        data: the folder of the photos, or its transforms.json. The path in the run is not followed: a run
-            from elsewhere could name anything.
-
     Raises:
         UserError: the data is gone, an option leads out of it, or the run's options or checkpoint do not fit
             this version.
@@ -102,18 +96,25 @@ def load_pipeline(run: RunFolder, checkpoint: Checkpoint, data: Path) -> AbcdPip
     try:
         pipeline.load_pipeline(checkpoint.pipeline, checkpoint.step - 1)
     except (KeyError, RuntimeError) as error:
-        where = _settings_file(run.path, run.settings)
         why = " ".join(str(error).split())
+        where = _settings_file(run.path, run.settings)
         raise UserError(one_line(f"{checkpoint.path} does not fit the options in {where}: {why}.")) from None
     return pipeline
 
 
 def pipeline_config(run: Path, settings: Settings, data: Path) -> AbcdPipelineConfig:
-    """The options that a run was trained with, for the photos in `data`; see `load_pipeline`."""
-    config, where = _registered(settings.method, settings.reader).pipeline, _settings_file(run, settings)
-    prefix = "pipeline."
-    options = {n: v for n, v in settings.options.items() if n.startswith(prefix)}
-    set_options(config, {n.removeprefix(prefix): v for n, v in options.items()}, where)
+    """The options that a run was trained with, for the photos in `data`.
+
+    Args:
+        data: the folder of the photos, or its transforms.json. The path in the run is not followed: a run
+            from elsewhere could name anything.
+
+    Raises:
+        UserError: an option leads out of `data`, or is none of this version.
+    """
+    config, where, prefix = registered_config(settings).pipeline, _settings_file(run, settings), "pipeline."
+    options = {name: value for name, value in settings.options.items() if name.startswith(prefix)}
+    set_options(config, {name.removeprefix(prefix): value for name, value in options.items()}, where)
     _check_paths(options, data, where)
     config.datamanager.data = data
     return config
@@ -130,44 +131,31 @@ def _check_paths(options: Mapping[str, Plain], data: Path, where: str) -> None:
     """Photos, masks and points are those of `data`, whatever a run's options say."""
     folder = (data if data.is_dir() else data.parent).resolve()
     for name, value in options.items():
-        if not name.startswith("pipeline.datamanager.") or not isinstance(value, str):
-            continue
-        if name.endswith(".data"):
+        of_data = name.startswith("pipeline.datamanager.") and not name.endswith(".data")
+        if not of_data or not isinstance(value, str):
             continue
         what = one_line(f"{name} is {value}")
-        try:
-            inside = (folder / value).resolve().is_relative_to(folder)
-        except ValueError:  # a NUL, which is in no path
-            raise UserError(f"{where}: {what}, which is no path; correct it there.") from None
-        if not inside:
+        if "\0" in value:
+            raise UserError(f"{where}: {what}, which is no path; correct it there.")
+        if not (folder / value).resolve().is_relative_to(folder):
             raise UserError(f"{where}: {what}, outside of {folder}; nothing there is read.")
 
 
-def default_config(method: str, reader: str = OUR_READER) -> AbcdTrainerConfig | None:
-    """The method as this version registers it, options taken over as in training; None for an unknown one."""
-    try:
-        config = _registered(method, reader)
-    except UserError:
-        return None
-    mirror(config.pipeline.training, config.pipeline.model)
-    return config
-
-
-def _registered(method: str, reader: str) -> AbcdTrainerConfig:
-    found = copy.deepcopy(registered(method))
+def registered_config(settings: Settings) -> AbcdTrainerConfig:
+    """The run's method and reader of data as this version has them; UserError where it has not."""
+    found = copy.deepcopy(registered(settings.method))
     if found is None:
-        raise UserError(f"The run's method {method!r} is none of this version of abcd_ns.")
-    if reader not in READERS:
-        raise UserError(f"The run's data was read by {reader!r}, which nerfstudio does not know here.")
-    found.pipeline.datamanager.dataparser = copy.deepcopy(READERS[reader])
+        raise UserError(f"The run's method {settings.method!r} is none of this version of abcd_ns.")
+    if settings.reader not in READERS:
+        raise UserError(f"The run's data was read by {settings.reader!r}, which nerfstudio does not know.")
+    found.pipeline.datamanager.dataparser = copy.deepcopy(READERS[settings.reader])
     return found
 
 
 def _newest(folder: Path) -> Checkpoint | None:
-    found = sorted(folder.glob("step-*.ckpt"))
-    if not found:
+    path = max(folder.glob("step-*.ckpt"), default=None)
+    if path is None:
         return None
-    path = found[-1]
     try:
         # Tensors and plain values only: an unpickler that made objects would run what the file says.
         content = torch.load(path, map_location="cpu", weights_only=True)

@@ -1,7 +1,6 @@
 """A run's log, read back: what happened when."""
 
 import json
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -16,90 +15,74 @@ from abcd_ns.nerfstudio.run.log_lines import (
     HeldOutLine,
     Line,
     SampleLine,
-    ShedAtEndLine,
-    SweepEndLine,
     TrainingLine,
     VisitEndLine,
     VisitLine,
-    WorkerLine,
+    layer_share,
 )
 
 L = TypeVar("L", bound=Line)
 
 
 @dataclass(frozen=True)
-class Visit:
-    """One visit, from its first line and its last."""
-
-    number: int
-    sweep: int
-    block: int | None
-    """None for the warm-up."""
-    began: float
-    """Training time, s; likewise `ended`."""
-    ended: float
-    done: bool
-    """False where the log ends within the visit."""
-    layer_seconds: float = 0.0
-    psnr: float | None = None
-    """Of its later half, on training crops, dB."""
-
-    @property
-    def seconds(self) -> float:
-        """How long it took, or has taken so far."""
-        return self.ended - self.began
-
-
-@dataclass(frozen=True)
 class Story:
     """All of a log."""
 
-    trainings: tuple[TrainingLine, ...]
-    """Where training began, and where it was resumed; at least one."""
-    samples: tuple[SampleLine, ...]
-    visits: tuple[Visit, ...]
-    sweeps: tuple[SweepEndLine, ...]
-    held_out: tuple[HeldOutLine, ...]
-    """Those with a PSNR."""
-    workers: tuple[WorkerLine, ...]
-    """At the end; none where one process trained."""
-    shed_at_end: ShedAtEndLine | None
-    """The last; None where the run is not complete, or nothing was pruned."""
-    end: EndLine | None
-    """None where the run goes on, or was killed."""
-    moments: tuple[tuple[int, float], ...]
-    """(step, training time) of every line."""
+    lines: tuple[Line, ...]
     blocks: int
     """Their number, as far as is known: one that is split off during a run has the next number."""
+
+    def of(self, kind: type[L]) -> tuple[L, ...]:
+        """The lines of a kind."""
+        return tuple(line for line in self.lines if isinstance(line, kind))
+
+    def last(self, kind: type[L]) -> L | None:
+        """The last line of a kind, if there is one."""
+        return next(reversed(self.of(kind)), None)
+
+    @property
+    def visits(self) -> tuple[VisitEndLine, ...]:
+        """Those that ended, the warm-up's among them."""
+        return self.of(VisitEndLine)
+
+    @property
+    def held_out(self) -> tuple[HeldOutLine, ...]:
+        """Those with a PSNR."""
+        return tuple(line for line in self.of(HeldOutLine) if line.psnr is not None)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run came to its end; else it goes on, or was killed."""
+        return self.last(EndLine) is not None
 
     @property
     def step(self) -> int:
         """The last that is known of."""
-        return self.moments[-1][0]
+        return self.lines[-1].step
 
     @property
     def seconds(self) -> float:
         """Of training, as far as is known."""
-        return self.moments[-1][1]
+        return self.lines[-1].seconds
 
     def seconds_at(self, step: int) -> float:
         """Training time at a step, interpolated between the lines."""
-        steps, seconds = zip(*self.moments, strict=True)
+        steps, seconds = zip(*((line.step, line.seconds) for line in self.lines), strict=True)
         return float(np.interp(step, steps, seconds))
 
     @property
     def gaussians(self) -> int:
         """In the whole scene, when last counted."""
-        known = [self.trainings[-1], *self.samples[-1:], *([self.end] if self.end else [])]
-        return known[-1].gaussians
+        known = self.last(EndLine) or self.last(SampleLine) or self.last(TrainingLine)
+        return known.gaussians
 
     @property
-    def layer_seconds(self) -> float:
-        """Training time that went into drawing layers."""
-        return sum(visit.layer_seconds for visit in self.visits)
+    def layer_share(self) -> float:
+        """Of the time of all visits that ended, the share for drawing layers."""
+        return layer_share(self.visits)
 
-    def of_block(self, block: int) -> tuple[Visit, ...]:
-        """The visits to one block."""
+    def of_block(self, block: int) -> tuple[VisitEndLine, ...]:
+        """The visits to one block that ended."""
         return tuple(visit for visit in self.visits if visit.block == block)
 
 
@@ -117,26 +100,13 @@ def read_story(path: Path) -> Story:
         raise RecordError(f"{path} does not exist; runs of this version of abcd_ns write it.") from None
     except OSError as error:
         raise RecordError(f"{path} cannot be read: {error.strerror}.") from None
-    lines = [_read_line(text, f"{path}, line {number}") for number, text in enumerate(texts, start=1)]
-    if not any(isinstance(line, TrainingLine) for line in lines):
+    story = Story(tuple(_read_line(text, f"{path}, line {row}") for row, text in enumerate(texts, 1)), 0)
+    training = story.last(TrainingLine)
+    if training is None:
         raise RecordError(f"{path} does not say when training began; it is not the log of a run.")
-    trainings, visits = _of(lines, TrainingLine), tuple(_join_visits(lines))
-    return Story(
-        trainings=trainings,
-        samples=_of(lines, SampleLine),
-        visits=visits,
-        sweeps=_of(lines, SweepEndLine),
-        workers=_of(lines, WorkerLine),
-        held_out=tuple(line for line in _of(lines, HeldOutLine) if line.psnr is not None),
-        shed_at_end=next(reversed(_of(lines, ShedAtEndLine)), None),
-        end=next(reversed(_of(lines, EndLine)), None),
-        moments=tuple((line.step, line.seconds) for line in lines),
-        blocks=max([trainings[-1].blocks, *(1 + v.block for v in visits if v.block is not None)]),
-    )
-
-
-def _of(lines: Iterable[Line], kind: type[L]) -> tuple[L, ...]:
-    return tuple(line for line in lines if isinstance(line, kind))
+    visits = (*story.of(VisitLine), *story.visits)
+    numbers = [1 + visit.block for visit in visits if visit.block is not None]
+    return Story(story.lines, max([training.blocks, *numbers]))
 
 
 def _read_line(text: str, where: str) -> Line:
@@ -155,16 +125,3 @@ def _read_line(text: str, where: str) -> Line:
 
 def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is no number in JSON")
-
-
-def _join_visits(lines: list[Line]) -> Iterator[Visit]:
-    begun = {line.visit: line for line in _of(lines, VisitLine)}
-    over = {line.visit: line for line in _of(lines, VisitEndLine)}
-    for number in sorted({*begun, *over}):
-        first, last = begun.get(number), over.get(number)
-        if last is None:
-            yield Visit(number, first.sweep, first.block, first.seconds, lines[-1].seconds, done=False)
-            continue
-        # A resumed run whose past is lost has visits without a beginning.
-        began = first.seconds if first else last.seconds - last.visit_seconds
-        yield Visit(number, last.sweep, last.block, began, last.seconds, True, last.layer_seconds, last.psnr)

@@ -193,5 +193,3 @@ def _alternatives(hint: Any) -> tuple[Any, ...]:
     if typing.get_origin(hint) in (Union, types.UnionType):
         return tuple(inner for arg in typing.get_args(hint) for inner in _alternatives(arg))
     return (hint,)
-
-

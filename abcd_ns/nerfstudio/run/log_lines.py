@@ -1,5 +1,6 @@
 """The lines of a run's log: what each kind of them says; some are an event of the engine's."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from abcd_ns.engine.events import ShedAtEnd, SweepEnded, VisitBegan, WorkerLost
@@ -69,6 +70,12 @@ class VisitEndLine(Line):
     visit_seconds: float
     psnr: float | None
     """Mean over the visit's later half, of the crops that were trained on, dB."""
+
+
+def layer_share(visits: Iterable[VisitEndLine]) -> float:
+    """Share of the visits' time that went into layers, 0..1: one number for terminal, log and report."""
+    visits = list(visits)
+    return sum(visit.layer_seconds for visit in visits) / max(sum(v.visit_seconds for v in visits), 1e-9)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from rich.progress import Progress, TaskID, TextColumn
 
 from abcd_ns.engine.events import (
     Event,
+    HeldOutScored,
     LayersDrawn,
     Mended,
     ShedAtEnd,
@@ -18,7 +19,6 @@ from abcd_ns.engine.events import (
     StepTaken,
     SweepEnded,
     VisitBegan,
-    VisitEnded,
     WorkerLost,
     WorkerSeen,
     WorkersSeen,
@@ -26,6 +26,7 @@ from abcd_ns.engine.events import (
 from abcd_ns.engine.train.health_record import MENDED, summary
 from abcd_ns.engine.train.run_state import UNLIMITED
 from abcd_ns.engine.train.trainer import Trainer
+from abcd_ns.nerfstudio.run.log_lines import VisitEndLine, layer_share
 from abcd_ns.units import GIB, bytes_in_words
 from abcd_ns.viewer.run_history import time_left
 from abcd_ns.viewer.texts import clock
@@ -42,14 +43,18 @@ ALARMING = ("gradients", "moments", "values")
 
 
 class ProgressReport:
-    """Listens to a coordinator. On a terminal one live line; elsewhere a line every few seconds."""
+    """Listens to a coordinator. On a terminal one live line; elsewhere a line every few seconds.
 
-    def __init__(self, coordinator: Trainer) -> None:
-        self._coordinator = coordinator
+    Args:
+        visits: those that ended so far, of the whole run; the log goes on adding to them.
+    """
+
+    def __init__(self, coordinator: Trainer, visits: Sequence[VisitEndLine] = ()) -> None:
+        self._coordinator, self._visits = coordinator, visits
+        self._held_out: HeldOutScored | None = None
         self._psnr: float | None = None
         self._sweep = 0
         self._visit: VisitBegan | None = None
-        self._layer_seconds = self._visit_seconds = 0.0
         self._workers: tuple[WorkerSeen, ...] = ()
         self._last_line = self._last_look = time.monotonic()
         self._live: Progress | None = None
@@ -65,15 +70,12 @@ class ProgressReport:
                 self._show(f"layers {event.done}/{event.total}")
             case StepTaken():
                 self._take_step(event)
-            case VisitEnded():
-                self._layer_seconds += event.layer_seconds
-                self._visit_seconds += event.seconds
             case SweepEnded() if self._coordinator.scene.tree.num_blocks > 1:
                 self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
+            case HeldOutScored():
+                self._held_out = event
             case Shedding():
-                self._show(
-                    f"{event.done}/{event.total}", where="final pruning", share=event.done / event.total
-                )
+                self._show(f"final pruning, view {event.done} of {event.total}", event.done / event.total)
             case ShedAtEnd():
                 self._print(_shed(event))
             case WorkersSeen():
@@ -95,7 +97,7 @@ class ProgressReport:
             "blocks": coordinator.scene.tree.num_blocks,
             "sweep": self._sweep,
             "gaussians": coordinator.count(),
-            "share of time for layers": self._share_for_layers(),
+            "share of time for layers": layer_share(self._visits),
             "RAM (GiB)": psutil.Process().memory_info().rss / GIB,
         }
         if torch.cuda.is_available():
@@ -110,14 +112,16 @@ class ProgressReport:
         state = self._coordinator.state
         CONSOLE.print(
             f"Trained {state.step:,} steps in {state.visit} visits, "
-            f"{clock(self._coordinator.stopwatch.seconds)}; {self._summary()}",
+            f"{clock(self._coordinator.stopwatch.seconds)}: {self._summary()}.",
             highlight=False,
+            soft_wrap=True,
         )
         lines = summary(self._coordinator.scene.tree.num_blocks, state.health, state.views)
         for line in lines if state.health else []:  # exact joint training has no visits
             CONSOLE.print(f"  {line}", highlight=False)
 
     def _take_step(self, event: StepTaken) -> None:
+        self._held_out = None  # of an earlier step
         if math.isfinite(event.psnr):
             before = event.psnr if self._psnr is None else self._psnr
             self._psnr = SMOOTHING * before + (1 - SMOOTHING) * event.psnr
@@ -128,13 +132,13 @@ class ProgressReport:
         self._show(f"step {event.visit_step}" if endless else f"step {event.visit_step}/{steps}")
 
     def _summary(self) -> str:
-        quality = "-" if self._psnr is None else f"{self._psnr:.2f} dB on training crops"
-        share = self._share_for_layers()
+        quality = "PSNR not measured"
+        if self._held_out is not None:
+            quality = f"held-out PSNR {self._held_out.psnr:.2f} dB"
+        elif self._psnr is not None:
+            quality = f"PSNR {self._psnr:.2f} dB on training crops"
+        share = layer_share(self._visits)
         return f"{quality}, {self._coordinator.count():,} Gaussians, {share:.0%} of the time for layers"
-
-    def _share_for_layers(self) -> float:
-        """Of all visits that have ended."""
-        return self._layer_seconds / self._visit_seconds if self._visit_seconds else 0.0
 
     def _show(self, what: str, pruned: float | None = None) -> None:
         now = time.monotonic()

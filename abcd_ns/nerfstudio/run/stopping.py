@@ -3,7 +3,7 @@
 import shlex
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -93,20 +93,25 @@ class StopSignals:
         self._before = {}
 
 
-def command_to_go_on(argv: Sequence[str], method: str, folder: Path) -> str | None:
+def command_to_go_on(
+    argv: Sequence[str], method: str, folder: Path, changed: Mapping[str, object] | None = None
+) -> str | None:
     """What to type to go on with the run in `folder`: the same command with --load-dir.
 
     Args:
         argv: the command line of this process; None is returned if it is not `ns-train`'s.
+        changed: options that are given anew, by flag.
     """
+    changed = changed or {}
     program, *words = argv
     if Path(program).name != "ns-train" or words[:1] != [method]:
         return None
     kept, skip = [], False
     for word in words[1:]:
         name = word.partition("=")[0].replace("_", "-")
-        if skip or name in FORGOTTEN:
+        if skip or name in FORGOTTEN or name in changed:
             skip = not skip and "=" not in word
         else:
             kept.append(word)
-    return shlex.join(["ns-train", method, "--load-dir", str(folder), *kept])
+    options = [str(word) for option in changed.items() for word in option]
+    return shlex.join(["ns-train", method, "--load-dir", str(folder), *options, *kept])

@@ -75,14 +75,6 @@ def test_points_in_view_are_those_that_pycolmap_projects_into_it(tmp_path):
         assert seen.in_view[row] == expected
 
 
-def test_a_choice_of_many_points_stands_for_all(found, monkeypatch):
-    whole = found.seen
-    monkeypatch.setattr("abcd_ns.cli.check.survey.MOST_POINTS", 200)
-    part = visibility(found.prepared)
-    assert part.in_view == pytest.approx(whole.in_view, abs=0.1 * POINTS)
-    assert part.in_view.sum() != whole.in_view.sum()
-
-
 @pytest.mark.parametrize(
     "spoil",
     [

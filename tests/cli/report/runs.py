@@ -1,5 +1,6 @@
 """Made-up runs for tests of `abcd report`. No number here was ever measured."""
 
+import copy
 import dataclasses
 import json
 from datetime import datetime, timezone
@@ -7,12 +8,13 @@ from pathlib import Path
 
 import torch
 
-from abcd_ns import methods
 from abcd_ns.cli.report.held_out import HeldOut, Shown
-from abcd_ns.cli.report.run_folder import Checkpoint, RunFolder, default_config
+from abcd_ns.cli.report.run_folder import Checkpoint, RunFolder
 from abcd_ns.cli.report.story import read_story
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.lab.results.run import ViewScore
+from abcd_ns.lab.runs.configs import registered
+from abcd_ns.nerfstudio.options import mirror
 from abcd_ns.nerfstudio.run import STATE
 from abcd_ns.nerfstudio.run.log_lines import KINDS
 from abcd_ns.nerfstudio.run.run_log import LOG_FILE
@@ -62,7 +64,8 @@ def write_log(path: Path, lines: list[str]) -> Path:
 
 def made_up_settings(method: str = "abcd", **fields) -> Settings:
     """Settings at the method's defaults."""
-    config = default_config(method) or methods.abcd.config
+    config = copy.deepcopy(registered(method) or registered("abcd"))
+    mirror(config.pipeline.training, config.pipeline.model)
     values = {
         "schema": SCHEMA,
         "method": method,

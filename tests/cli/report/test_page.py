@@ -7,6 +7,7 @@ import re
 import shlex
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 import torch
 
@@ -87,7 +88,7 @@ def test_the_tiles_and_the_table_say_what_was_measured(shown):
     assert page.texts["h1"] == ["made-up"]
     assert page.texts["title"][0] == "made-up · abcd"
     assert page.texts["dd"][:3:2] == ["24.00 dB", "330"]
-    for value in ("SSIM 0.800", "PSNR 23.50 dB", "45.0 dB", "16.0 s", "40 steps, 19% for layers"):
+    for value in ("SSIM 0.800", "PSNR 23.50 dB", "45.0 dB", "16.0 s", "40 steps, 19% of the time for layers"):
         assert value in text
     assert "not ended: still running, or interrupted" in text
     assert "2026-01-02 03:04 UTC" in text
@@ -99,7 +100,7 @@ def test_workers_are_counted_where_there_were_any(tmp_path):
     lines = [*log_lines(), *(line("worker", 40, 16.0, visits=2, **end) for end in ends)]
     story = read_story(write_log(tmp_path / "workers.jsonl", lines))
     found = dataclasses.replace(run, story=story)
-    assert "9% for layers" in tiles(found, None)[2][2]  # of two workers' time: half of one process's 19%
+    assert "19% of the time for layers" in tiles(found, None)[2][2]  # of the visits, whoever made them
     assert more_figures(found, None)["workers"] == "2, waited 15% of the time, 1 lost"
     assert "workers" not in more_figures(run, None)
 
@@ -267,20 +268,21 @@ def test_blocks_are_those_of_the_log_and_of_the_checkpoint(tmp_path):
 
 def test_states_of_blocks_say_why_one_was_not_trained(tmp_path):
     run = made_up_run(tmp_path)
-    story = dataclasses.replace(run.story, visits=run.story.visits[:2])
-    assert [row[-1] for row in block_rows(dataclasses.replace(run, story=story))] == [
-        "trained", "in the warm-up only", "in the warm-up only",
-    ]  # fmt: skip
-    jointly = dataclasses.replace(run, story=dataclasses.replace(story, visits=()))
+    story = dataclasses.replace(run.story, lines=run.story.lines[:6])
+    state = RunState(views={2: 0})
+    rows = block_rows(dataclasses.replace(run, story=story, state=state))
+    assert [row[-1] for row in rows] == ["trained", "not visited yet", "seen by no view, left as it was"]
+    jointly = dataclasses.replace(run, story=dataclasses.replace(story, lines=story.lines[:1]))
     assert {row[-1] for row in block_rows(jointly)} == {"trained in every step"}
     without = dataclasses.replace(run, checkpoint=None)
     assert [row[:2] for row in block_rows(without)] == [("1", "-"), ("2", "-"), ("3", "-")]
 
 
-def test_smoothing_keeps_the_ends_and_a_straight_line():
-    points = [(float(k), 2.0 * k) for k in range(100)]
-    assert smoothed(points) == [(x, pytest.approx(y)) for x, y in points]
-    assert smoothed([(0.0, 5.0)]) == [(0.0, 5.0)]
+def test_smoothing_keeps_a_straight_line():
+    times, values = smoothed(np.array([[k, 2.0 * k] for k in range(100)]).T)
+    assert len(times) > 90
+    assert values == pytest.approx(2 * times)
+    assert smoothed(np.array([[0.0], [5.0]])).tolist() == [[0.0], [5.0]]
 
 
 def test_what_was_pruned_at_the_end_is_told(tmp_path):

@@ -15,27 +15,13 @@ def story(tmp_path) -> Story:
     return read_story(write_log(tmp_path / "log.jsonl", log_lines()))
 
 
-def test_visits_are_joined_from_their_beginning_and_end(story):
+def test_a_log_tells_visits_and_totals(story):
     assert [visit.block for visit in story.visits] == [None, 0, 1, 2]
-    assert [(visit.began, visit.ended) for visit in story.visits] == [(0, 4), (4, 8), (8, 12), (12, 16)]
-    assert all(visit.done for visit in story.visits)
-    assert story.layer_seconds == 3.0
+    assert story.layer_share == 3 / 16
     assert [visit.psnr for visit in story.of_block(1)] == [22.0]
     assert (story.step, story.seconds, story.blocks, story.gaussians) == (40, 16.0, 3, 330)
-    assert story.end is None
+    assert not story.ended
     assert [story.seconds_at(step) for step in (0, 5, 25, 99)] == [0.0, 2.0, 10.0, 16.0]
-
-
-def test_a_visit_without_an_end_lasts_until_the_log_ends(tmp_path):
-    lines = [*log_lines(), line("visit", 40, 16.0, visit=4, block=1), line("sample", 45, 19.0)]
-    visit = read_story(write_log(tmp_path / "log.jsonl", lines)).visits[-1]
-    assert (visit.began, visit.ended, visit.done) == (16.0, 19.0, False)
-
-
-def test_a_visit_whose_beginning_is_lost_began_as_long_ago_as_it_says(tmp_path):
-    end = line("visit end", 60, 30.0, visit=7, visit_seconds=4.5)
-    story = read_story(write_log(tmp_path / "log.jsonl", [line("training", 50, 27.0, **TRAINING), end]))
-    assert [(visit.number, visit.began) for visit in story.visits] == [(7, 25.5)]
 
 
 def test_blocks_that_were_cut_off_during_the_run_count(tmp_path):
