@@ -19,6 +19,7 @@ from torch.nn import Parameter, ParameterDict
 
 from abcd_ns.engine.gaussians.block_state import checksum
 from abcd_ns.engine.gaussians.param_swap import live_gaussians
+from abcd_ns.engine.layers.fog import fog_in_white
 from abcd_ns.engine.layers.painter import Ownership, Painter, PaintSettings, default_pass
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
 from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, make_rasterizer
@@ -260,6 +261,12 @@ class AbcdModel(SplatfactoModel):
         pictures = self._by_units(view, "fragments", keep=lambda g: paint(self._crop(g)), sh_degree=0)
         show = self.choice.show if viewed.asked_by_viewer() else viewed.Show.EVERYTHING
         return (normals_in(pictures.draw(show, self._chosen_block())) + 1) / 2
+
+    @torch.no_grad()
+    def fog(self, view: View) -> float:
+        """Share of the screen that Gaussians before the view's nearest point take, 0..1."""
+        pictures = self._by_units(view, "fragments", keep=lambda g: fog_in_white(g, view), sh_degree=0)
+        return float(pictures.draw(viewed.Show.EVERYTHING, None).color.mean())
 
     @torch.no_grad()
     def draw_median(self, view: View) -> Tensor:

@@ -168,13 +168,17 @@ class AbcdPipeline(VanillaPipeline):
             asked.resumed_from,
         )
 
+    def training_views(self) -> list[View]:
+        """The photos' cameras as the scene is trained with them."""
+        points = None if self.model.seed_points is None else self.model.seed_points[0]
+        return training_views(self.datamanager.train_dataset.cameras, points, self.config.near_plane)
+
     def _capture(self) -> Capture:
         """What there is to train on; from now on the model draws from its near plane on."""
-        dataset, manager = self.datamanager.train_dataset, self.datamanager
-        points = None if self.model.seed_points is None else self.model.seed_points[0]
-        views = training_views(dataset.cameras, points, self.config.near_plane)
+        dataset, manager, views = self.datamanager.train_dataset, self.datamanager, self.training_views()
         self.model.near = views[0].near
         first = partial(self._first_gaussians, views)
+        points = None if self.model.seed_points is None else self.model.seed_points[0]
         count, factor = 0 if points is None else len(points), factor_of(manager.dataparser)
         return Capture(views, dataset.image_filenames, manager.target, first, count, factor)
 

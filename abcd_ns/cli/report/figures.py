@@ -54,6 +54,9 @@ def more_figures(run: RunFolder, held_out: HeldOut | None) -> dict[str, str]:
     if held_out is not None and story.blocks > 1:
         psnr, ssim = known(held_out.mean("psnr"), "{:.2f} dB"), known(held_out.mean("ssim"), "{:.3f}")
         found |= {"composited": f"PSNR {psnr}, SSIM {ssim}", "ordering gap": held_out.gap}
+    if held_out is not None and held_out.fog:
+        mean, most = sum(held_out.fog) / len(held_out.fog), max(held_out.fog)
+        found["fog"] = f"{mean:.1%} of the screen, {most:.1%} at most: Gaussians before the nearest point"
     if story.visits and story.blocks > 1:
         found["visits"] = f"{len(story.visits)}, {len(story.of(SweepEndLine))} passes over all blocks"
     if (pruned := story.last(ShedAtEndLine)) is not None:

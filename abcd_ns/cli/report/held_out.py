@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
+from abcd_ns.engine.train.schedule import evenly
 from abcd_ns.lab.compare.pictures import ERROR_COLORS, ERROR_GAIN, PictureArray, error_map
 from abcd_ns.lab.results.run import ViewScore
 from abcd_ns.lab.runs.evaluate import Drawn, draw_held_out, mean, ordering_gap, score, squared_gap
@@ -19,6 +20,8 @@ from abcd_ns.nerfstudio.pipeline import AbcdPipeline
 
 PAGE_PIXELS = 6_000_000
 """Of all pictures of a page together; larger ones are reduced. As JPEG that is some 3 MiB."""
+FOG_VIEWS = 16
+"""Training views, at most, that fog is looked for in."""
 LOSSLESS_PIXELS = 40_000
 """Pictures no larger than this are PNG: JPEG would spoil what little there is."""
 
@@ -47,6 +50,8 @@ class HeldOut:
     """The ordering gap, or why there is none."""
     shown: tuple[Shown, ...]
     """From best to worst."""
+    fog: tuple[float, ...] = ()
+    """Shares of the screen that fog takes in a few training views; see `engine/layers/fog.py`."""
 
     def mean(self, name: str) -> float | None:
         """Over all views, of a field of their scores."""
@@ -66,7 +71,9 @@ def look_at_held_out(pipeline: AbcdPipeline, pictures: int, console: Console) ->
         row = drawn.view.row
         shown[row] = _show(drawn, scores[row], places[row], len(places))
     said = note if gap is None else f"{gap:.1f} dB"
-    return HeldOut(tuple(scores), said, tuple(shown[row] for row in places))
+    views = evenly([view for view in pipeline.training_views() if view.nearest], FOG_VIEWS)
+    fog = tuple(pipeline.model.fog(view) for view in track(views, "Fog", **bar))
+    return HeldOut(tuple(scores), said, tuple(shown[row] for row in places), fog)
 
 
 def pick(scores: Sequence[ViewScore], wanted: int) -> dict[int, str]:

@@ -16,6 +16,7 @@ from abcd_ns.engine.gaussians.initialize import gaussians_from_points, thin_out
 from abcd_ns.engine.gaussians.param_swap import nothing_live
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.render.loss import psnr
+from abcd_ns.engine.space.near_plane import as_trained
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.store import ParameterStore
@@ -31,7 +32,7 @@ from abcd_ns.engine.train.run import TrainingRun
 from abcd_ns.engine.train.run_state import Budget
 from abcd_ns.engine.train.schedule import views_per_step, warm_up_is_over
 from abcd_ns.engine.train.training_loop import train_step
-from abcd_ns.engine.types import Crop, Gaussians, View
+from abcd_ns.engine.types import NEAR_PLANE, Crop, Gaussians, View
 from abcd_ns.lab.world.world import TABLE, World, ring
 
 Method = Literal["abcd", "abcd-ablated", "abcd-monolithic"]
@@ -84,6 +85,7 @@ def make_stage(
     views = ring(16) if views is None else views
     held_out = ring(8, turn=0.17) if held_out is None else held_out
     where, colors = world.points(views, points)
+    views = as_trained(views, where, NEAR_PLANE)
     photos = {view.index: world.photo(view) for view in views}
     return Stage(views, photos, where, colors, held_out, [world.photo(view) for view in held_out])
 

@@ -1,4 +1,4 @@
-"""A3, A5 to A7, A13, A14, A19: giants, growth, old layers, seams, the number of blocks."""
+"""A3, A5 to A7, A13, A14, A19, A23: giants, growth, old layers, seams, the number of blocks, fog."""
 
 import math
 from dataclasses import replace
@@ -11,6 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from abcd_ns.engine.events import Event, StepTaken, VisitEnded
+from abcd_ns.engine.layers.fog import fog_in_white
 from abcd_ns.engine.space.partition import build_grid, build_kd
 from abcd_ns.engine.space.tree import BlockTree
 from abcd_ns.engine.train.coordinator import Coordinator
@@ -18,8 +19,20 @@ from abcd_ns.engine.train.density.clock import DensityClock
 from abcd_ns.engine.train.density.control import LEAST_REFINEMENTS, DensityConfig, DensityControl
 from abcd_ns.engine.train.health.health_rules import GIANT_ANGLE
 from abcd_ns.engine.train.recipe import Recipe
+from abcd_ns.engine.train.training_loop import train_step
 from abcd_ns.engine.types import Gaussians, View
-from abcd_ns.lab.stability.lab import BLOCKS, BUDGET, METHODS, PAIR, Finding, Lab, Stage, make_stage, scenario
+from abcd_ns.lab.stability.lab import (
+    BLOCKS,
+    BUDGET,
+    METHODS,
+    PAIR,
+    Finding,
+    Lab,
+    Stage,
+    make_stage,
+    merged,
+    scenario,
+)
 from abcd_ns.lab.world.world import Surfaces, Wall, World, camera, ring
 
 SIGMAS = (1.0, 3.0, 10.0)
@@ -277,3 +290,42 @@ def blocks_and_cuts(lab: Lab) -> Finding:
     said["abcd-monolithic"] = f"{psnrs['1 block']:.2f} dB"
     numbers = {**{f"psnr {name}": value for name, value in psnrs.items()}, "best to worst": gap}
     return Finding(gap <= CLIFF_DB, said, numbers, worse=behind > 0)
+
+
+FOG = 0.02
+"""Of the screen, in the mean over training views, at most."""
+
+
+@scenario(
+    "A23",
+    "fog before the cameras imitates each photo's vignette (drone captures)",
+    "photos that darken by half towards their corners",
+    f"Gaussians before the nearest point of a view take under {FOG:.0%} of the screen at any time",
+)
+def fog(lab: Lab) -> Finding:
+    """A23: the share of the screen that fog takes, every 50 steps."""
+    stage, said, most = make_stage(views=ring(12), points=400), {}, {}
+    dark = {index: photo * vignette(*photo.shape[:2]) for index, photo in stage.photos.items()}
+    for method in PAIR:
+        coordinator = lab.coordinator(stage.start(), stage.views, method, budget=BUDGET)
+        shares = [0.0]
+        while not coordinator.finished:
+            train_step(coordinator, replace(stage, photos=dark))
+            if coordinator.state.step % 50 == 0:
+                shares.append(share_of_fog(lab, merged(coordinator), stage.views))
+        most[method] = max(shares)
+        said[method] = f"{most[method]:.1%} of the screen at most"
+    return Finding(max(most.values()) < FOG, said, {f"fog {name}": value for name, value in most.items()})
+
+
+def vignette(height: int, width: int) -> Tensor:
+    """1 in the middle, a half in the corners; [height, width, 1]."""
+    y, x = torch.linspace(-1, 1, height)[:, None], torch.linspace(-1, 1, width)
+    return (1 - (x.square() + y.square()) / 4)[..., None]
+
+
+@torch.no_grad()
+def share_of_fog(lab: Lab, gaussians: Gaussians, views: list[View]) -> float:
+    """The mean over views."""
+    white = (lab.rasterizer(fog_in_white(gaussians, view), view, sh_degree=0) for view in views)
+    return mean(float(raster.color.mean()) for raster in white)

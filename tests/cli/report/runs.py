@@ -109,4 +109,4 @@ def made_up_held_out(name: str = "0000.png") -> HeldOut:
     """Two views, one of them shown."""
     first = made_up_score(0, 25.0, name)
     shown = Shown(first, "best", PIXEL, PIXEL, PIXEL, 64, 48)
-    return HeldOut((first, made_up_score(8, 23.0)), "45.0 dB", (shown,))
+    return HeldOut((first, made_up_score(8, 23.0)), "45.0 dB", (shown,), (0.002, 0.013))
