@@ -70,7 +70,7 @@ def _draw_curves(results: Results, along: Along, x_label: str) -> Figure:
     axes.set(xlabel=x_label, ylabel="held-out PSNR (dB)", xlim=(0, None))
     if x_label.startswith("Gaussians"):
         axes.xaxis.set_major_formatter(lambda value, _: short(value))
-    figure.legend(loc="outside right upper")
+    figure.legend(loc="outside right center")
     return figure
 
 
@@ -106,5 +106,5 @@ def _draw_memory(results: Results) -> Figure:
         axes.axhline(min(bases), color="#888888", linewidth=0.8, linestyle=":", label="RAM before any scene")
     axes.set(xlabel="Gaussians in the scene at the end", ylabel="peak memory (MiB)", ylim=(0, None))
     axes.xaxis.set_major_formatter(lambda value, _: short(value))
-    figure.legend(loc="outside right upper")
+    figure.legend(loc="outside right center")
     return figure

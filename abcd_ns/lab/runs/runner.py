@@ -213,16 +213,19 @@ def run_job(job: Job, out: Path) -> Run | Failure:
     folder.mkdir(parents=True)
     write_json(folder / JOB_FILE, encode(job))
     log = folder / LOG_FILE
+    command = [*command_of(job), str(folder / JOB_FILE)]
+    env = {**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb"}
     try:
-        with open(log, "wb") as stream:
-            code = subprocess.run(
-                [*command_of(job), str(folder / JOB_FILE)],
-                stdin=subprocess.DEVNULL,
-                stdout=stream,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, "PYTHONUNBUFFERED": "1", "TERM": "dumb"},
-                check=False,
-            ).returncode
+        with (
+            open(log, "wb") as stream,
+            subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT, env=env
+            ) as process,
+        ):
+            try:
+                code = process.wait()
+            finally:
+                process.terminate()  # on Ctrl-C; what has ended takes no notice
     finally:
         for name in job.scratch:
             shutil.rmtree(folder / name, ignore_errors=True)
