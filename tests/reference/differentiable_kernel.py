@@ -51,15 +51,14 @@ def stands_in(**fixed: Any) -> Callable[[Callable], Callable]:
 
     def decorate(function: Callable) -> Callable:
         signature = inspect.signature(getattr(_wrapper, function.__name__))
-        taken = inspect.signature(function).parameters
 
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
-            given = signature.bind(*args, **options)
-            given.apply_defaults()
-            others = {name: value for name, value in given.arguments.items() if name not in taken}
-            assert others == fixed
-            return function(**{name: given.arguments[name] for name in taken})
+            bound = signature.bind(*args, **options)
+            bound.apply_defaults()
+            given = dict(bound.arguments)
+            assert {name: given.pop(name) for name in fixed} == fixed
+            return function(**given)
 
         return call
 

@@ -172,27 +172,11 @@ def rasterize_to_pixels(
 
 
 @stands_in(backgrounds=None, packed=True, absgrad=False, distloss=False)
-def rasterize_to_pixels_2dgs(
-    means2d,
-    ray_transforms,
-    colors,
-    opacities,
-    normals,
-    densify,
-    image_width,
-    image_height,
-    tile_size,
-    isect_offsets,
-    flatten_ids,
-    masks,
-) -> tuple[Tensor | None, ...]:
+def rasterize_to_pixels_2dgs(ray_transforms, normals, densify, **given) -> tuple[Tensor | None, ...]:
     """As `rasterize_to_pixels`; of what else CUDA gives, nothing."""
-    assert ray_transforms.shape == (len(opacities), 3, 3)
-    assert normals.shape == (len(opacities), 3)
-    assert densify.shape == means2d.shape
-    splats = means2d, ray_transforms, colors, opacities
-    lists = image_width, image_height, tile_size, isect_offsets, flatten_ids
-    return (*rasterize_to_pixels(*splats, *lists, masks=masks, packed=True), None, None, None)
+    count = len(given["opacities"])
+    assert (ray_transforms.shape, normals.shape, densify.shape) == ((count, 3, 3), (count, 3), (count, 2))
+    return (*rasterize_to_pixels(conics=ray_transforms, packed=True, **given), None, None, None)
 
 
 def _in_image(offsets: Tensor, size: tuple[int, int, int]) -> Tensor:

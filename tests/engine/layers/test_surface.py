@@ -5,11 +5,12 @@ import torch
 
 from abcd_ns.engine.layers.painter import Painter, PaintSettings
 from abcd_ns.engine.layers.surface import colored_by_normal, median_depth, normals_in
+from abcd_ns.engine.render import Raster
 from abcd_ns.engine.render.cpu.backend import TorchRasterizer
 from abcd_ns.engine.space.partition import build_kd
 from abcd_ns.engine.store.derived_scenes import ChangedScene
 from abcd_ns.engine.store.scene import MemoryScene
-from abcd_ns.engine.types import Crop, View
+from abcd_ns.engine.types import View
 from abcd_ns.viewer.pictures import BlockPictures
 from tests.reference.naive_rasterizer import rotation
 from tests.reference.scenes import random_gaussians, ring_of_views
@@ -27,14 +28,13 @@ def painter_of(primitive: str, pass_gaussians: int, keep=lambda gaussians: gauss
     return Painter(scene, VIEWS, rasterizer, **options)
 
 
-def fragments_at(primitive: str, view: View, x: int, y: int) -> list[tuple[float, int, float]]:
-    """(depth, which Gaussian, alpha) of a pixel's fragments, front to back: each Gaussian drawn alone."""
-    draw, found = TorchRasterizer(primitive=primitive), []
-    for k in range(len(SCENE)):
-        one = draw(SCENE[k : k + 1], view, sh_degree=0, crop=Crop(x, y, 1, 1))
-        alpha = 1 - float(one.transmittance)
+def fragments_at(alone: list[Raster], x: int, y: int) -> list[tuple[float, int, float]]:
+    """(depth, which Gaussian, alpha) of a pixel's fragments, front to back, by pictures of each alone."""
+    found = []
+    for k, one in enumerate(alone):
+        alpha = 1 - float(one.transmittance[y, x])
         if alpha > 0:
-            found.append((float(one.depth) / alpha, k, alpha))
+            found.append((float(one.depth[y, x]) / alpha, k, alpha))
     return sorted(found)
 
 
@@ -57,9 +57,11 @@ def test_both_are_those_of_a_loop_over_fragments(primitive):
     """Drawn at once, and unit by unit; in pixels all over a picture."""
     view, crossed = VIEWS[1], 0
     ways = [drawn(primitive, view, pass_gaussians) for pass_gaussians in (0, 1000)]
+    draw = TorchRasterizer(primitive=primitive)
+    alone = [draw(SCENE[k : k + 1], view, sh_degree=0) for k in range(len(SCENE))]
     for x, y in ((5, 5), (18, 12), (24, 18), (29, 22), (33, 9), (20, 26)):
         left, expected, mean = 1.0, 0.0, torch.zeros(3, dtype=torch.float64)
-        for z, k, alpha in fragments_at(primitive, view, x, y):
+        for z, k, alpha in fragments_at(alone, x, y):
             expected = z if left > 0.5 else expected
             mean += left * alpha * facing(k, view, primitive)
             left *= 1 - alpha

@@ -106,14 +106,6 @@ def test_a_scene_without_harmonics_has_none_to_lose():
     assert len(lowered(gaussians[:0], weighed(0), ring_of_views(12)).gone) == 0
 
 
-def half_matt(seed: int = 7) -> Gaussians:
-    """Every other one looks alike from everywhere."""
-    truth = random_gaussians(120, seed=seed, size=0.12, sh_degree=2)
-    rest = 3.0 * truth.features_rest
-    rest[::2] = 0.0
-    return replace(truth, features_rest=rest)
-
-
 @pytest.fixture(scope="module")
 def views():
     return ring_of_views(6)
