@@ -1,7 +1,7 @@
 """nerfstudio's dataset over Photos, of what our own reader or another of nerfstudio's found.
 
-Others name files and cameras; what they leave to nerfstudio's datamanager, undistorting and putting photos onto
-a background, is done here as for our own reader: in memory, and checked beforehand.
+Others name files and cameras; what they leave to nerfstudio's datamanager, undistorting and putting photos
+onto a background, is done here as for our own reader: in memory, and checked beforehand.
 """
 
 import dataclasses
@@ -83,14 +83,17 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
     color = outputs.alpha_color
     alpha_color = None if color is None else tuple(float(value) for value in color)
     sources, lenses, problems, finders = [], [], Problems(), {}
-    if not outputs.cameras.camera_to_worlds.isfinite().all():
+    given = (
+        outputs.cameras if outputs.cameras.shape else outputs.cameras.reshape((1,))
+    )  # as of one held-out view
+    if not given.camera_to_worlds.isfinite().all():
         fix = "where the reader has an --orientation-method, set it to none"
         raise InputError(
             f"{outputs.image_filenames[0]} and others have poses that are NaN or infinite; {fix}."
         )
     for row, path in enumerate(outputs.image_filenames):
         with problems.collect(name=str(path)):
-            lens = _lens(outputs.cameras, row, str(path))
+            lens = _lens(given, row, str(path))
             stored = lens.size
             if needs_photos:
                 path = finders.setdefault(path.parent, FileFinder(path.parent, path)).find(path.name)
@@ -107,7 +110,7 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
             lenses.append(flat.pinhole if flat else lens)
     problems.raise_if_any()
-    cameras = pinhole_cameras(lenses, outputs.cameras.camera_to_worlds)
+    cameras = pinhole_cameras(lenses, given.camera_to_worlds)
     return dataclasses.replace(
         outputs,
         image_filenames=[source.path for source in sources],
@@ -136,10 +139,8 @@ def _lens(cameras: Cameras, row: int, label: str) -> Lens:
     if kind not in (_BROWN, _FISHEYE):
         name = CameraType(kind).name.lower()
         raise InputError(f"{label} is {name}; photos must be perspective or fisheye ones.")
-    given = torch.zeros(6) if cameras.distortion_params is None else cameras.distortion_params.double()
-    k1, k2, k3, k4, p1, p2 = given.expand(len(cameras.camera_to_worlds), 6)[
-        row
-    ].tolist()  # one for all, perhaps
+    given = cameras.distortion_params
+    k1, k2, k3, k4, p1, p2 = [0.0] * 6 if given is None else given[row].double().tolist()
     if kind == _BROWN and k4 != 0:
         raise InputError(f"{label} has k4 = {k4:g}, which OpenCV cannot undistort; undistort it first.")
     fx, fy, cx, cy = (float(getattr(cameras, name)[row]) for name in ("fx", "fy", "cx", "cy"))

@@ -179,8 +179,9 @@ def weighted_by_alpha(
 def visible(picture: Image.Image) -> Bool[np.ndarray, "h w"]:
     """Which pixels of a mask are used: neither black nor transparent.
 
-    In grey masks with values of 128 or more, and in lossy files, all below three quarters of the largest is
-    black: edges are soft. In others any value but 0 may be a label, also that of a palette without colours.
+    Edges of grey masks with values of 128 or more are soft: below three quarters of the largest they are
+    black. Lossy files are cut at half of it. In others any value but 0 may be a label, also that of a palette
+    without colours.
     """
     alpha = np.array(picture.convert("RGBA"))[..., 3] if has_alpha(picture) else np.uint8(255)
     if picture.mode.startswith(("I", "F")):
@@ -191,8 +192,8 @@ def visible(picture: Image.Image) -> Bool[np.ndarray, "h w"]:
             colors = np.array(picture)[..., None]
     value = colors.max(axis=2)
     grey = (colors == colors[..., :1]).all()
-    soft = picture.format in _LOSSY or (grey and value.max() >= 128)
-    return (value > (value.max() * 0.75 if soft else 0)) & (alpha >= 128)
+    cut = 0.5 if picture.format in _LOSSY else 0.75 if grey and value.max() >= 128 else 0
+    return (value > cut * value.max()) & (alpha >= 128)
 
 
 def reduces_to(stored: tuple[int, int], size: tuple[int, int]) -> bool:

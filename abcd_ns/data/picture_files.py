@@ -122,7 +122,7 @@ class FileFinder:
 
 
 def visible_files(folder: Path) -> Iterator[Path]:
-    """All files below a folder but for those that systems hide there, as macOS's ._a.jpg and Synology's @eaDir."""
+    """All files below a folder but for what systems hide there: macOS's ._a.jpg, Synology's @eaDir."""
     for at, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(_HIDDEN)]
         yield from (Path(at, name) for name in names if not name.startswith(_HIDDEN))

@@ -28,8 +28,10 @@ _SPELLINGS = (
     (("distortion_params",), _COEFFICIENTS),
 )
 """Keys that say the same, those that win first. A frame's spelling hides the other ones of the file."""
-_UNREAD = ("k5", "k6", "p3", "p4", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "omega", "xi", "rolling_shutter",
-           "latlong", "equirectangular", *(f"ftheta_p{k}" for k in range(5)))  # fmt: skip
+_UNREAD = (
+    *("k5", "k6", "p3", "p4", "s1", "s2", "s3", "s4", "b1", "b2", "skew", "omega", "xi", "rolling_shutter"),
+    *("latlong", "equirectangular", "ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"),
+)
 """Keys of a camera that other programs know. Where they are not zero the photos would be read wrongly."""
 
 

@@ -1,5 +1,6 @@
 """Photos and cameras of nerfstudio's own readers: as nerfstudio makes them, but checked and in our hands."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
@@ -130,11 +132,18 @@ def test_cameras_that_cannot_be_are_named(photo, camera, says):
     assert says in str(refused.value)
 
 
-def test_a_distortion_may_be_one_for_all(photo):
-    given = outputs_of(photo, distortion_params=torch.tensor([0.1, 0, 0, 0, 0, 0]))
-    assert given.cameras.distortion_params.shape == (6,)
-    (source,) = with_photos(given).metadata[PHOTOS]
-    assert source.undistortion.lens.distortion[0] == pytest.approx(0.1)
+@pytest.mark.parametrize(("share", "held_out"), [(0.9, 1), (1.0, 0)])
+def test_instant_ngps_reader_may_hold_out_one_view_or_none(scene, share, held_out):
+    meta = write_transforms(scene)
+    frame = meta["frames"][0]
+    alike = [each for each in meta["frames"] if each["w"] == frame["w"]]
+    (scene / "transforms.json").write_text(json.dumps({**meta, **frame, "frames": alike}))
+    reader = InstantNGPDataParserConfig(data=scene, eval_mode="fraction", train_split_fraction=share)
+    assert inspect(reader).pixels == frame["w"] * frame["h"]
+    tested = reader.setup().get_dataparser_outputs("val")
+    assert len(tested.image_filenames) == held_out
+    if held_out:
+        assert with_photos(tested).cameras.camera_to_worlds.shape == (1, 3, 4)
 
 
 def test_a_path_of_windows_is_found(photo):
