@@ -71,9 +71,7 @@ class ProgressReport:
             case SweepEnded() if self._coordinator.scene.tree.num_blocks > 1:
                 self._print(f"sweep {event.sweep} done at step {event.step:,}: {self._summary()}")
             case Shedding():
-                self._show(
-                    f"{event.done}/{event.total}", where="final pruning", share=event.done / event.total
-                )
+                self._show(f"final pruning {event.done}/{event.total}", event.done / event.total)
             case ShedAtEnd():
                 self._print(_shed(event))
             case WorkersSeen():
