@@ -44,6 +44,7 @@ def test_the_live_line_fits_the_terminal(coordinator, monkeypatch):
     report = ProgressReport(coordinator)
     report(VisitBegan(0, 0, 2, steps=1000, views=3, gaussians=40))
     report(StepTaken(1, 0, 999, psnr=20.0))
+    report._live.refresh()
     report(Shedding(2, 8))
     report._live.refresh()
     lines = [re.sub(r"\x1b\[[0-9?]*[a-zA-Z]", "", line) for line in re.split(r"[\r\n]", file.getvalue())]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.scripts import render
@@ -204,6 +205,24 @@ def test_a_name_that_is_no_output_is_answered_by_names_alone(trained):
     assert "tensor" not in repr(pipeline.model.get_outputs_for_camera(camera).keys())
     with pytest.raises(UserError, match="abcd mesh"):
         pipeline.model.get_outputs_for_camera_ray_bundle(camera.generate_rays(0, keep_shape=True))
+
+
+def test_a_path_of_fisheye_cameras_is_one_line_and_a_preview_in_the_viewer(
+    trained, rendered, monkeypatch, capsys
+):
+    _, pipeline, _, _ = eval_setup(trained / "config.yml")
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    straight = pipeline.model.view(camera)
+    camera.camera_type = torch.full_like(camera.camera_type, CameraType.FISHEYE.value)
+    with monkeypatch.context() as patched:
+        patched.setattr("abcd_ns.viewer.pictures.asked_by_viewer", lambda: True)
+        assert torch.equal(pipeline.model.view(camera).viewmat, straight.viewmat)
+    monkeypatch.setattr(
+        "sys.argv", ["ns-render", "camera-path", "--load-config", str(trained / "config.yml")]
+    )
+    with pytest.raises(SystemExit):
+        rendered(["rgb"], camera_type="fisheye")
+    assert "error: Camera 0 is fisheye" in capsys.readouterr().out
 
 
 def test_an_export_of_degree_0_has_the_colours_that_are_drawn():

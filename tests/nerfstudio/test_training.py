@@ -2,6 +2,7 @@
 
 import copy
 import json
+import signal
 import threading
 import time
 from pathlib import Path
@@ -20,6 +21,7 @@ from abcd_ns.engine.store import ParameterStore
 from abcd_ns.engine.store.scene import StoredScene
 from abcd_ns.engine.store.special_blocks import INBOX
 from abcd_ns.nerfstudio.run.settings import SETTINGS_FILE
+from abcd_ns.nerfstudio.run.stopping import Stopped
 from abcd_ns.nerfstudio.trainer import AbcdTrainer, AbcdTrainerConfig, _save_atomically
 from abcd_ns.run.fit import RamShares
 from tests.reference.colmap_scene import HEIGHT, HELD_OUT, WIDTH
@@ -92,6 +94,22 @@ def trained(data, tmp_path_factory) -> AbcdTrainer:
 def test_on_the_cpu_layers_and_photos_have_room_under_the_ram_budget_alone(trained):
     assert trained.pipeline.datamanager.device_photo_bytes == 0
     assert trained.pipeline.coordinator.layer_limit == RamShares.of(0).layers
+
+
+@pytest.mark.parametrize("end", [RuntimeError, Stopped])
+def test_workers_end_with_their_run_and_visits_are_saved_where_it_is_stopped(data, tmp_path, end):
+    """Once at once, since whoever stops it may not wait, and once with the visits under way."""
+    done = []
+
+    def after_step(trainer: AbcdTrainer) -> None:
+        for name in ("save", "await_visits", "dismiss"):
+            setattr(trainer.pipeline.coordinator, name, lambda name=name: not done.append(name))
+        raise end(signal.SIGINT)
+
+    with pytest.raises(SystemExit if end is Stopped else RuntimeError):
+        run(configure(data, tmp_path, blocks=1), after_step=after_step)
+    assert done[-1] == "dismiss"
+    assert done[:3] == ["save", "await_visits", "save"] or end is RuntimeError
 
 
 def test_a_checkpoint_takes_away_its_own_leftovers_and_no_others(tmp_path):

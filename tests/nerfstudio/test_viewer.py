@@ -215,9 +215,10 @@ def finished(watched, monkeypatch):
 
     monkeypatch.setattr(run_viewer, "ViewerState", Seen)
     monkeypatch.setattr(run_viewer, "time", SimpleNamespace(sleep=stop))
-    monkeypatch.setattr("sys.argv", ["ns-viewer", "--load-config", "config.yml"])
+    config = watched.trainer.base_dir / "config.yml"
+    monkeypatch.setattr("sys.argv", ["ns-viewer", "--load-config", str(config)])
     with pytest.raises(KeyboardInterrupt):
-        run_viewer.RunViewer(load_config=watched.trainer.base_dir / "config.yml").main()
+        run_viewer.RunViewer(load_config=config).main()
     yield tuple(seen)
     seen[1].viser_server.stop()
 

@@ -75,7 +75,7 @@ class ProgressReport:
             case HeldOutScored():
                 self._held_out = event
             case Shedding():
-                self._show(f"final pruning, view {event.done} of {event.total}", event.done / event.total)
+                self._show(f"final pruning {event.done}/{event.total}", event.done / event.total)
             case ShedAtEnd():
                 self._print(_shed(event))
             case WorkersSeen():
