@@ -26,7 +26,7 @@ assert "torch" not in sys.modules
 """
 AFTER = """
 assert "nerfstudio" not in sys.modules
-assert float((picture - photos[0] / 255).abs().mean()) < 0.1
+assert float((picture - photos[0] / 255).abs().mean()) < 0.02
 """
 
 

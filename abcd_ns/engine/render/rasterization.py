@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from abcd_ns.engine.gaussians.spherical_harmonics import SH_C0
-from abcd_ns.engine.render import PrimitiveName, Rasterizer, Shot, make_rasterizer
+from abcd_ns.engine.render import PrimitiveName, Raster, Rasterizer, Shot, make_rasterizer
 from abcd_ns.engine.types import Gaussians, View
 
 FIXED = {
@@ -79,6 +79,28 @@ def rasterization(
         ValueError: an argument has a value that is not supported.
         TypeError: gsplat has no such argument.
     """
+    _check(colors, sh_degree, fixed)
+    gaussians = _before_activation(means, quats, scales, opacities, colors)
+    cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
+    views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
+    shots = [Shot(view, view.full) for view in views]
+    options = {"sh_degree": sh_degree or 0, "antialiased": rasterize_mode == "antialiased"}
+    rasters = rasterizer_on(means.device).draw(gaussians, shots, **options)
+    color, alphas, depth = (torch.stack(each) for each in zip(*map(_channels, rasters), strict=True))
+    if backgrounds is not None:
+        color = color + (1 - alphas) * backgrounds[:, None, None]
+    if "ED" in render_mode:
+        depth = depth / alphas.clamp_min(1e-10)
+    wanted = [color] * ("RGB" in render_mode) + [depth] * ("D" in render_mode)
+    return torch.cat(wanted, dim=-1), alphas, rasters[0].info
+
+
+def _channels(raster: Raster) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour [h, w, 3], alpha and depth [h, w, 1]."""
+    return raster.color, 1 - raster.transmittance[..., None], raster.depth[..., None]
+
+
+def _check(colors: Tensor, sh_degree: int | None, fixed: dict[str, Any]) -> None:
     for name, value in fixed.items():
         if name not in FIXED:
             raise TypeError(f"rasterization has no argument {name}.")
@@ -87,24 +109,6 @@ def rasterization(
     if colors.shape[-1] != 3 or colors.ndim != (2 if sh_degree is None else 3):
         wanted = "[n, 3]" if sh_degree is None else "[n, k, 3]"
         raise ValueError(f"colors must be {wanted}, not {list(colors.shape)}.")
-    gaussians = _before_activation(means, quats, scales, opacities, colors)
-    cameras = zip(viewmats.cpu(), Ks.cpu(), strict=True)
-    views = [View(pose, K, width, height, k, near_plane) for k, (pose, K) in enumerate(cameras)]
-    rasters = rasterizer_on(means.device).draw(
-        gaussians,
-        [Shot(view, view.full) for view in views],
-        sh_degree=sh_degree or 0,
-        antialiased=rasterize_mode == "antialiased",
-    )
-    alphas = 1 - torch.stack([raster.transmittance for raster in rasters])[..., None]
-    channels = []
-    if "RGB" in render_mode:
-        color = torch.stack([raster.color for raster in rasters])
-        channels.append(color if backgrounds is None else color + (1 - alphas) * backgrounds[:, None, None])
-    if "D" in render_mode:
-        depth = torch.stack([raster.depth for raster in rasters])[..., None]
-        channels.append(depth / alphas.clamp_min(1e-10) if "ED" in render_mode else depth)
-    return torch.cat(channels, dim=-1), alphas, rasters[0].info
 
 
 def _before_activation(
