@@ -37,8 +37,9 @@ from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
 from abcd_ns.nerfstudio.fit import FREE_SHARE
-from abcd_ns.nerfstudio.flags import shown
+from abcd_ns.nerfstudio.flags import hidden, shown
 from abcd_ns.nerfstudio.metrics import image_metrics
+from abcd_ns.nerfstudio.options import HIDDEN
 from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.viewer import pictures as viewed
@@ -49,6 +50,7 @@ VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
 @shown("rasterizer", "random_init")
+@hidden(*HIDDEN)
 @dataclass
 class AbcdModelConfig(SplatfactoModelConfig):
     """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""

@@ -24,9 +24,9 @@ from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.fit import Demand, device_budget, find_fit
-from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, shown
+from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, hidden, shown
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
-from abcd_ns.nerfstudio.options import check_options
+from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.resuming import RunRequest, Start, check_start, find_start, has_begun, pin_name
@@ -35,6 +35,7 @@ from abcd_ns.nerfstudio.run.stopping import Stopped, StopSignals, at_once, comma
 from abcd_ns.viewer.guard.rules import THIS_MACHINE, WILDCARDS
 
 
+@hidden("max_norm", "fused")
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam as 3DGS uses it, one pass over memory for each parameter."""
@@ -60,6 +61,7 @@ def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerCon
     "data", "max_num_iterations", "output_dir", "experiment_name", "load_dir", "steps_per_save", "vis",
     "pipeline", "machine", "viewer",
 )  # fmt: skip
+@hidden(*UNUSED)
 @dataclass
 class AbcdTrainerConfig(TrainerConfig):
     """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""
