@@ -59,7 +59,7 @@ class AbcdModelConfig(SplatfactoModelConfig):
     rasterizer: Literal["auto", "torch", "gsplat"] = "auto"
     """gsplat: CUDA kernels. torch: any device. auto takes gsplat on CUDA devices."""
     random_init: bool = False
-    """Start with Gaussians at random places, as splatfacto does, instead of the points."""
+    """Start with Gaussians at random places instead of the points."""
     render: Literal["merged", "composited"] = "merged"
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 
