@@ -137,10 +137,11 @@ class View:
     """Gaussians whose mean has a smaller camera z are not drawn; world units."""
     reduction: int = 1
     """A pixel is a square of so many pixels of the photo, wide and high."""
-    distance: float = 1.0
-    """Median camera z of the points that it sees, world units: Gaussians' means move in proportion to it."""
+    reach: float = 1.0
+    """What the rate of means is in, world units: the extent of the cameras, but no more than a few times the
+    median camera z of the points that the view sees. One camera far away at most doubles it."""
     nearest: float = 0.0
-    """Least camera z of these points, but for wrong matches; 0 where none is known."""
+    """Least camera z of the points that it sees, but for wrong matches; 0 where none is known."""
 
     @property
     def full(self) -> Crop:

@@ -28,7 +28,7 @@ from abcd_ns.engine.transfer import upload
 from abcd_ns.engine.types import Crop
 from abcd_ns.errors import IMPORT_TROUBLE
 from abcd_ns.nerfstudio.dataparser import AbcdDataParserConfig
-from abcd_ns.nerfstudio.flags import shown
+from abcd_ns.nerfstudio.flags import hidden, shown
 from abcd_ns.nerfstudio.views import place_cameras
 from abcd_ns.units import GIB
 
@@ -96,6 +96,7 @@ def reading(config: DataParserConfig) -> Iterator[None]:
 
 
 @shown("dataparser", "data_format")
+@hidden(*UNUSED)
 @dataclass
 class AbcdDataManagerConfig(FullImageDatamanagerConfig):
     """Photos, served by crop to the block in training."""

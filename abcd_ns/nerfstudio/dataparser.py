@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import (
@@ -38,7 +39,7 @@ class AbcdDataParserConfig(SceneOptions):
     """Photos 0, n, 2n, ... by name are held out; at least 2."""
     train_split_fraction: float = 0.9
     """Share of the views that is trained on by "fraction"."""
-    as_stored: bool = False
+    as_stored: tyro.conf.Suppress[bool] = False
     """Give the cameras of the files as they lie on the disk, distortion included: for methods that read
     photos by nerfstudio's means."""
 

@@ -16,6 +16,10 @@ from abcd_ns.errors import UserError
 
 METHODS = "abcd"
 """What the names of all our methods begin with."""
+UNUSED_OF_MACHINE = dict.fromkeys(
+    ("num_devices", "num_machines", "machine_rank", "dist_url"), "for several devices set --pipeline.workers"
+)
+"""Options of nerfstudio's machine that ABCD has no use for, and why."""
 
 
 def trains_ours(words: Sequence[str]) -> bool:
@@ -92,18 +96,28 @@ def _value(words: Sequence[str], flag: str) -> str | None:
     return words[place].partition("=")[2] or "".join(words[place + 1 : place + 2])
 
 
-def shown(*names: str) -> Callable[[type], type]:
-    """Of a config class, above `@dataclass`: the fields that `--help` lists, in this order.
+def hidden(*names: str) -> Callable[[type], type]:
+    """Of a config class, above `@dataclass`: these fields are no flags; files and Python may set them."""
 
-    The other fields are options as well, for files, Python and the command line.
+    def decorate(cls: type) -> type:
+        hints = get_type_hints(cls, include_extras=True)
+        return _annotate(cls, {name: tyro.conf.Suppress[hints[name]] for name in names})
+
+    return decorate
+
+
+def shown(*names: str) -> Callable[[type], type]:
+    """Of a config class, above `@dataclass`: the fields that `ns-train abcd --help` lists, in this order.
+
+    The other fields are flags as well. tyro lists all that it takes, so they are none while it prints help.
     """
 
     def decorate(cls: type) -> type:
         fields = {field.name: field for field in dataclasses.fields(cls)}
-        others = [name for name in fields if name not in names and not name.startswith("_")]
         cls.__dataclass_fields__ = {name: fields[name] for name in (*names, *fields)}
-        hints = get_type_hints(cls, include_extras=True)
-        return _annotate(cls, {name: tyro.conf.Suppress[hints[name]] for name in others})
+        others = [name for name in fields if name not in names and not name.startswith("_")]
+        helps = trains_ours(sys.argv) and not {"-h", "--help"}.isdisjoint(sys.argv)
+        return hidden(*others)(cls) if helps else cls
 
     return decorate
 
@@ -122,6 +136,7 @@ def _annotate(cls: type, annotations: dict[str, Any]) -> type:
 
 
 @shown("device_type", "seed")
+@hidden(*UNUSED_OF_MACHINE)
 @dataclasses.dataclass
 class AbcdMachineConfig(MachineConfig):
     """nerfstudio's machine; its seed is the run's."""
@@ -131,6 +146,7 @@ class AbcdMachineConfig(MachineConfig):
 
 
 @shown("websocket_port", "websocket_host", "quit_on_train_completion")
+@hidden("num_rays_per_chunk")
 @dataclasses.dataclass
 class AbcdViewerConfig(ViewerConfig):
     """nerfstudio's viewer, fewer of its options in the help."""

@@ -34,8 +34,9 @@ from abcd_ns.engine.train.trainer import Trainer
 from abcd_ns.engine.types import NEAR_PLANE, Gaussians, Layer, View
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import BATCH
-from abcd_ns.nerfstudio.flags import as_a_command, shown
+from abcd_ns.nerfstudio.flags import as_a_command, hidden, shown
 from abcd_ns.nerfstudio.metrics import image_metrics
+from abcd_ns.nerfstudio.options import HIDDEN
 from abcd_ns.nerfstudio.outputs import Outputs, as_list, masked, pictured, rendered_outputs
 from abcd_ns.nerfstudio.views import view_of
 from abcd_ns.run.fit import FREE_SHARE
@@ -47,6 +48,7 @@ VIEWER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 
 
 @shown("rasterizer", "random_init")
+@hidden(*HIDDEN)
 @dataclass
 class AbcdModelConfig(SplatfactoModelConfig):
     """Splatfacto's model, so that its tools work. How it is trained is set under `pipeline.training`."""
@@ -55,7 +57,7 @@ class AbcdModelConfig(SplatfactoModelConfig):
     rasterizer: Literal["auto", "torch", "gsplat"] = "auto"
     """gsplat: CUDA kernels. torch: any device. auto takes gsplat on CUDA devices."""
     random_init: bool = False
-    """Start with Gaussians at random places, as splatfacto does, instead of the points."""
+    """Start with Gaussians at random places instead of the points."""
     render: Literal["merged", "composited"] = "merged"
     """How whole pictures are drawn: all Gaussians at once, as any viewer will, or block by block."""
 

@@ -20,7 +20,7 @@ from abcd_ns.engine.train.recipe import Limits, Recipe
 from abcd_ns.errors import UserError
 from abcd_ns.nerfstudio.datamanager import READERS
 from abcd_ns.nerfstudio.datamanager import UNUSED as UNUSED_OF_DATA
-from abcd_ns.nerfstudio.flags import named_too, shown
+from abcd_ns.nerfstudio.flags import UNUSED_OF_MACHINE, hidden, named_too, shown
 from abcd_ns.nerfstudio.run.settings import flat_options
 from abcd_ns.nerfstudio.workers import check_workers
 
@@ -57,7 +57,7 @@ SAME = {
 for _not_offered in (Recipe, Limits):
     tyro.conf.configure(tyro.conf.Fixed)(_not_offered)
 _first = ("primitive", "sh_degree", "background", "light", "poses", "antialiased", "warmup", "density")
-shown(*_first)(TrainingConfig)
+shown(*_first)(hidden("seed")(TrainingConfig))
 shown("strategy", "max_gaussians", "price", "split_pixels")(DensityConfig)
 for _config, _flags in SAME.items():
     named_too(_config, {name: f"--pipeline.model.{flag}" for name, flag in _flags.items()})
@@ -96,10 +96,6 @@ UNUSED = {
     "prompt": "ABCD trains on photos",
 }
 """Options of nerfstudio's trainer that ABCD has no use for, and why."""
-UNUSED_OF_MACHINE = dict.fromkeys(
-    ("num_devices", "num_machines", "machine_rank", "dist_url"), "for several devices set --pipeline.workers"
-)
-"""Options of nerfstudio's machine that ABCD has no use for, and why."""
 NOT_CLIPPED = "steps whose gradients are no numbers are skipped, and others are not clipped"
 UNUSED_OF_OPTIMIZERS = {
     "camera_opt": "poses are refined by steps of their own, see --pipeline.training.poses",

@@ -23,9 +23,9 @@ from abcd_ns.engine.gaussians.adam import Adam
 from abcd_ns.engine.store import StoreError, crash_points
 from abcd_ns.engine.store.atomic import TEMPORARY_SUFFIX, fsync_folder, replacing
 from abcd_ns.errors import UserError
-from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_command, opened, shown
+from abcd_ns.nerfstudio.flags import AbcdMachineConfig, AbcdViewerConfig, as_a_command, hidden, opened, shown
 from abcd_ns.nerfstudio.inspection import Inspected, inspect
-from abcd_ns.nerfstudio.options import check_options
+from abcd_ns.nerfstudio.options import UNUSED, check_options
 from abcd_ns.nerfstudio.pipeline import AbcdPipeline, AbcdPipelineConfig
 from abcd_ns.nerfstudio.run import STATE, STORE
 from abcd_ns.nerfstudio.run.ending import next_steps
@@ -40,6 +40,7 @@ UNLIMITED_STEPS = 10**8
 """From so many on the number of steps means that seconds end the run."""
 
 
+@hidden("max_norm", "fused")
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam as 3DGS uses it, one pass over memory for each parameter."""
@@ -65,6 +66,7 @@ def on_this_machine(viewer: ViewerConfig, arguments: Sequence[str]) -> ViewerCon
     "data", "max_num_iterations", "output_dir", "experiment_name", "load_dir", "steps_per_save", "vis",
     "pipeline", "machine", "viewer",
 )  # fmt: skip
+@hidden(*UNUSED)
 @dataclass
 class AbcdTrainerConfig(TrainerConfig):
     """nerfstudio's trainer with ABCD's checkpoints; moves to the CPU where there is no GPU."""

@@ -1,10 +1,10 @@
 """What the command line offers of training, and what it leaves to the method and the device's memory."""
 
 import copy
-import io
 import math
 import re
-from contextlib import redirect_stdout, suppress
+import subprocess
+import sys
 from fnmatch import fnmatchcase
 from operator import attrgetter
 from pathlib import Path
@@ -83,15 +83,13 @@ def refused(name: str) -> bool:
 @pytest.fixture(scope="module")
 def help_text() -> str:
     """What `ns-train abcd --help` says, at a terminal's usual width."""
-    said = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), suppress(SystemExit):
-        patch.setenv("COLUMNS", "100")
-        parsed("--help")
-    return said.getvalue()
+    words = [Path(sys.executable).with_name("ns-train"), "abcd", "--help"]
+    return subprocess.run(words, capture_output=True, text=True, timeout=300, check=True).stdout
 
 
+@pytest.mark.cli
 def test_the_help_has_at_most_forty_flags_most_used_groups_first(help_text):
-    words = set(re.findall(r"--[\w.-]+", help_text)) - {"--help"}
+    words = set(re.findall(r"--[a-z][\w.-]*", help_text)) - {"--help"}
     assert 30 < len(words) <= 40
     assert re.findall(r"^\W*(\S* ?options|subcommands)\W*$", help_text, re.MULTILINE) == [
         "options",
@@ -107,24 +105,25 @@ def test_the_help_has_at_most_forty_flags_most_used_groups_first(help_text):
     assert {"colmap", "nerfstudio-data", "blender-data"} <= set(re.findall(r"[\w-]+", help_text))
 
 
+@pytest.mark.cli
 def test_what_has_no_effect_is_not_in_the_help(help_text):
     shown = {word.replace("-", "_") for word in re.findall(r"--([\w.-]+)", help_text)}
     assert {word for word in shown if refused(word)} == {"pipeline.model.camera_optimizer.mode"}  # taken
 
 
-def test_the_reference_has_every_option_and_no_other(help_text):
+def test_the_reference_has_every_option_of_ours_and_none_that_is_not():
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference.md").read_text()
     section = page[page.index("## Options") : page.index("## Splatfacto's options")]
     rows = re.findall(r"^\| (`[^|]*`) \|", section, re.MULTILINE)
     written = {name.replace("-", "_") for row in rows for name in re.findall(r"`([\w.-]+)`", row)}
     known = set(flat_options(METHODS["abcd"]))
     written = {name if name in known else f"pipeline.{name}" for name in written}
-    shown = {word.replace("-", "_") for word in re.findall(r"--([\w.-]+)", help_text)}
-    ours = {name for name in known if name.startswith("pipeline.") or name in shown}
+    ours = {name for name in known if name.startswith("pipeline.")}
     not_set = ("data", "dataparser.data", "dataparser.as_stored", "data_format")
     ours -= {f"pipeline.datamanager.{name}" for name in not_set}
     mirrored = {f"pipeline.model.{name}" for name in MIRRORED}
-    assert written == {name for name in ours - mirrored if not refused(name)}
+    assert written & ours == {name for name in ours - mirrored if not refused(name)}
+    assert written <= known
 
 
 @pytest.mark.parametrize(
@@ -278,7 +277,7 @@ def test_flags_that_are_offered_are_not_refused(name, capsys):
     with pytest.raises(SystemExit):
         tyro.cli(AnnotatedBaseConfigUnion, args=[name, "--help"])
     words = set(re.findall(r"--[\w.-]+", capsys.readouterr().out))
-    assert len(words) > 30
+    assert len(words) > 80
     refuse_flags(sorted(words), METHODS[name])
 
 

@@ -97,7 +97,7 @@ def test_settings_are_plain_values_of_every_option(trained):
     assert options == flat_options(trained.config) | follows  # as they were asked for
     assert options["pipeline.blocks"] == 3
     assert options["pipeline.training.density.strategy"] == "default"
-    assert options["optimizers.means.optimizer.lr"] == pytest.approx(3.2e-4)
+    assert options["optimizers.means.optimizer.lr"] == pytest.approx(1.6e-4)
     assert not any("_target" in name for name in options)
 
 

@@ -17,15 +17,14 @@ Params = MutableMapping[str, Parameter] | ParameterDict
 Optimizers = Mapping[str, torch.optim.Optimizer]
 """One Adam per parameter, under the parameter's name; each with one parameter group."""
 LEARNING_RATES = {
-    "means": 3.2e-4,
+    "means": 1.6e-4,
     "features_dc": 0.0025,
     "features_rest": 0.0025 / 20,
     "opacities": 0.05,
     "scales": 0.005,
     "quats": 0.001,
 }
-"""Splatfacto's, but for the means': it is in the distance of what views see, not in the extent of the
-cameras, and decays with the progress of the run, see TrainingConfig."""
+"""Splatfacto's. The means' is in the reach of views, see View, and decays with the progress of the run."""
 RATED_FOR = 10_000
 """Steps after which a block is trained with these rates, which are made for 30,000."""
 YOUNG_RATES = 4.0

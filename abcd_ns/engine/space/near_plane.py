@@ -13,12 +13,14 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from abcd_ns.engine.types import NEAR_PLANE, View
+from abcd_ns.engine.types import NEAR_PLANE, View, centers_of
 
 SHARE = 0.5
 """The near plane, as a share of the distance of the nearest point that a view sees."""
 OUTLIERS = 0.001
 """Share of the points that a view sees which may be nearer: wrong matches."""
+FARTHER = 4.0
+"""Times a view's median depth, at most, is its reach."""
 MOST_POINTS, MOST_VIEWS = 20_000, 500
 """Of more than these, an evenly spaced choice is looked at."""
 
@@ -42,21 +44,29 @@ def near_plane(points: Float[Tensor, "n 3"], views: Sequence[View]) -> float:
 
 
 def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float = 0.0) -> list[View]:
-    """The views as a scene is trained with them: from their near plane on, each with the nearest and the
-    median distance of the points that it sees. Where it sees none it has the median of the others'.
+    """The views as a scene is trained with them: from their near plane on, each with its `nearest` and its
+    `reach`.
 
     Args:
         points: see `near_plane`.
         near: from where on they see, world units; 0 finds that by the points.
     """
-    near = near or near_plane(points, views)
+    near, extent = near or near_plane(points, views), _extent(views)
     found = {
-        view.index: (float(torch.quantile(depths, OUTLIERS)), float(depths.median()))
+        view.index: (float(torch.quantile(depths, OUTLIERS)), min(extent, FARTHER * float(depths.median())))
         for view, depths in _depths(points, views)
     }
-    others = 0.0, median(distance for _, distance in found.values()) if found else 1.0
-    seen = ((view, *found.get(view.index, others)) for view in views)
-    return [replace(view, near=near, nearest=nearest, distance=distance) for view, nearest, distance in seen]
+    nothing = 0.0, median(reach for _, reach in found.values()) if found else extent
+    seen = ((view, *found.get(view.index, nothing)) for view in views)
+    return [replace(view, near=near, nearest=nearest, reach=reach) for view, nearest, reach in seen]
+
+
+def _extent(views: Sequence[View]) -> float:
+    """How far cameras stand from their middle along an axis, world units: the farthest, but no more than twice
+    as far as the median one. 1 where all stand in one place."""
+    centers = centers_of(views)
+    away = (centers - centers.median(dim=0).values).abs().amax(dim=1)
+    return min(float(away.max()), 2 * float(away.median())) or float(away.max()) or 1.0
 
 
 def _depths(

@@ -77,9 +77,8 @@ class TrainingRun:
         self._reduced = {1: self.views}
 
     def reach(self, views: Iterable[int]) -> float:
-        """What the means' rate is multiplied by, world units: how far these views see, by the median. It does
-        not depend on how far from them other cameras are."""
-        return median(self.views[view].distance for view in views)
+        """What the means' rate is multiplied by for a block that these views are trained on, world units."""
+        return median(self.views[view].reach for view in views)
 
     @property
     def reduction(self) -> int:

@@ -175,27 +175,42 @@ def test_gsplats_own_where_nothing_is_known():
     assert near_plane(ahead(views[0], -5.0), views[:1]) == NEAR_PLANE
 
 
-def test_a_camera_far_away_changes_nothing_for_the_others():
-    """Its frame is scaled down; what the others see from how far is as before."""
-    views, points = ring_of_views(4), torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
-    far = replace(views[0], viewmat=views[0].viewmat.clone(), index=4)
+def test_a_camera_far_away_changes_little_for_the_others():
+    """Its frame is scaled down; the near plane is what it was, in pixels, and rates at most double."""
+    views, points = ring_of_views(9), torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+    far = replace(views[0], viewmat=views[0].viewmat.clone(), index=9)
     far.viewmat[2, 3] += 3000.0
+    expected = as_trained(views, points)
     for scale in (1.0, 1e-3):
         seen = [replace(v, viewmat=v.viewmat.clone()) for v in (*views, far)]
         for view in seen:
             view.viewmat[:3, 3] *= scale
-        alone, beside = as_trained(seen[:4], points * scale), as_trained(seen, points * scale)
-        assert [view.distance for view in alone] == [view.distance for view in beside[:4]]
-        assert alone[0].distance == pytest.approx(3.38 * scale, rel=1e-2)
-        assert near_plane(points * scale, seen) == pytest.approx(near_plane(points, views) * scale, rel=1e-3)
+        for view, before in zip(as_trained(seen, points * scale), expected, strict=False):
+            assert 0.99 < view.reach / (before.reach * scale) < 2.0
+            assert view.near == pytest.approx(before.near * scale, rel=1e-3)
+            assert view.nearest == pytest.approx(before.nearest * scale, rel=1e-3)
 
 
-def test_a_view_that_sees_no_point_is_as_far_as_the_others():
+def test_two_sites_far_apart_are_trained_at_rates_of_their_own():
+    """All cameras stand far from the middle, and what they see is near."""
+    site, points = ring_of_views(6), torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+    away = torch.tensor([5000.0, 0.0, 0.0])
+    other = [replace(v, viewmat=v.viewmat.clone(), index=v.index + 6) for v in site]
+    for view in other:
+        view.viewmat[:3, 3] -= view.viewmat[:3, :3] @ away
+    both = as_trained([*site, *other], torch.cat((points, points + away)))
+    alone = as_trained(site, points)
+    assert max(view.reach for view in both) < 6 * alone[0].reach
+    assert [view.near for view in both] == pytest.approx([alone[0].near] * 12, rel=1e-3)
+
+
+def test_a_view_that_sees_no_point_reaches_as_far_as_the_others():
     near, other = ring_of_views(2)
     away = replace(near, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ near.viewmat, index=1)
-    points = ahead(near, 2.0, 5)
-    assert [view.distance for view in as_trained([near, away], points)] == pytest.approx([2.0, 2.0])
-    assert [view.distance for view in as_trained([near, other], torch.zeros(0, 3))] == [1.0, 1.0]
+    found = as_trained([near, away], ahead(near, 0.2, 5))
+    assert [view.reach for view in found] == pytest.approx([0.8, 0.8])
+    assert [view.nearest for view in found] == pytest.approx([0.2, 0.0])
+    assert as_trained([near], torch.zeros(0, 3))[0].reach == 1.0
 
 
 def test_no_more_points_and_views_than_needed_are_looked_at():

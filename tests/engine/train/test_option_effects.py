@@ -29,7 +29,7 @@ OTHERS = {
 OTHERS_OF_DENSITY = {
     "strategy": "mcmc",
     "max_gaussians": 125,
-    "price": 9.0,
+    "price": 0.0,
     "split_pixels": 1e4,
     "refine_start": 0.3,
     "refine_stop": 0.1,
