@@ -62,8 +62,8 @@ def as_trained(views: Sequence[View], points: Float[Tensor, "n 3"], near: float 
 
 
 def _extent(views: Sequence[View]) -> float:
-    """How far cameras stand from their middle along an axis, world units: the farthest, but no more than twice
-    as far as the median one. 1 where all stand in one place."""
+    """How far cameras stand from their middle along an axis, world units: the farthest, but at most twice as
+    far as the median one. 1 where all stand in one place."""
     centers = centers_of(views)
     away = (centers - centers.median(dim=0).values).abs().amax(dim=1)
     return min(float(away.max()), 2 * float(away.median())) or float(away.max()) or 1.0

@@ -205,7 +205,7 @@ def test_two_sites_far_apart_are_trained_at_rates_of_their_own():
 
 
 def test_a_view_that_sees_no_point_reaches_as_far_as_the_others():
-    near, other = ring_of_views(2)
+    near, _ = ring_of_views(2)
     away = replace(near, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ near.viewmat, index=1)
     found = as_trained([near, away], ahead(near, 0.2, 5))
     assert [view.reach for view in found] == pytest.approx([0.8, 0.8])
