@@ -67,6 +67,11 @@ class AbcdDataset(InputDataset):
         return data
 
 
+def has_views(outputs: DataparserOutputs) -> bool:
+    """Whether there are photos with poses: of one view, instant-ngp's reader gives no place of the camera."""
+    return bool(outputs.image_filenames) and outputs.cameras.camera_to_worlds.shape[-2:] == (3, 4)
+
+
 def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> DataparserOutputs:
     """The same with PHOTOS, and with the cameras of photos that are undistorted; our own reader's unchanged.
 
@@ -83,17 +88,14 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
     color = outputs.alpha_color
     alpha_color = None if color is None else tuple(float(value) for value in color)
     sources, lenses, problems, finders = [], [], Problems(), {}
-    given = (
-        outputs.cameras if outputs.cameras.shape else outputs.cameras.reshape((1,))
-    )  # as of one held-out view
-    if not given.camera_to_worlds.isfinite().all():
+    if not outputs.cameras.camera_to_worlds.isfinite().all():
         fix = "where the reader has an --orientation-method, set it to none"
         raise InputError(
             f"{outputs.image_filenames[0]} and others have poses that are NaN or infinite; {fix}."
         )
     for row, path in enumerate(outputs.image_filenames):
         with problems.collect(name=str(path)):
-            lens = _lens(given, row, str(path))
+            lens = _lens(outputs.cameras, row, str(path))
             stored = lens.size
             if needs_photos:
                 path = finders.setdefault(path.parent, FileFinder(path.parent, path)).find(path.name)
@@ -110,7 +112,7 @@ def with_photos(outputs: DataparserOutputs, needs_photos: bool = True) -> Datapa
             sources.append(PhotoSource(path, stored, lens.size, flat, mask, alpha_color))
             lenses.append(flat.pinhole if flat else lens)
     problems.raise_if_any()
-    cameras = pinhole_cameras(lenses, given.camera_to_worlds)
+    cameras = pinhole_cameras(lenses, outputs.cameras.camera_to_worlds)
     return dataclasses.replace(
         outputs,
         image_filenames=[source.path for source in sources],

@@ -19,7 +19,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.utils.data import DataLoader
 
-from abcd_ns.data.dataset import AbcdDataset
+from abcd_ns.data.dataset import AbcdDataset, has_views
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.engine.events import Event, PhotosWanted
 from abcd_ns.engine.train.step.batch import Sample, Target
@@ -159,8 +159,8 @@ class AbcdDataManager(FullImageDatamanager[AbcdDataset]):
     def create_eval_dataset(self) -> AbcdDataset:
         """The held-out photos; looked at one after the other, so none is kept."""
         outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
-        if not outputs.image_filenames:  # as with `--eval-mode fraction --train-split-fraction 1`
-            CONSOLE.print("No view is held out: scores are of the training views.", style="yellow")
+        if not has_views(outputs):
+            CONSOLE.print("No held-out view can be used: scores are of the training views.", style="yellow")
             outputs = self.train_dataparser_outputs
         return self._dataset(outputs, 0)
 

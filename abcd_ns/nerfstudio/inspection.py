@@ -5,7 +5,7 @@ from pathlib import Path
 
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig
 
-from abcd_ns.data.dataset import PHOTOS, with_photos
+from abcd_ns.data.dataset import PHOTOS, has_views, with_photos
 from abcd_ns.data.input_errors import InputError
 from abcd_ns.data.prepare import check_masks
 from abcd_ns.errors import UserError
@@ -48,8 +48,8 @@ def inspect(config: DataParserConfig) -> Inspected:
     parser = config.setup()
     with reading(config):
         read = [parser.get_dataparser_outputs(split=split) for split in ("train", "val")]
-    parts = [with_photos(outputs) for outputs in read if outputs.image_filenames]
-    if not read[0].image_filenames:
+    parts = [with_photos(outputs) for outputs in read if has_views(outputs)]
+    if not has_views(read[0]):
         raise InputError(f"{config.data} has no photos to train on.")
     sources = list(dict.fromkeys(source for part in parts for source in part.metadata[PHOTOS]))
     check_masks(sources)
