@@ -24,10 +24,7 @@ from abcd_ns.data.prepare import Prepared, SceneOptions, prepare
 from abcd_ns.nerfstudio.flags import shown
 
 
-@shown(
-    "downscale_factor", "max_side", "colmap_path", "images_path", "masks_path", "eval_mode", "eval_interval",
-    "orientation_method",
-)  # fmt: skip
+@shown("downscale_factor", "colmap_path", "images_path", "masks_path", "eval_mode", "eval_interval")
 @dataclass
 class AbcdDataParserConfig(SceneOptions):
     """A folder with a COLMAP model or a transforms.json, and photos. `--data DIR` alone is enough."""

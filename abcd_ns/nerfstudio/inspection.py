@@ -54,7 +54,7 @@ def inspect(config: DataParserConfig) -> Inspected:
     sources = list(dict.fromkeys(source for part in parts for source in part.metadata[PHOTOS]))
     check_masks(sources)
     largest = max((source.size for source in sources), key=lambda size: size[0] * size[1])
-    train, held_out = (len(part.image_filenames) for part in parts)
+    train, held_out = (len(outputs.image_filenames) if has_views(outputs) else 0 for outputs in read)
     points = len(parts[0].metadata.get("points3D_xyz", ()))
     return Inspected(train, held_out, largest, points, factor_of(parser))
 

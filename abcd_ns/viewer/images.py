@@ -8,10 +8,8 @@ import base64
 import io
 from collections.abc import Sequence
 
-import matplotlib
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.figure import Figure
 from PIL import Image
 
 WIDTH = 260
@@ -27,6 +25,9 @@ def curve_image(points: Sequence[tuple[float, float]], name: str) -> str:
     """
     if len(points) < 2:
         return "Nothing to show yet."
+    import matplotlib  # runs do without it
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(WIDTH / 96, WIDTH / 192), layout="constrained")  # at 96 px an inch
     axes = figure.add_subplot(facecolor="none")
     axes.plot(*zip(*points, strict=True), color=LINE, linewidth=1)

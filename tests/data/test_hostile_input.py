@@ -12,6 +12,9 @@ from PIL import Image
 
 from abcd_ns.data.dataset import AbcdDataset
 from abcd_ns.data.input_errors import InputError
+from abcd_ns.data.photos import Photos, PhotoSource
+from abcd_ns.data.scene import Lens
+from abcd_ns.data.undistort import undistortion
 from abcd_ns.nerfstudio.inspection import inspect
 from tests.data.dataparser_scenes import NAMES, SIZES, parser, refusal, write_capture, write_transforms
 
@@ -215,3 +218,19 @@ def test_lists_that_name_unknown_photos_are_refused(scene, where):
 def test_lists_that_leave_one_side_empty_are_refused(scene, kept, message):
     (scene / "test_list.txt").write_text("\n".join(NAMES[:kept]))
     assert message in refusal(scene)
+
+
+@pytest.mark.parametrize("coefficients", [(-3.0,), (-1.2, 0.1), (1e6,), (0.0, 0.0, 5.0, 5.0)])
+def test_absurd_distortion_is_refused(coefficients):
+    padded = coefficients + (0.0,) * (8 - len(coefficients))
+    with pytest.raises(InputError, match="leaves no picture"):
+        undistortion(Lens(200, 150, 160, 160, 100, 75, padded))
+
+
+def test_palette_becomes_its_colors(tmp_path):
+    picture = Image.fromarray(
+        np.random.default_rng(0).integers(0, 256, (24, 40, 3), dtype=np.uint8)
+    ).quantize(16)
+    picture.save(tmp_path / "p.png")
+    photos = Photos([PhotoSource(tmp_path / "p.png", picture.size, picture.size)])
+    assert np.array_equal(photos.image(0).numpy(), np.array(picture.convert("RGB")))

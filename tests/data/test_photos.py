@@ -398,17 +398,3 @@ def test_mask_is_undistorted_with_its_photo(tmp_path):
     # What is used was white all through; half-way pixels are not used.
     assert (photos.image(0)[photos.mask(0)[..., 0]] == 255).all()
     assert 0.4 < photos.mask(0).float().mean() < 0.6
-
-
-@pytest.mark.parametrize("coefficients", [(-3.0,), (-1.2, 0.1), (1e6,), (0.0, 0.0, 5.0, 5.0)])
-def test_absurd_distortion_is_refused(coefficients):
-    padded = coefficients + (0.0,) * (8 - len(coefficients))
-    with pytest.raises(InputError, match="leaves no picture"):
-        undistortion(Lens(200, 150, 160, 160, 100, 75, padded))
-
-
-def test_palette_becomes_its_colors(tmp_path):
-    picture = Image.fromarray(noise(0)).quantize(16)
-    picture.save(tmp_path / "p.png")
-    photos = Photos([PhotoSource(tmp_path / "p.png", picture.size, picture.size)])
-    assert np.array_equal(photos.image(0).numpy(), np.array(picture.convert("RGB")))

@@ -276,8 +276,8 @@ def test_every_option_of_splatfactos_model_is_a_flag_or_refused_by_a_reason():
 def test_flags_that_are_offered_are_not_refused(name, capsys):
     with pytest.raises(SystemExit):
         tyro.cli(AnnotatedBaseConfigUnion, args=[name, "--help"])
-    words = set(re.findall(r"--[\w.-]+", capsys.readouterr().out))
-    assert len(words) > 80
+    words = set(re.findall(r"--[a-z][\w.-]+", capsys.readouterr().out))
+    assert len(words) > 30
     refuse_flags(sorted(words), METHODS[name])
 
 

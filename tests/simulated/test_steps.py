@@ -31,11 +31,10 @@ def test_a_step_waits_once_and_copies_its_photos_alone(on_device, photos, simula
     """Beside what isect_tiles waits for, which gives a list whose length nobody knows."""
     coordinator = on_device(blocks=blocks, steps=3 * blocks, density=GATHERING, crop_pixels=parts)
     watch = Watch(simulated_gsplat)
-    watch.take_step(coordinator, photos)  # the first one uploads cameras and backgrounds
-    while not coordinator.finished:
-        before = watch.steps.counts.copy()
-        watch.take_step(coordinator, photos)
-        taken = watch.steps.counts.since(before)
+    with watch.watching(coordinator):
+        while not coordinator.finished:
+            watch.take_step(coordinator, photos)
+    for taken in watch.steps[1:]:  # the first one uploads cameras and backgrounds
         apart = taken.waits.pop("isect_tiles")
         assert apart == 1
         assert dict(+taken.waits) in ({}, {"event": 1}), taken.places

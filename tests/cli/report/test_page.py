@@ -214,7 +214,7 @@ def test_changed_settings_and_the_command_that_sets_them():
     assert found == {"pipeline.blocks": ("4", "0"), "pipeline.max_seconds": ("60.0", "None")}
     assert shlex.split(training_command(settings).replace("\\\n", "")) == [
         "ns-train", "abcd", "--data", "my data; rm -rf",
-        "--pipeline.blocks", "4", "--pipeline.max-seconds", "60.0",
+        "--pipeline.max-seconds", "60.0", "--pipeline.blocks", "4",
     ]  # fmt: skip
 
 

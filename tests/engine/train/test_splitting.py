@@ -96,7 +96,7 @@ def test_a_run_never_has_a_larger_block_than_it_may(make, photos, blocks, monkey
         assert bool((tree.assign(means) == block).all())
 
 
-def test_a_block_that_is_alone_may_be_larger_until_it_is_cut(make, photos):
+def test_a_block_that_is_alone_may_be_larger_until_it_is_cut(make, views, photos):
     options = {"blocks": 1, "steps": 50, "density": GROWING, "block_limit": 90, "warmup": 0.0}
     coordinator = make(**options, sole_limit=200)
     ended = listen(coordinator, VisitEnded)
